@@ -1,0 +1,1 @@
+"""Perturbed, success-checked, fully labelled fine-tuning data from LIBERO demonstrations."""

@@ -1,0 +1,31 @@
+"""One exception type for everything a user can cause and mend."""
+
+from __future__ import annotations
+
+
+class PipelineError(Exception):
+    """Says what is wrong, where, what was expected and what to try.
+
+    Args:
+        what: the fault, one sentence without a full stop.
+        where: the file, field or row it was found in.
+        expected: what would have been right (list the values that would have worked).
+        remedy: the command or edit that mends it.
+    """
+
+    def __init__(self, what: str, *, where: object = None, expected: str | None = None, remedy: str | None = None):
+        self.what, self.where, self.expected, self.remedy = what, where, expected, remedy
+        lines = [what if where is None else f"{where}: {what}"]
+        if expected is not None:
+            lines.append(f"  expected: {expected}")
+        if remedy is not None:
+            lines.append(f"  try: {remedy}")
+        super().__init__("\n".join(lines))
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # Keyword-only arguments need this to survive the trip back from a worker process.
+        return _rebuild, (self.what, None if self.where is None else str(self.where), self.expected, self.remedy)
+
+
+def _rebuild(what: str, where: str | None, expected: str | None, remedy: str | None) -> PipelineError:
+    return PipelineError(what, where=where, expected=expected, remedy=remedy)

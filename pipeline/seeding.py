@@ -1,0 +1,28 @@
+"""Keyed randomness: the same key gives the same numbers in any process, in any order."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+
+import numpy as np
+
+Key = str | int
+
+
+def digest(*key: object) -> str:
+    """SHA-256 (64 hex digits) of a JSON-serialisable key, in canonical form."""
+    return hashlib.sha256(json.dumps(key, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def rng(*key: Key) -> np.random.Generator:
+    """A Philox generator keyed by values such as ``(seed, axis, demo_id, variant)``.
+
+    There is no default: a generator without a key cannot be asked for, so nothing runs unseeded.
+
+    Raises:
+        TypeError: when the key is empty or holds something other than str and int.
+    """
+    if not key or not all(isinstance(part, (str, int)) for part in key):
+        raise TypeError(f"seeding.rng wants one or more str or int as its key, got {key!r}")
+    return np.random.Generator(np.random.Philox(key=int(digest(*key)[:32], 16)))

@@ -1,0 +1,117 @@
+"""The nouns of the pipeline, in the order in which data meets them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Frame = NDArray[np.uint8]
+"""(H, W, 3) RGB."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One LIBERO task.
+
+    Attributes:
+        suite: ``libero_spatial``, ``libero_object``, ``libero_goal`` or ``libero_10``.
+        name: LIBERO's task name, the stem of its BDDL file.
+        instruction: the wording of LIBERO's task list, as policies are prompted with it.
+        bddl_file: where the scene and the goal are defined.
+    """
+
+    suite: str
+    name: str
+    instruction: str
+    bddl_file: Path
+
+
+@dataclass(frozen=True)
+class Demo:
+    """One recorded human demonstration.
+
+    Attributes:
+        task: the task it solves.
+        key: its name in its source, such as ``demo_0``.
+        source: where it came from, for provenance (never parsed).
+        sha256: hash of the recorded content (actions, states, model), 64 hex digits.
+        actions: (T, 7) OSC_POSE deltas in [-1, 1] and gripper (-1 open, +1 close), 20 Hz.
+        init_state: (S,) flattened MuJoCo state before the first action: time, qpos, qvel.
+        model_xml: MJCF of the recorded scene with asset paths of this machine, or None when the source did
+            not record it (then fixtures are placed by LIBERO's own reset under a fixed seed).
+    """
+
+    task: Task
+    key: str
+    source: str
+    sha256: str
+    actions: Floats
+    init_state: Floats
+    model_xml: str | None
+
+    @property
+    def demo_id(self) -> str:
+        return f"{self.task.suite}/{self.task.name}/{self.key}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether something planned is kept, and the reason when it is not."""
+
+    kept: bool
+    reason: str
+    """``kept``, or a short snake_case reason such as ``goal_not_reached``."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What physics did: no pixels.
+
+    Attributes:
+        trajectory_id: hash of everything that determines it.
+        model_xml: MJCF of the scene it happened in, asset paths of this machine.
+        states: (K+1, S) flattened states: before each executed action, and after the last.
+        actions: (K, 7) executed actions.
+        kept_mask: (T,) which of the demonstration's actions were executed.
+        site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
+        verdict: the judge's word after the last action.
+    """
+
+    trajectory_id: str
+    model_xml: str
+    states: Floats
+    actions: Floats
+    kept_mask: NDArray[np.bool_]
+    site_alpha: NDArray[np.float32]
+    verdict: Verdict
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What a policy sees, ready for the writers; names, units and signs are those of ``schemas/episode.json``.
+
+    Attributes:
+        episode_id: identity by content, joins RLDS, LeRobot and manifest.
+        frames: view name (``image``, ``wrist_image``) to T JPEG files, already rotated.
+        state: (T, 8) float32.
+        joint_state: (T, 7) float32.
+        action: (T, 7) float32.
+        instruction: the text the policy is prompted with.
+        provenance: flat, JSON-serialisable, the columns named in ``schemas/episode.json``.
+    """
+
+    episode_id: str
+    frames: Mapping[str, Sequence[bytes]]
+    state: NDArray[np.float32]
+    joint_state: NDArray[np.float32]
+    action: NDArray[np.float32]
+    instruction: str
+    provenance: Mapping[str, str]
+
+    def __len__(self) -> int:
+        return len(self.action)
