@@ -1,0 +1,46 @@
+"""The axes of perturbation, one file each, and the union that reads any recorded perturbation back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Annotated
+
+from pydantic import Field, TypeAdapter
+
+from pipeline.axes.base import Frozen, Layer, Perturbation
+from pipeline.axes.camera import CameraAxis, CameraPerturbation
+from pipeline.axes.language import LanguageAxis, LanguagePerturbation
+from pipeline.axes.noise import NoiseAxis, NoisePerturbation
+
+AnyPerturbation = Annotated[
+    CameraPerturbation | NoisePerturbation | LanguagePerturbation, Field(discriminator="axis")
+]
+AnyAxis = CameraAxis | NoiseAxis | LanguageAxis
+
+_LIST = TypeAdapter(tuple[AnyPerturbation, ...])
+
+
+class Axes(Frozen):
+    """The axes that a run draws from; an axis left out is not drawn."""
+
+    camera: CameraAxis | None = None
+    noise: NoiseAxis | None = None
+    language: LanguageAxis | None = None
+
+
+def to_json(perturbations: Iterable[AnyPerturbation]) -> str:
+    """Canonical JSON of a set of perturbations: the same whatever order they were listed in."""
+    ordered = sorted(perturbations, key=lambda p: (-p.layer, p.axis))
+    return _LIST.dump_json(tuple(ordered)).decode()
+
+
+def from_json(text: str) -> tuple[AnyPerturbation, ...]:
+    """Read perturbations back, deepest layer first, which is the order they apply in."""
+    return _LIST.validate_json(text)
+
+
+def in_layers(perturbations: Sequence[AnyPerturbation], *layers: Layer) -> tuple[AnyPerturbation, ...]:
+    return tuple(p for p in perturbations if p.layer in layers)
+
+
+__all__ = ["AnyAxis", "AnyPerturbation", "Axes", "Layer", "Perturbation", "from_json", "in_layers", "to_json"]

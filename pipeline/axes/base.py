@@ -10,9 +10,10 @@ An axis comes as a pair of small frozen models in one file:
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from pydantic import BaseModel, ConfigDict
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 
 class Layer(IntEnum):
@@ -44,3 +45,24 @@ class Perturbation(Frozen):
     layer: ClassVar[Layer]
     views: ClassVar[frozenset[str]]
     """The views of ``schemas/episode.json`` whose frames this can change; empty for text."""
+
+
+def _ordered(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    if not intervals or any(low > high for low, high in intervals):
+        raise ValueError(f"expected one or more [low, high] with low <= high, got {[list(i) for i in intervals]}")
+    return intervals
+
+
+Intervals = Annotated[tuple[tuple[float, float], ...], AfterValidator(_ordered)]
+"""A union of closed intervals, written ``[[low, high], ...]``: ranges with the test set's values cut out."""
+
+
+def draw(rng: np.random.Generator, intervals: Intervals) -> float:
+    """One number, uniform over the union of ``intervals`` and rounded to four decimals (as it will be recorded)."""
+    lengths = [high - low for low, high in intervals]
+    at = rng.uniform(0.0, sum(lengths))
+    for (low, _), length in zip(intervals, lengths, strict=True):
+        if at <= length:
+            return round(low + at, 4)
+        at -= length
+    return round(intervals[-1][1], 4)

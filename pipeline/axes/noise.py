@@ -1,0 +1,279 @@
+"""Sensor noise on the agent view: five image corruptions, a fresh draw for every frame.
+
+The corruptions are those of ImageNet-C (Hendrycks and Dietterich, 2019) as LIBERO-Plus applies them. What the
+benchmark computes with ImageMagick, scikit-image and SciPy is computed here in NumPy and Numba with the same
+arithmetic, in the same order where that decides a grey level, because every component but motion ends by truncation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal, TypeVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+
+from pipeline import seeding
+from pipeline.axes.base import Frozen, Layer, Perturbation
+from pipeline.types import Floats, Frame, Task
+
+Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
+AboveOne = Annotated[float, Field(gt=1)]
+Pixels = NDArray[np.float32]
+Samples = tuple[NDArray[np.intp], Floats]
+"""Where to sample an axis: (N,) lower neighbours and (N,) fractions of the way to the next pixel."""
+
+
+def _to_frame(image: NDArray[np.floating]) -> Frame:
+    """(H, W, 3) in [0, 1] to grey levels, truncated as the benchmark does."""
+    return (image.clip(0, 1) * 255).astype(np.uint8, order="C")
+
+
+@njit(cache=True)
+def _blur_columns(image: Floats, half_kernel: Floats) -> Floats:
+    """(N, M) convolved along axis 0 with a symmetric kernel, given from its centre outwards; edges repeated."""
+    blurred: Floats = image * half_kernel[0]
+    last = len(image) - 1
+    for y in range(len(image)):
+        for k in range(len(half_kernel) - 1, 0, -1):  # outermost pair first, as SciPy sums them
+            above, below = image[max(y - k, 0)], image[min(y + k, last)]
+            for x in range(image.shape[1]):
+                blurred[y, x] += (above[x] + below[x]) * half_kernel[k]
+    return blurred
+
+
+def _gaussian_blur(image: Floats, sigma_px: float) -> Floats:
+    """(H, W, 3) blurred per channel by a Gaussian cut at 4 sigma, edges repeated."""
+    radius = int(4 * sigma_px + 0.5)
+    kernel = np.exp(-0.5 / sigma_px**2 * np.arange(-radius, radius + 1) ** 2)
+    half_kernel = (kernel / kernel.sum())[radius:]
+    for _ in range(2):  # down the columns, then along the rows
+        blurred: Floats = _blur_columns(image.reshape(len(image), -1), half_kernel)
+        image = blurred.reshape(image.shape).swapaxes(0, 1)
+    return image
+
+
+class Motion(Frozen):
+    """Blur by a one-sided Gaussian trail in a direction drawn from +-45 degrees; ImageMagick's MotionBlurImage.
+
+    ``out(p) = sum_i w_i in(p + round(i u))`` for i = 0 .. 2 ``radius_px``, w_i ~ exp(-i^2 / 2 sigma^2), u the unit
+    vector (cos, sin) of the angle in (x right, y down), halves rounded down, edges repeated.
+    """
+
+    component: ClassVar[Component] = "motion"
+    radius_px: PositiveInt
+    sigma_px: PositiveFloat
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        height, width, _ = frame.shape
+        angle_rad = math.radians(rng.uniform(-45, 45))
+        reach = 2 * self.radius_px
+        step = np.arange(reach + 1)
+        weights = np.exp(-(step**2) / (2 * self.sigma_px**2))
+        weights /= weights.sum()
+        dy, dx = (np.ceil(step * u - 0.5).astype(int) for u in (math.sin(angle_rad), math.cos(angle_rad)))
+        padded = np.pad(frame, ((reach, reach), (0, reach), (0, 0)), mode="edge").astype(np.float32)
+        blurred = np.zeros(frame.shape, np.float32)
+        for weight, y, x in zip(weights.astype(np.float32), dy + reach, dx, strict=True):
+            blurred += weight * padded[y : y + height, x : x + width]
+        return np.rint(blurred).astype(np.uint8)
+
+
+class Gaussian(Frozen):
+    """Defocus as a Gaussian blur; scikit-image's ``gaussian`` with its defaults."""
+
+    component: ClassVar[Component] = "gaussian"
+    sigma_px: PositiveFloat
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        return _to_frame(_gaussian_blur(frame / 255, self.sigma_px))
+
+
+@njit(cache=True)
+def _add_resampled(total: Pixels, image: Pixels, rows: Samples, columns: Samples) -> None:
+    """Add to ``total`` (H, W, 3) the image interpolated bilinearly at H rows and W columns."""
+    for i, y in enumerate(rows[0]):
+        v = rows[1][i]
+        for j, x in enumerate(columns[0]):
+            u = columns[1][j]
+            for c in range(3):
+                upper = image[y, x, c] * (1 - v) * (1 - u) + image[y, x + 1, c] * (1 - v) * u
+                lower = image[y + 1, x, c] * v * (1 - u) + image[y + 1, x + 1, c] * v * u
+                total[i, j, c] += np.float32(upper + lower)
+
+
+def _magnified(size: int, scale: float) -> Samples:
+    """Sampling that magnifies the central 1/``scale`` of ``size`` pixels to ``size`` pixels again.
+
+    The corners of the crop map to the corners of its magnification (``scipy.ndimage.zoom``), which is then trimmed
+    around its centre.
+    """
+    crop = math.ceil(size / scale)
+    zoomed = round(crop * scale)
+    position = (np.arange(size) + (zoomed - size) // 2) * ((crop - 1) / (zoomed - 1))
+    lower = np.minimum(position.astype(np.intp), crop - 2)
+    return lower + (size - crop) // 2, position - lower
+
+
+class Zoom(Frozen):
+    """Mean of the frame and of ``copies`` magnifications, evenly spaced from 1 to ``max_scale``."""
+
+    component: ClassVar[Component] = "zoom"
+    max_scale: AboveOne
+    copies: Annotated[int, Field(ge=2)]
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        height, width, _ = frame.shape
+        image = (frame / 255).astype(np.float32, order="C")
+        total = np.zeros_like(image)
+        for scale in np.linspace(1, self.max_scale, self.copies):
+            _add_resampled(total, image, _magnified(height, scale), _magnified(width, scale))
+        return _to_frame((image + total) / np.float32(self.copies + 1))
+
+
+def _diamond_square(jitter: Floats, roughness_decay: float) -> Floats:
+    """Fractal relief in [0, 1] on a torus whose side is a power of two (Fournier, Fussell and Carpenter, 1982).
+
+    Args:
+        jitter: (S, S) uniform in [-1, 1], the random part of each point; that of (0, 0) is not used.
+        roughness_decay: the amplitude of the random part falls by its square with each halving of the step.
+    """
+    side = len(jitter)
+    relief = np.zeros_like(jitter)
+    amplitude = 1.0
+    while side > 1:
+        half = side // 2
+        corner = relief[::side, ::side]
+        below = corner + np.roll(corner, -1, axis=0)
+        centre = (below + np.roll(below, -1, axis=1)) / 4 + amplitude * jitter[half::side, half::side]
+        right = corner + np.roll(corner, -1, axis=1) + centre + np.roll(centre, 1, axis=0)
+        down = below + centre + np.roll(centre, 1, axis=1)
+        relief[half::side, half::side] = centre
+        relief[::side, half::side] = right / 4 + amplitude * jitter[::side, half::side]
+        relief[half::side, ::side] = down / 4 + amplitude * jitter[half::side, ::side]
+        side, amplitude = half, amplitude / roughness_decay**2
+    relief -= relief.min()
+    relief /= relief.max()
+    return relief
+
+
+class Fog(Frozen):
+    """A fractal veil added to the frame x in [0, 1]: ``(x + density veil) m / (m + density)``, m = max(x)."""
+
+    component: ClassVar[Component] = "fog"
+    density: PositiveFloat
+    roughness_decay: AboveOne
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        height, width, _ = frame.shape
+        side = 1 << (max(height, width) - 1).bit_length()
+        veil = _diamond_square(rng.uniform(-1, 1, (side, side)), self.roughness_decay)[:height, :width, None]
+        image = frame / 255
+        brightest = image.max()
+        return _to_frame((image + self.density * veil) * brightest / (brightest + self.density))
+
+
+@njit(cache=True)
+def _scatter(frame: Frame, offsets: NDArray[np.int8], delta_px: int) -> None:
+    """In place and pixel after pixel, from bottom right to top left, replace each by one of its neighbours.
+
+    Args:
+        frame: (H, W, 3); rows and columns up to ``delta_px`` and beyond H or W - ``delta_px`` stay as they are.
+        offsets: (passes, H, W, 2) where each pixel is fetched from: rows down, columns right.
+    """
+    height, width, _ = frame.shape
+    for drawn in offsets:
+        for y in range(height - delta_px, delta_px, -1):
+            for x in range(width - delta_px, delta_px, -1):
+                frame[y, x] = frame[y + drawn[y, x, 0], x + drawn[y, x, 1]]
+
+
+class Glass(Frozen):
+    """Frosted glass: blur, scatter pixels by -delta .. delta - 1 in each direction, blur again.
+
+    ImageNet-C means to swap pixels, but its assignment between NumPy views copies one over the other; so does this.
+    """
+
+    component: ClassVar[Component] = "glass"
+    sigma_px: PositiveFloat
+    delta_px: PositiveInt
+    passes: PositiveInt
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        shape = (self.passes, *frame.shape[:2], 2)
+        offsets = rng.integers(-self.delta_px, self.delta_px, shape, dtype=np.int8)
+        scattered = _to_frame(_gaussian_blur(frame / 255, self.sigma_px))
+        _scatter(scattered, offsets, self.delta_px)
+        return _to_frame(_gaussian_blur(scattered / 255, self.sigma_px))
+
+
+Effect = Motion | Gaussian | Zoom | Fog | Glass
+T = TypeVar("T")
+E = TypeVar("E", Motion, Gaussian, Zoom, Fog, Glass)
+Levels = tuple[T, T, T, T, T]
+"""One value for each strength, weakest first."""
+
+
+class NoisePerturbation(Perturbation):
+    """One corruption at one strength for a whole episode.
+
+    Attributes:
+        effect: the corruption and its parameters.
+        level: 1 to 5, the row of the axis's grid that ``effect`` is.
+        seed: with the index of the frame, the key of everything drawn in :meth:`apply`.
+    """
+
+    axis: Literal["noise"] = "noise"
+    component: Component
+    effect: Effect
+    level: Annotated[int, Field(ge=1, le=5)]
+    seed: int
+
+    layer: ClassVar[Layer] = Layer.PIXELS
+    views: ClassVar[frozenset[str]] = frozenset({"image"})
+
+    @model_validator(mode="after")
+    def _component_is_that_of_effect(self) -> NoisePerturbation:
+        if self.component != self.effect.component:
+            raise ValueError(f"component is {self.component!r}, but the effect's parameters are {self.effect!r}")
+        return self
+
+    def apply(self, frame: Frame, frame_index: int) -> Frame:
+        """A corrupted copy of one frame.
+
+        Args:
+            frame: (H, W, 3) RGB in the raw orientation of the simulator, *before* the rotation by 180 degrees:
+                there the benchmark corrupts, and motion, fog and glass are not symmetric under that rotation.
+            frame_index: place of the frame in its episode; each index has draws of its own.
+        """
+        return self.effect.apply(frame, seeding.rng(self.seed, "noise", frame_index))
+
+
+def _grid(effect: type[E], **parameters: Levels[float]) -> Levels[E]:
+    """An effect at five levels, from one column of values per parameter."""
+    rows = zip(*parameters.values(), strict=True)
+    one, two, three, four, five = (effect(**dict(zip(parameters, row, strict=True))) for row in rows)
+    return one, two, three, four, five
+
+
+class NoiseAxis(Frozen):
+    """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none."""
+
+    motion: Levels[Motion] = _grid(Motion, radius_px=(7, 11, 17, 23, 33), sigma_px=(2.5, 4.5, 7, 11, 17.5))
+    gaussian: Levels[Gaussian] = _grid(Gaussian, sigma_px=(1.5, 3.5, 5.5, 7.5, 9.5))
+    zoom: Levels[Zoom] = _grid(Zoom, max_scale=(1.13, 1.22, 1.33, 1.42, 1.52), copies=(14, 12, 23, 22, 27))
+    fog: Levels[Fog] = _grid(Fog, density=(0.75, 1.75, 2.75, 3.75, 4.75), roughness_decay=(2.9, 2.35, 1.9, 1.55, 1.35))
+    glass: Levels[Glass] = _grid(
+        Glass, sigma_px=(0.6, 0.95, 1.2, 1.65, 2.35), delta_px=(1, 2, 3, 4, 5), passes=(3, 3, 2, 2, 1)
+    )
+
+    def sample(self, rng: np.random.Generator, task: Task, variant: int) -> NoisePerturbation:
+        """A component and a level, each with equal chance, whatever the task and the variant."""
+        grids: tuple[Levels[Effect], ...] = (self.motion, self.gaussian, self.zoom, self.fog, self.glass)
+        grid = grids[rng.integers(len(grids))]
+        level = int(rng.integers(1, 6))
+        effect = grid[level - 1]
+        seed = int(rng.integers(2**53))  # what every JSON reader keeps exactly
+        return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=seed)

@@ -1,0 +1,166 @@
+"""The typed configuration: one file is one complete run, a section per stage, nothing inherited."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from pipeline.axes import Axes
+from pipeline.axes.base import Frozen
+from pipeline.demos import DemoIndex, DemoSource, HDF5Source, StarterSource
+from pipeline.errors import PipelineError
+from pipeline.tasks import select_tasks
+
+Count = Annotated[int, Field(ge=1)]
+
+
+class DemosConfig(Frozen):
+    """Which demonstrations to start from.
+
+    Attributes:
+        source: ``starter`` for the 130 demonstrations that a Python package carries, ``hdf5`` for LIBERO's own files.
+        root: folder with ``<suite>/<task>_demo.hdf5``; only with ``source: hdf5``.
+        tasks: shell-style patterns matched against ``<suite>/<task>``.
+        per_task: at most so many demonstrations of each task; all of them when left out.
+    """
+
+    source: Literal["starter", "hdf5"] = "starter"
+    root: Path | None = None
+    tasks: tuple[str, ...] = ("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*")
+    per_task: Count | None = None
+
+    @model_validator(mode="after")
+    def _root_with_hdf5(self) -> DemosConfig:
+        if (self.source == "hdf5") != (self.root is not None):
+            raise ValueError("root goes with source: hdf5, and only with it")
+        return self
+
+    def open(self) -> DemoSource:
+        return StarterSource() if self.root is None else HDF5Source(self.root)
+
+    def index(self) -> DemoIndex:
+        """The demonstrations that a run starts from, and those that cannot be used."""
+        return self.open().index(select_tasks(self.tasks), self.per_task)
+
+
+class PlanConfig(Frozen):
+    """What to make of them.
+
+    Attributes:
+        seed: every random draw of the run is keyed by it.
+        axes: the ranges each axis draws from.
+        episodes: for each axis of ``axes``, how many kept episodes are wanted, spread evenly over the tasks.
+        reserve: share of further candidates to draw, used in order where an episode fails.
+    """
+
+    seed: int
+    axes: Axes
+    episodes: dict[Literal["camera", "noise", "language"], Count]
+    reserve: float = Field(default=0.0, ge=0.0, le=10.0)
+
+    @model_validator(mode="after")
+    def _axes_match_episodes(self) -> PlanConfig:
+        configured = {name for name in Axes.model_fields if getattr(self.axes, name) is not None}
+        if configured != set(self.episodes):
+            raise ValueError(
+                f"axes and episodes must name the same axes, got {sorted(configured)} and {sorted(self.episodes)}"
+            )
+        return self
+
+
+class ReplayConfig(Frozen):
+    """How demonstrations are replayed.
+
+    Attributes:
+        mode: ``open_loop`` sends the recorded actions as they are.
+        noops: ``drop`` skips every no-op (OpenVLA's rule), ``trim_ends`` only those before the first and after the
+            last real action, ``keep`` none.
+        fixture_seed: seeds LIBERO's reset where the source did not record the scene.
+    """
+
+    mode: Literal["open_loop"] = "open_loop"
+    noops: Literal["drop", "trim_ends", "keep"] = "drop"
+    fixture_seed: int = Field(default=0, ge=0, lt=2**32)
+
+
+class RenderConfig(Frozen):
+    """How episodes are rendered; the size is that of ``schemas/episode.json``."""
+
+    encoding: Literal["jpeg"] = "jpeg"
+    jpeg_quality: int = Field(default=95, ge=50, le=100)
+
+
+class RldsConfig(Frozen):
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    shards: Count
+
+
+class LeRobotConfig(Frozen):
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    parts: Count
+
+
+class ExportConfig(Frozen):
+    rlds: RldsConfig
+    lerobot: LeRobotConfig
+
+
+class ComputeConfig(Frozen):
+    """Where the work runs; it never changes the result.
+
+    Attributes:
+        cluster: ``local`` starts worker processes here, ``loop`` runs everything in this process, anything with
+            ``://`` is the address of a Dask scheduler.
+        workers: processes of a local cluster; one for each core when left out.
+    """
+
+    cluster: str = Field(default="local", pattern=r"^(local|loop|\w+://.+)$")
+    workers: Count | None = None
+
+
+class Config(Frozen):
+    """A whole run."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    demos: DemosConfig
+    plan: PlanConfig
+    replay: ReplayConfig = ReplayConfig()
+    render: RenderConfig = RenderConfig()
+    export: ExportConfig
+    compute: ComputeConfig = ComputeConfig()
+
+    @property
+    def data(self) -> Path:
+        """The folder that everything this run makes lies in."""
+        return Path("data") / self.name
+
+
+def load(path: Path) -> Config:
+    """Read and validate a configuration.
+
+    Raises:
+        PipelineError: naming the file, every field that is wrong, and what would have worked.
+    """
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise PipelineError(
+            "cannot read the configuration", where=path, remedy=f"one of {sorted(map(str, Path('configs').glob('*')))}"
+        ) from error
+    try:
+        return Config.model_validate(yaml.safe_load(text))
+    except yaml.YAMLError as error:
+        raise PipelineError(f"not valid YAML: {error}", where=path) from error
+    except ValidationError as error:
+        faults = [
+            f"{'.'.join(str(part) for part in fault['loc']) or 'top level'}: {fault['msg']} (got {fault['input']!r:.80})"
+            for fault in error.errors()
+        ]
+        raise PipelineError(
+            "the configuration is not valid:\n    " + "\n    ".join(faults),
+            where=path,
+            expected="the fields and ranges of schemas/config.schema.json",
+        ) from error

@@ -1,0 +1,250 @@
+"""Sources of demonstrations: the starter set, and LIBERO's own HDF5 files. Needs no simulator."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path, PurePosixPath
+from typing import Protocol
+
+import h5py
+import numpy as np
+import yaml
+
+from pipeline import hdf5
+from pipeline.assets import package_folder, relocate
+from pipeline.errors import PipelineError
+from pipeline.tasks import SUITES, find_task, tasks
+from pipeline.types import Demo, Floats, Task
+
+
+@dataclass(frozen=True)
+class DemoEntry:
+    """A demonstration in a source's index: all that planning needs, without its arrays.
+
+    Attributes:
+        task, key, source, sha256: as in ``Demo``.
+        steps: number of actions, 20 a second.
+    """
+
+    task: Task
+    key: str
+    source: str
+    sha256: str
+    steps: int
+
+    @property
+    def demo_id(self) -> str:
+        return f"{self.task.suite}/{self.task.name}/{self.key}"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something in a source that cannot be used.
+
+    Attributes:
+        name: a demonstration's id, or ``<suite>/<task>`` when its whole file is unusable.
+        error: why, and what to do.
+    """
+
+    name: str
+    error: PipelineError
+
+
+@dataclass(frozen=True)
+class DemoIndex:
+    """What a source holds. Every entry was read and checked once, so it can be loaded."""
+
+    entries: list[DemoEntry]
+    problems: list[Problem]
+
+
+class DemoSource(Protocol):
+    """Where demonstrations come from."""
+
+    def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
+        """The first ``per_task`` usable demonstrations of each task (all by default), and what was unusable."""
+        ...
+
+    def load(self, demo_id: str) -> Demo:
+        """One demonstration, by ``<suite>/<task>/<key>``.
+
+        Raises:
+            PipelineError: when it is not there or cannot be used.
+        """
+        ...
+
+
+class StarterSource:
+    """One human LIBERO demonstration for each of the 130 tasks, carried by the package ``robouse``.
+
+    Actions are rounded to six decimals; of the states only the first is there, and the scene's model is not.
+    """
+
+    def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
+        del per_task  # There is one for each task, and a count is at least one.
+        return DemoIndex([_entry(self._read(task)) for task in wanted], [])
+
+    def load(self, demo_id: str) -> Demo:
+        task, key = _parse(demo_id)
+        demo = self._read(task)
+        if demo.key != key:
+            raise PipelineError(f"the starter set has no {demo_id}", expected=demo.demo_id)
+        return demo
+
+    def _read(self, task: Task) -> Demo:
+        group = "libero-90" if task.suite == "libero_90" else "libero"
+        name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
+        folder = package_folder("robouse") / "bundled_tasks" / group / name
+        try:
+            front_matter = (folder / "task.md").read_text().split("\n---\n")[0]
+            header = yaml.load(front_matter, Loader=yaml.CSafeLoader)["robouse"]
+            recorded = json.loads((folder / "oracle" / "demo_actions.json").read_text())
+            if (header["suite"], header["env"]) != (task.suite, task.name):
+                raise ValueError(f"holds {header['suite']}/{header['env']}")
+            key, source = recorded["demo"], f"{recorded['source']} {recorded['demo']}"
+            actions, init_state = np.array(recorded["actions"], np.float64), np.array(header["init_state"], np.float64)
+        except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError) as error:
+            raise PipelineError(
+                f"no starter demonstration of {task.suite}/{task.name} ({error})",
+                where=folder,
+                remedy="pip install --force-reinstall robouse==0.2.0",
+            ) from error
+        return _demo(task, key, source, actions, init_state[None], None, where=str(folder))
+
+
+@dataclass(frozen=True)
+class HDF5Source:
+    """LIBERO's demonstrations as published: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file.
+
+    Attributes:
+        root: the folder that holds the suites.
+    """
+
+    root: Path
+
+    def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
+        wanted = list(wanted)
+        entries: list[DemoEntry] = []
+        problems = [stray for suite in dict.fromkeys(task.suite for task in wanted) for stray in self._strays(suite)]
+        for task in wanted:
+            name, usable = f"{task.suite}/{task.name}", 0
+            try:
+                with self._data(task) as data:
+                    for key in hdf5.names(data, str(self._path(task))):
+                        if usable == per_task:
+                            break
+                        try:
+                            entries.append(_entry(self._read(task, key, data)))
+                            usable += 1
+                        except PipelineError as error:
+                            problems.append(Problem(f"{name}/{key}", error))
+            except PipelineError as error:
+                problems.append(Problem(name, error))
+        return DemoIndex(entries, problems)
+
+    def load(self, demo_id: str) -> Demo:
+        task, key = _parse(demo_id)
+        with self._data(task) as data:
+            return self._read(task, key, data)
+
+    def _path(self, task: Task) -> Path:
+        return self.root / task.suite / f"{task.name}_demo.hdf5"
+
+    def _strays(self, suite: str) -> Iterator[Problem]:
+        """The files that go with no task of LIBERO's list."""
+        folder = self.root / suite
+        if not folder.is_dir():
+            raise PipelineError(
+                "no such folder",
+                where=folder,
+                expected="<root>/<suite>/<task>_demo.hdf5",
+                remedy="set demos.root to the folder that holds the suites, or use the starter set",
+            )
+        for path in sorted(folder.glob("*.hdf5")):
+            try:
+                find_task(suite, path.name.removesuffix("_demo.hdf5"))
+            except PipelineError as error:
+                yield Problem(f"{suite}/{path.name}", PipelineError(error.what, where=path, expected=error.expected))
+
+    @contextmanager
+    def _data(self, task: Task) -> Iterator[h5py.Group]:
+        path = self._path(task)
+        with hdf5.opened(path) as file:
+            data = hdf5.member(file, "data", h5py.Group, str(path))
+            # Of the places that name the task, only this one was corrected for publication; the tasks' earlier names
+            # stay in env_args. A name that no task has is taken for one of those.
+            recorded = PurePosixPath(hdf5.text(data, "bddl_file_name", f"{path} data")).stem
+            if recorded != task.name and recorded in _task_names():
+                raise PipelineError(
+                    f"named after one task but recorded for another, {recorded!r} (bddl_file_name)",
+                    where=path,
+                    remedy=f"rename it to {recorded}_demo.hdf5",
+                )
+            yield data
+
+    def _read(self, task: Task, key: str, data: h5py.Group) -> Demo:
+        path = self._path(task)
+        where = f"{path} data/{key}"
+        if not re.fullmatch(r"demo_\d+", key):
+            raise PipelineError("not a demonstration", where=where, expected="a group named demo_<number>")
+        group = hdf5.member(data, key, h5py.Group, where)
+        actions, states = hdf5.array(group, "actions", where), hdf5.array(group, "states", where)
+        init_state = hdf5.numbers(group, "init_state", where)
+        if len(states) != len(actions) or not (init_state is None or np.array_equal(init_state, states[0])):
+            raise PipelineError(
+                f"actions {actions.shape}, states {states.shape} and the attribute init_state do not agree",
+                where=where,
+                expected="one state for each action, the first of them equal to init_state",
+                remedy=hdf5.AGAIN,
+            )
+        # Named within the set, not on this machine: provenance must not change from machine to machine.
+        source = f"{task.suite}/{path.name} {key}"
+        return _demo(task, key, source, actions, states, hdf5.text(group, "model_file", where), where)
+
+
+def _demo(
+    task: Task, key: str, source: str, actions: Floats, states: Floats, model_file: str | None, where: str
+) -> Demo:
+    """Check what was recorded and make a ``Demo`` of it. States are (T, S), or (1, S) when only the first is known."""
+    fault = None
+    if actions.ndim != 2 or actions.shape[1] != 7 or len(actions) == 0:
+        fault = f"actions have shape {actions.shape}"
+    elif states.ndim != 2 or states.shape[1] == 0:
+        fault = f"states have shape {states.shape}"
+    elif not (np.isfinite(actions).all() and np.isfinite(states).all()):
+        fault = "actions or states hold NaN or infinity"
+    elif np.abs(actions).max() > 1 + 1e-6:
+        fault = f"actions reach {np.abs(actions).max():.6g}"
+    if fault:
+        expected = "actions (T, 7) in [-1, 1] and states (T, S), all finite"
+        raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.AGAIN)
+    # Hash the model as recorded: relocated, it would differ from machine to machine.
+    content = hashlib.sha256()
+    for array in (actions, states):
+        content.update(repr(array.shape).encode())
+        content.update(array.astype("<f8").tobytes())
+    content.update((model_file or "").encode())
+    model_xml = None if model_file is None else relocate(model_file, where=f"{where} model_file")
+    return Demo(task, key, source, content.hexdigest(), actions, states[0].copy(), model_xml)
+
+
+def _entry(demo: Demo) -> DemoEntry:
+    return DemoEntry(demo.task, demo.key, demo.source, demo.sha256, len(demo.actions))
+
+
+def _parse(demo_id: str) -> tuple[Task, str]:
+    parts = demo_id.split("/")
+    if len(parts) != 3:
+        raise PipelineError(f"not a demonstration's id: {demo_id!r}", expected="<suite>/<task>/<key>")
+    return find_task(parts[0], parts[1]), parts[2]
+
+
+@cache
+def _task_names() -> frozenset[str]:
+    return frozenset(task.name for suite in SUITES for task in tasks(suite))

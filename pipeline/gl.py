@@ -1,0 +1,169 @@
+"""Which OpenGL renders: a GPU through EGL, else Mesa in software through EGL, else OSMesa.
+
+mujoco and robosuite read ``MUJOCO_GL`` when they are imported, so choose before importing either; worker processes
+inherit the choice. Two renderers may differ by some grey levels, so the choice is said aloud and worth recording.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.errors import PipelineError
+
+BACKENDS = ("egl", "osmesa")
+REMEDY = "apt-get install -y libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libosmesa6   (as root, or let setup.sh do it)"
+NVIDIA_REMEDY = "install NVIDIA's EGL driver (in a container, have graphics among NVIDIA_DRIVER_CAPABILITIES)"
+
+
+@dataclass(frozen=True)
+class GlChoice:
+    """What renders in this process and in those it starts.
+
+    Attributes:
+        backend: ``egl`` or ``osmesa``.
+        device: the renderer and its driver, as OpenGL names them.
+        reason: why this one.
+    """
+
+    backend: str
+    device: str
+    reason: str
+
+    @property
+    def software(self) -> bool:
+        return _is_software(self.device)
+
+    def __str__(self) -> str:
+        return f"rendering with {self.backend} on {self.device}: {self.reason}"
+
+
+@functools.cache
+def choose() -> GlChoice:
+    """Try what is there in short subprocesses (0.7 s each), set the environment, return the choice for printing.
+
+    ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set.
+
+    Raises:
+        PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does.
+    """
+    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    faults = {}
+    for backend in BACKENDS:
+        if asked not in ("", backend):
+            continue
+        try:
+            device, index = _best_device(backend)
+        except _NoDeviceError as error:
+            faults[backend] = str(error)
+            continue
+        os.environ.update(MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
+        if index is not None:
+            os.environ["MUJOCO_EGL_DEVICE_ID"] = index
+        return GlChoice(backend, device, "MUJOCO_GL asks for it" if asked else _reason(backend, device, faults))
+
+    what = "; ".join(f"{backend} fails: {fault}" for backend, fault in faults.items())
+    if not asked:
+        raise PipelineError(f"no OpenGL renders here ({what})", expected=" or ".join(BACKENDS), remedy=REMEDY)
+    working = _working_backends()
+    raise PipelineError(
+        f"MUJOCO_GL={asked} does not render here ({what or 'unknown, or it needs a display'})",
+        where="environment",
+        expected=" or ".join(working) or f"{' or '.join(BACKENDS)}, though neither works on this machine",
+        remedy="unset MUJOCO_GL" if working else REMEDY,
+    )
+
+
+class _NoDeviceError(Exception):
+    """A back end that rendered nothing, and why."""
+
+
+def _working_backends() -> list[str]:
+    working = []
+    for backend in BACKENDS:
+        try:
+            device, _ = _best_device(backend)
+        except _NoDeviceError:
+            continue
+        working.append(f"{backend} ({device})")
+    return working
+
+
+def _best_device(backend: str) -> tuple[str, str | None]:
+    """The first GPU, or else the first renderer, as its name and the ``MUJOCO_EGL_DEVICE_ID`` it needs."""
+    indices: list[str | None] = [os.environ.get("MUJOCO_EGL_DEVICE_ID")]
+    # Render on the GPU that the job was given, where EGL and CUDA count alike: robosuite goes by the same rule, and
+    # refuses a device that is not in this list. Without an index mujoco takes the first device that answers.
+    first_visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0]
+    if backend == "egl" and indices == [None] and first_visible.isdigit():
+        indices.insert(0, first_visible)
+
+    found: list[tuple[str, str | None]] = []
+    fault = ""
+    for index in indices:
+        try:
+            device = _probe(backend, index)
+        except _NoDeviceError as error:
+            fault = str(error)
+            continue
+        if not _is_software(device):
+            return device, index
+        found.append((device, index))
+    if not found:
+        raise _NoDeviceError(fault)
+    return found[0]
+
+
+def _probe(backend: str, index: str | None) -> str:
+    """Render one frame in a process of its own, as a broken driver may take its process down."""
+    environment = os.environ | {"MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    if index is not None:
+        environment["MUJOCO_EGL_DEVICE_ID"] = index
+    command = [sys.executable, "-m", "pipeline.gl"]
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    except subprocess.TimeoutExpired:
+        raise _NoDeviceError("no frame within 60 s") from None
+    if done.returncode != 0:
+        raise _NoDeviceError(done.stdout.strip() or f"the driver ended the process with status {done.returncode}")
+    return done.stdout.strip()
+
+
+def has_nvidia_gpu() -> bool:
+    return any(Path("/dev").glob("nvidia[0-9]*"))
+
+
+def _is_software(device: str) -> bool:
+    return device.startswith(("llvmpipe", "softpipe", "swrast"))
+
+
+def _reason(backend: str, device: str, faults: dict[str, str]) -> str:
+    if not _is_software(device):
+        return "a GPU"
+    if has_nvidia_gpu():
+        return f"software, many times slower than the GPU that is there; {NVIDIA_REMEDY}"
+    return f"software, as EGL fails: {faults['egl']}" if backend == "osmesa" else "software, as no GPU answers"
+
+
+def _render_once() -> str:
+    """The renderer of this process; a context alone proves little, so it renders a frame."""
+    import mujoco
+    from OpenGL import GL
+
+    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><light/><geom size='1'/></worldbody></mujoco>")
+    with mujoco.Renderer(model, 64, 64) as renderer:
+        renderer.update_scene(mujoco.MjData(model))
+        renderer.render()
+        return ", ".join(GL.glGetString(name).decode() for name in (GL.GL_RENDERER, GL.GL_VERSION))
+
+
+if __name__ == "__main__":
+    try:
+        print(_render_once())
+    except Exception as error:  # drivers and loaders fail in many ways, and each is an answer here
+        print(f"{type(error).__name__}: {error}")
+        sys.exit(1)

@@ -1,0 +1,208 @@
+"""LIBERO's HDF5 layout: reading its parts without trusting them, and writing it."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.assets import package_folder
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.types import Floats, Task
+
+AGAIN = "delete the file and download it again; the starter set needs no download"
+
+# LIBERO's longest demonstrations have some 500 steps; without a limit a few bytes of header could ask for all memory.
+_MAX_NUMBERS = 10_000_000
+_Node = TypeVar("_Node", h5py.Group, h5py.Dataset)
+
+
+@contextmanager
+def _undamaged(where: str) -> Iterator[None]:
+    """Turn all that h5py raises on truncated or overwritten bytes into one error."""
+    try:
+        yield
+    except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
+        raise PipelineError(
+            f"not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=AGAIN
+        ) from error
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[h5py.File]:
+    """An HDF5 file, open for reading.
+
+    Raises:
+        PipelineError: when it is missing or truncated.
+    """
+    if not path.is_file():
+        raise PipelineError("no such file", where=path, remedy="download it, or leave its task out of demos.tasks")
+    with _undamaged(str(path)):
+        # Many workers read and nobody writes, and locks fail on some network file systems.
+        file = h5py.File(path, "r", locking=False)
+    with file:
+        yield file
+
+
+def names(group: h5py.Group, where: str) -> list[str]:
+    """A group's member names in natural order, ``demo_2`` before ``demo_10``."""
+    with _undamaged(where):
+        return sorted(group, key=lambda name: [part.zfill(20) for part in re.split(r"(\d+)", name)])
+
+
+def member(group: h5py.Group, name: str, kind: type[_Node], where: str) -> _Node:
+    """A group's member, which must be of that kind and in the same file: a link could lead to any file."""
+    with _undamaged(where):
+        link = group.get(name, getlink=True)
+        found = group[name] if isinstance(link, h5py.HardLink) else link
+    if not isinstance(found, kind):
+        what = "missing" if found is None else f"a {type(found).__name__}"
+        raise PipelineError(f"{name!r} is {what}", where=where, expected=f"a {kind.__name__}", remedy=AGAIN)
+    return found
+
+
+def array(group: h5py.Group, name: str, where: str) -> Floats:
+    """A group's (T, N) dataset of floating-point numbers."""
+    dataset = member(group, name, h5py.Dataset, where)
+    with _undamaged(where):
+        if dataset.external or dataset.is_virtual:
+            raise PipelineError(f"{name!r} takes its numbers from another file", where=where, remedy=AGAIN)
+        if dataset.dtype.kind != "f" or dataset.ndim != 2 or not 0 < dataset.size <= _MAX_NUMBERS:
+            raise PipelineError(
+                f"{name!r} holds {dataset.dtype} of shape {dataset.shape}",
+                where=where,
+                expected="floating-point numbers of shape (T, N)",
+                remedy=AGAIN,
+            )
+        return np.asarray(dataset[()], np.float64)
+
+
+def numbers(group: h5py.Group, name: str, where: str) -> Floats | None:
+    """A group's attribute as floating-point numbers, None when there is none."""
+    with _undamaged(where):
+        return np.asarray(group.attrs[name], np.float64) if name in group.attrs else None
+
+
+def text(group: h5py.Group, name: str, where: str) -> str:
+    """A group's text attribute."""
+    with _undamaged(where):
+        value = group.attrs.get(name)
+        if isinstance(value, bytes):
+            value = value.decode()
+    if not isinstance(value, str):
+        raise PipelineError(
+            f"attribute {name!r} is {'missing' if value is None else 'not text'}",
+            where=where,
+            expected="LIBERO's own files, which record the scene of every demonstration in model_file",
+            remedy="use the published files, not a re-rendered or converted copy of them",
+        )
+    return value
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A demonstration with all its states, as LIBERO's HDF5 files hold it.
+
+    Attributes:
+        actions: (T, 7) OSC_POSE deltas and gripper, in [-1, 1].
+        states: (T, S) flattened MuJoCo state before each action: time, qpos, qvel.
+        robot_states: (T, 9) finger positions, end-effector position in m, end-effector quaternion (x, y, z, w).
+        model_file: MJCF of the scene.
+        obs: name to (T, ...), such as ``agentview_rgb`` (T, 128, 128, 3) or ``ee_pos`` (T, 3).
+    """
+
+    actions: Floats
+    states: Floats
+    robot_states: Floats
+    model_file: str
+    obs: Mapping[str, NDArray[Any]]
+
+
+def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
+    """Write a task's demonstrations the way LIBERO publishes them, so that whatever reads its files reads this one.
+
+    The same recordings make the same bytes.
+    """
+    bddl = task.bddl_file.read_text()
+    problem = _in_bddl(bddl, "problem")
+    bddl_file = f"libero/libero/bddl_files/{task.suite}/{task.name}.bddl"
+    controller = package_folder("robosuite") / "controllers" / "config" / "osc_pose.json"
+    env_kwargs = {
+        "robots": ["Panda"],
+        "controller_configs": json.loads(controller.read_text()),
+        "bddl_file_name": bddl_file,
+        "has_renderer": False,
+        "has_offscreen_renderer": True,
+        "ignore_done": True,
+        "use_camera_obs": True,
+        "camera_depths": False,
+        "camera_names": ["robot0_eye_in_hand", "agentview"],
+        "reward_shaping": True,
+        "control_freq": 20,
+        "camera_heights": 128,
+        "camera_widths": 128,
+        "camera_segmentations": None,
+    }
+    env_args = {
+        "type": 1,
+        "env_name": problem.replace("LIBERO_", "Libero_"),
+        "problem_name": problem.lower(),
+        "bddl_file": bddl_file,
+        "env_kwargs": env_kwargs,
+    }
+    problem_info = {
+        "problem_name": problem.lower(),
+        "domain_name": "robosuite",
+        "language_instruction": _in_bddl(bddl, ":language").lower(),
+    }
+    with replaced(path) as temporary, h5py.File(temporary, "w") as file:
+        data, total, count = file.create_group("data"), 0, 0
+        for count, recording in enumerate(recordings, start=1):
+            _write_demo(data.create_group(f"demo_{count - 1}"), recording)
+            total += len(recording.actions)
+        data.attrs.update(
+            env_name=env_args["env_name"],
+            env_args=json.dumps(env_args),
+            problem_info=json.dumps(problem_info),
+            bddl_file_name=bddl_file,
+            bddl_file_content=bddl,
+            macros_image_convention="opengl",
+            tag="libero-v1",
+            num_demos=count,
+            total=total,
+        )
+
+
+def _write_demo(group: h5py.Group, recording: Recording) -> None:
+    steps = len(recording.actions)
+    at_end = np.zeros(steps, np.uint8)
+    at_end[-1] = 1
+    content: dict[str, NDArray[Any]] = {
+        "actions": recording.actions,
+        "states": recording.states,
+        "robot_states": recording.robot_states,
+        "rewards": at_end,
+        "dones": at_end,
+        **{f"obs/{name}": values for name, values in recording.obs.items()},
+    }
+    for name, values in content.items():
+        if len(values) != steps:
+            raise ValueError(f"{name} has {len(values)} rows for {steps} actions")
+        group.create_dataset(name, data=values)
+    group.attrs.update(num_samples=steps, model_file=recording.model_file, init_state=recording.states[0])
+
+
+def _in_bddl(bddl: str, keyword: str) -> str:
+    found = re.search(rf"\({keyword}\s+([^()]+)\)", bddl)
+    if found is None:
+        raise PipelineError(f"the BDDL file has no ({keyword} ...)", remedy="reinstall LIBERO")
+    return found[1].strip()

@@ -1,0 +1,206 @@
+"""The plan: a table with one row per wanted episode. All randomness is drawn here, keyed, never by position."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.axes import AnyPerturbation, in_layers, to_json
+from pipeline.axes.base import Layer
+from pipeline.config import PlanConfig, ReplayConfig
+from pipeline.demos import DemoEntry
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.seeding import digest, rng
+from pipeline.types import Verdict
+
+_ATTEMPTS = 100
+
+
+@dataclass(frozen=True)
+class Row:
+    """One candidate episode.
+
+    Attributes:
+        episode_id: hash of the demonstration, the perturbations and the way it is replayed.
+        twin_id: the episode of the same demonstration without perturbations (its own id for a twin).
+        trajectory_id: the physics it is rendered from; episodes that differ in render, pixels or text share it.
+        role: ``twin`` or ``perturbed``.
+        axis, component: what is perturbed; ``clean`` for a twin.
+        perturbations: canonical JSON with every parameter.
+        instruction: the text the policy is prompted with.
+        rank: place among the candidates of its (axis, task).
+        wanted: False for a reserve, used only where a candidate before it fails.
+        seed, variant: with axis and demonstration, the key that the parameters were drawn under.
+    """
+
+    episode_id: str
+    twin_id: str
+    trajectory_id: str
+    role: str
+    suite: str
+    task: str
+    demo_id: str
+    demo_sha256: str
+    demo_source: str
+    demo_steps: int
+    axis: str
+    component: str
+    perturbations: str
+    instruction: str
+    replay_mode: str
+    rank: int
+    wanted: bool
+    seed: int
+    variant: int
+
+
+def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig) -> list[Row]:
+    """Draw the plan: a clean twin of every demonstration, then each axis's candidates, task by task.
+
+    Raises:
+        PipelineError: when there is nothing to plan from, or an axis has too few distinct draws for its quota.
+    """
+    if not demos:
+        raise PipelineError("no demonstrations to plan from", remedy="widen demos.tasks or check demos.root")
+    by_task: dict[str, list[DemoEntry]] = defaultdict(list)
+    for demo in demos:
+        by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
+    rows = [_row(demo, (), plan.seed, 0, rank, True, replay) for group in by_task.values() for rank, demo in enumerate(group)]
+    for axis, episodes in plan.episodes.items():
+        for (_, group), wanted in zip(by_task.items(), _shares(episodes, len(by_task)), strict=True):
+            rows += _candidates(axis, group, wanted, plan, replay)
+    return rows
+
+
+def _shares(total: int, parts: int) -> list[int]:
+    """``total`` dealt out evenly; the first parts get one more where it does not divide."""
+    return [total // parts + (index < total % parts) for index in range(parts)]
+
+
+def _candidates(
+    axis: str, group: Sequence[DemoEntry], wanted: int, plan: PlanConfig, replay: ReplayConfig
+) -> Iterator[Row]:
+    """A task's candidates on one axis: every demonstration's first variant, then every second one, and so on."""
+    sampler = getattr(plan.axes, axis)
+    seen: set[str] = set()
+    for rank in range(wanted + round(wanted * plan.reserve)):
+        demo, variant = group[rank % len(group)], rank // len(group)
+        for attempt in range(_ATTEMPTS):
+            draw = sampler.sample(rng(plan.seed, axis, demo.demo_id, variant, attempt), demo.task, variant)
+            row = _row(demo, (draw,), plan.seed, variant, rank, rank < wanted, replay)
+            if row.episode_id not in seen:
+                break
+        else:
+            if rank < wanted:
+                raise PipelineError(
+                    f"the {axis} axis has no {rank + 1} different draws for {demo.task.suite}/{demo.task.name}",
+                    where=f"plan.episodes.{axis}",
+                    expected=f"at most {rank} episodes for this task",
+                    remedy="ask for fewer episodes, widen the axis's ranges or use more demonstrations",
+                )
+            return
+        seen.add(row.episode_id)
+        yield row
+
+
+def _row(
+    demo: DemoEntry,
+    perturbations: tuple[AnyPerturbation, ...],
+    seed: int,
+    variant: int,
+    rank: int,
+    wanted: bool,
+    replay: ReplayConfig,
+) -> Row:
+    how = replay.model_dump()
+    physics = to_json(in_layers(perturbations, Layer.PHYSICS))
+    listed = to_json(perturbations)
+    instruction = demo.task.instruction
+    for change in in_layers(perturbations, Layer.TEXT):
+        instruction = change.apply(instruction)
+    return Row(
+        episode_id=digest("episode", demo.sha256, how, listed)[:16],
+        twin_id=digest("episode", demo.sha256, how, "[]")[:16],
+        trajectory_id=digest("trajectory", demo.sha256, how, physics)[:16],
+        role="perturbed" if perturbations else "twin",
+        suite=demo.task.suite,
+        task=demo.task.name,
+        demo_id=demo.demo_id,
+        demo_sha256=demo.sha256,
+        demo_source=demo.source,
+        demo_steps=demo.steps,
+        axis="+".join(p.axis for p in perturbations) or "clean",
+        component="+".join(p.component for p in perturbations) or "clean",
+        perturbations=listed,
+        instruction=instruction,
+        replay_mode=replay.mode,
+        rank=rank,
+        wanted=wanted,
+        seed=seed,
+        variant=variant,
+    )
+
+
+def write(rows: Sequence[Row], path: Path) -> None:
+    table = pa.Table.from_pylist([asdict(row) for row in rows])
+    with replaced(path) as temporary:
+        pq.write_table(table, temporary)
+
+
+def read(path: Path) -> list[Row]:
+    """Read a plan back.
+
+    Raises:
+        PipelineError: when the file is not a plan of this version.
+    """
+    try:
+        table = pq.read_table(path)
+        return [Row(**row) for row in table.select([field.name for field in fields(Row)]).to_pylist()]
+    except (OSError, pa.ArrowException, KeyError, TypeError) as error:
+        raise PipelineError("not a readable plan", where=path, remedy="run the plan stage again") from error
+
+
+def pending(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> list[str]:
+    """The trajectories that have to be replayed next, in plan order, given what is known so far.
+
+    Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
+    """
+    wanted: dict[str, None] = {}
+    for group in _groups(rows):
+        need = sum(row.wanted for row in group)
+        for row in group:
+            verdict = verdicts.get(row.trajectory_id)
+            if need and (verdict is None or verdict.kept):
+                need -= 1
+                if verdict is None:
+                    wanted[row.trajectory_id] = None
+    return list(wanted)
+
+
+def select(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> dict[str, Verdict]:
+    """What became of every row: kept, dropped with its trajectory's reason, or a reserve that was not needed."""
+    outcome: dict[str, Verdict] = {}
+    for group in _groups(rows):
+        need = sum(row.wanted for row in group)
+        for row in group:
+            verdict = verdicts.get(row.trajectory_id, Verdict(False, "not_replayed"))
+            if not need:
+                verdict = Verdict(False, "reserve_not_needed")
+            need -= verdict.kept
+            outcome[row.episode_id] = verdict
+    return outcome
+
+
+def _groups(rows: Iterable[Row]) -> list[list[Row]]:
+    """Rows that fill one quota: the twins and each axis, task by task, in order of rank."""
+    groups: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[row.axis, row.suite, row.task].append(row)
+    return [sorted(group, key=lambda row: row.rank) for group in groups.values()]
+

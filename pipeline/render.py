@@ -1,0 +1,173 @@
+"""States to frames: every picture comes from stored states, so one replay is rendered under many perturbations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.axes import AnyPerturbation, Layer, from_json, in_layers, to_json
+from pipeline.compute import Run
+from pipeline.config import Config, RenderConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.episodes import verdicts
+from pipeline.frames import Stream, encode, streams_of, to_policy
+from pipeline.plan import Row, select
+from pipeline.store import FrameStore, Rendered, TrajectoryStore
+from pipeline.types import Frame, Trajectory
+
+VISUAL_FIELDS = ("cam_pos", "cam_quat")
+"""The model's arrays that render-layer perturbations may write, put back after each."""
+
+
+class Renderer:
+    """Renders one scene through one GL context; close it before the next is made.
+
+    Args:
+        model_xml: MJCF of the scene.
+
+    Raises:
+        PipelineError: when no GL back end was chosen (see ``pipeline.gl``).
+    """
+
+    def __init__(self, model_xml: str):
+        height, width, _ = SCHEMA.frame.shape
+        self.model = mujoco.MjModel.from_xml_string(model_xml)
+        self.data = mujoco.MjData(self.model)
+        self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
+        self._option = mujoco.MjvOption()
+        # As robosuite's off-screen context: visual meshes without the collision geometry.
+        self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
+
+    def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
+        """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
+        nq, nv = self.model.nq, self.model.nv
+        self.data.time = state[0]
+        self.data.qpos[:] = state[1 : 1 + nq]
+        self.data.qvel[:] = state[1 + nq : 1 + nq + nv]
+        self.model.site_rgba[:, 3] = site_alpha
+        mujoco.mj_forward(self.model, self.data)
+
+    def frame(self, camera: str) -> Frame:
+        """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
+        self._renderer.update_scene(self.data, camera, self._option)
+        return np.ascontiguousarray(self._renderer.render()[::-1])
+
+    def proprioception(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """State (8,) and joint state (7,) of the restored state; names and units in ``schemas/episode.json``."""
+        position = self.data.site("gripper0_grip_site").xpos
+        w, *xyz = self.data.body("robot0_right_hand").xquat
+        fingers = [self.data.joint(f"gripper0_finger_joint{n}").qpos[0] for n in (1, 2)]
+        joints = [self.data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)]
+        state = np.concatenate([position, _axis_angle(w, np.array(xyz)), fingers])
+        return state.astype(np.float32), np.array(joints, np.float32)
+
+    @contextmanager
+    def perturbed(self, perturbations: Sequence[AnyPerturbation]) -> Iterator[None]:
+        """Apply render-layer perturbations to the model for a moment."""
+        saved = {name: getattr(self.model, name).copy() for name in VISUAL_FIELDS}
+        try:
+            for perturbation in perturbations:
+                perturbation.apply(self.model)
+            yield
+        finally:
+            for name, value in saved.items():
+                getattr(self.model, name)[:] = value
+
+    def close(self) -> None:
+        self._renderer.close()
+
+
+def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
+    """Render the streams of one trajectory: the frame before each executed action.
+
+    Streams that differ in pixel noise alone share the clean frames they are made from.
+    """
+    variants: dict[str, list[Stream]] = {}
+    for stream in streams:
+        variants.setdefault(to_json(in_layers(stream.perturbations, Layer.RENDER)), []).append(stream)
+    encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
+    proprioception: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
+    steps = len(trajectory.actions)
+    renderer = Renderer(trajectory.model_xml)
+    try:
+        for step in range(steps):
+            renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+            proprioception.append(renderer.proprioception())
+        for perturbations, members in variants.items():
+            with renderer.perturbed(from_json(perturbations)):
+                for step in range(steps):
+                    renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+                    clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
+                    for stream in members:
+                        frame = clean[stream.view]
+                        for noise in in_layers(stream.perturbations, Layer.PIXELS):
+                            frame = noise.apply(frame, step)
+                        encoded[stream.stream_id].append(encode(to_policy(frame), config))
+    finally:
+        renderer.close()
+    state, joint_state = (np.stack(column) for column in zip(*proprioception, strict=True))
+    return Rendered(state, joint_state, trajectory.actions.astype(np.float32), encoded)
+
+
+def _axis_angle(w: float, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axis times angle (rad) of a unit quaternion, the angle in [0, 2 pi] as robosuite's ``quat2axisangle`` has it."""
+    w = float(np.clip(w, -1.0, 1.0))
+    sine = np.sqrt(1.0 - w * w)
+    if np.isclose(sine, 0.0):
+        return np.zeros(3)
+    return np.asarray(xyz * 2.0 * np.arccos(w) / sine)
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """One trajectory's share of the rendering, as it is sent to a worker."""
+
+    trajectory_id: str
+    streams: tuple[Stream, ...]
+    trajectories: Path
+    frames: Path
+    config: RenderConfig
+
+    def __call__(self) -> None:
+        """Render what is missing and store it with what an earlier run already rendered."""
+        store = FrameStore(self.frames, self.config)
+        there = store.streams(self.trajectory_id)
+        trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
+        rendered = render(trajectory, [s for s in self.streams if s.stream_id not in there], self.config)
+        earlier = [stream.stream_id for stream in self.streams if stream.stream_id in there]
+        if earlier:
+            rendered = replace(rendered, streams={**rendered.streams, **store.load(self.trajectory_id, earlier).streams})
+        store.save(self.trajectory_id, rendered)
+
+
+def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, run: Run) -> set[str]:
+    """Render the streams of every kept episode that ``folder`` does not hold yet.
+
+    Returns:
+        The trajectories that have a file in ``folder`` now.
+    """
+    outcome = select(rows, verdicts(rows, trajectories))
+    streams: dict[str, dict[str, Stream]] = {}
+    steps: dict[str, int] = {}
+    for row in rows:
+        if outcome[row.episode_id].kept:
+            shown = streams.setdefault(row.trajectory_id, {})
+            shown |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+            steps[row.trajectory_id] = row.demo_steps
+    store = FrameStore(folder, config.render)
+    jobs = [
+        RenderJob(trajectory_id, tuple(shown.values()), trajectories, folder, config.render)
+        for trajectory_id, shown in streams.items()
+        if store.streams(trajectory_id) != set(shown)
+    ]
+    # The longest first, so that no worker is left alone with one at the end.
+    jobs.sort(key=lambda job: -steps[job.trajectory_id] * len(job.streams))
+    if jobs:
+        run(RenderJob.__call__, jobs, "render")
+    return set(streams)

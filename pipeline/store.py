@@ -1,0 +1,165 @@
+"""Trajectories and rendered episodes on disk: one HDF5 file for each trajectory, whole or not there.
+
+A file is done when it exists, opens and was made under the versions that run now; anything else is made again.
+Names are content hashes, so a changed plan never picks up a file that was made for something else, and still finds
+every file that it shares with the plan before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import RenderConfig
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.seeding import digest
+from pipeline.types import Trajectory, Verdict
+from pipeline.versions import fingerprint
+
+
+class TrajectoryStore:
+    """Replayed trajectories, verdict included, under one folder."""
+
+    def __init__(self, root: Path):
+        self.root = root
+
+    def path(self, trajectory_id: str) -> Path:
+        return self.root / f"{trajectory_id}.h5"
+
+    def save(self, trajectory: Trajectory) -> None:
+        with replaced(self.path(trajectory.trajectory_id)) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs["made_by"] = fingerprint()
+            file.attrs["kept"] = trajectory.verdict.kept
+            file.attrs["reason"] = trajectory.verdict.reason
+            file["model_xml"] = np.frombuffer(trajectory.model_xml.encode(), np.uint8)
+            file["states"] = trajectory.states
+            file["actions"] = trajectory.actions
+            file["kept_mask"] = trajectory.kept_mask
+            file.create_dataset("site_alpha", data=trajectory.site_alpha, compression="gzip")
+
+    def load(self, trajectory_id: str) -> Trajectory:
+        """Read a trajectory back.
+
+        Raises:
+            PipelineError: when its file is missing, damaged or of other versions.
+        """
+        with _opened(self.path(trajectory_id), fingerprint(), "replay") as file:
+            return Trajectory(
+                trajectory_id=trajectory_id,
+                model_xml=file["model_xml"][()].tobytes().decode(),
+                states=file["states"][()],
+                actions=file["actions"][()],
+                kept_mask=file["kept_mask"][()],
+                site_alpha=file["site_alpha"][()],
+                verdict=_verdict(file),
+            )
+
+    def verdict(self, trajectory_id: str) -> Verdict | None:
+        """The verdict on a trajectory, or None when it still has to be replayed."""
+        try:
+            with _opened(self.path(trajectory_id), fingerprint(), "replay") as file:
+                return _verdict(file)
+        except PipelineError:
+            return None
+
+    def steps(self, trajectory_id: str) -> int:
+        """How many actions were executed."""
+        with _opened(self.path(trajectory_id), fingerprint(), "replay") as file:
+            return len(file["actions"])
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Everything that a policy may see of one trajectory.
+
+    Attributes:
+        state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
+        streams: stream id to K encoded frames.
+    """
+
+    state: NDArray[np.float32]
+    joint_state: NDArray[np.float32]
+    action: NDArray[np.float32]
+    streams: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
+
+
+class FrameStore:
+    """Rendered trajectories under one folder; episodes that show the same frames share one stream of them.
+
+    Args:
+        root: the folder.
+        config: how frames are encoded; what was encoded otherwise counts as missing.
+    """
+
+    def __init__(self, root: Path, config: RenderConfig):
+        self.root = root
+        self._made_by = digest(fingerprint(), config.model_dump())[:16]
+
+    def path(self, trajectory_id: str) -> Path:
+        return self.root / f"{trajectory_id}.h5"
+
+    def save(self, trajectory_id: str, rendered: Rendered) -> None:
+        with replaced(self.path(trajectory_id)) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs["made_by"] = self._made_by
+            for name in ("state", "joint_state", "action"):
+                file[name] = getattr(rendered, name)
+            for stream, frames in sorted(rendered.streams.items()):
+                file[f"streams/{stream}/bytes"] = np.frombuffer(b"".join(frames), np.uint8)
+                file[f"streams/{stream}/ends"] = np.cumsum([len(frame) for frame in frames])
+
+    def streams(self, trajectory_id: str) -> set[str]:
+        """The streams that are already there; none when the file is missing, damaged or of other versions."""
+        try:
+            with _opened(self.path(trajectory_id), self._made_by, "render") as file:
+                return set(file["streams"])
+        except PipelineError:
+            return set()
+
+    def load(self, trajectory_id: str, streams: Sequence[str]) -> Rendered:
+        """Read the named streams of a trajectory.
+
+        Raises:
+            PipelineError: when the file or one of the streams is not there.
+        """
+        with _opened(self.path(trajectory_id), self._made_by, "render") as file:
+            missing = set(streams) - set(file["streams"])
+            if missing:
+                raise PipelineError(
+                    f"streams {sorted(missing)} were not rendered",
+                    where=self.path(trajectory_id),
+                    remedy="run the render stage again",
+                )
+            return Rendered(
+                state=file["state"][()],
+                joint_state=file["joint_state"][()],
+                action=file["action"][()],
+                streams={name: _frames(file[f"streams/{name}"]) for name in streams},
+            )
+
+
+def _frames(stream: h5py.Group) -> list[bytes]:
+    packed = stream["bytes"][()].tobytes()
+    ends = stream["ends"][()].tolist()
+    return [packed[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
+def _verdict(file: h5py.File) -> Verdict:
+    return Verdict(bool(file.attrs["kept"]), str(file.attrs["reason"]))
+
+
+@contextmanager
+def _opened(path: Path, made_by: str, stage: str) -> Iterator[h5py.File]:
+    try:
+        with h5py.File(path, "r") as file:
+            if file.attrs.get("made_by") != made_by:
+                raise PipelineError("made under other versions or settings", where=path, remedy=f"run the {stage} stage again")
+            yield file
+    except (OSError, KeyError) as error:
+        raise PipelineError("missing or damaged", where=path, remedy=f"run the {stage} stage again") from error

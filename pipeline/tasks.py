@@ -1,0 +1,62 @@
+"""LIBERO's task list."""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+
+from libero.libero import get_libero_path
+from libero.libero.benchmark import task_maps
+
+from pipeline.errors import PipelineError
+from pipeline.types import Task
+
+SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
+
+
+@cache
+def tasks(suite: str) -> tuple[Task, ...]:
+    """A suite's tasks, in the order of LIBERO's list.
+
+    Raises:
+        PipelineError: when there is no such suite.
+    """
+    if suite not in SUITES:
+        raise PipelineError(f"unknown suite {suite!r}", expected=" or ".join(SUITES))
+    folder = Path(get_libero_path("bddl_files")).resolve() / suite
+    return tuple(
+        Task(suite, known.name, known.language, folder / known.bddl_file) for known in task_maps[suite].values()
+    )
+
+
+def find_task(suite: str, name: str) -> Task:
+    """The task of that name.
+
+    Raises:
+        PipelineError: when the suite has none, naming the closest.
+    """
+    by_name = {task.name: task for task in tasks(suite)}
+    if name not in by_name:
+        closest = difflib.get_close_matches(name, by_name, cutoff=0)
+        raise PipelineError(f"{suite} has no task {name!r}", expected=" or ".join(closest))
+    return by_name[name]
+
+
+def select_tasks(patterns: Iterable[str]) -> list[Task]:
+    """The tasks whose ``<suite>/<task>`` matches any of the shell-style patterns, in LIBERO's order.
+
+    Raises:
+        PipelineError: when a pattern matches nothing.
+    """
+    known = {f"{task.suite}/{task.name}": task for suite in SUITES for task in tasks(suite)}
+    chosen: set[str] = set()
+    for pattern in patterns:
+        matched = fnmatch.filter(known, pattern)
+        if not matched:
+            closest = difflib.get_close_matches(pattern, known, cutoff=0)
+            raise PipelineError(f"no task matches {pattern!r}", expected="a pattern such as " + " or ".join(closest))
+        chosen.update(matched)
+    return [task for name, task in known.items() if name in chosen]

@@ -1,0 +1,26 @@
+"""Stage export_lerobot: write the kept episodes as a LeRobot v3.0 dataset, through lerobot itself."""
+
+import json
+
+from pipeline import plan
+from pipeline.compute import runner
+from pipeline.config import Config
+from pipeline.episodes import EpisodeLoader, kept
+from pipeline.stage import main
+from pipeline.writers import lerobot
+
+
+def run(config: Config) -> None:
+    plan_file = config.data / "plan.parquet"
+    ids = kept(plan.read(plan_file), config.data / "trajectories")
+    load = EpisodeLoader(plan_file, config.data / "frames", config.render)
+    target = config.export.lerobot
+    out = config.data / "lerobot" / target.name
+    with runner(config.compute) as workers:
+        report = lerobot.write(ids, load, out, repo_id=target.name, parts=target.parts, run=workers)
+    (config.data / "lerobot.json").write_text(json.dumps(report.episode_index, indent=0) + "\n")
+    print(f"wrote {len(ids)} episodes to {out}")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

@@ -1,0 +1,35 @@
+"""Stage manifest: one row for every planned episode, the statistics for OpenVLA-OFT, and the counts."""
+
+import json
+
+from pipeline import manifest, plan, stats
+from pipeline.config import Config
+from pipeline.episodes import EpisodeLoader, kept, verdicts
+from pipeline.stage import main
+from pipeline.store import TrajectoryStore
+
+
+def run(config: Config) -> None:
+    data = config.data
+    plan_file, trajectories = data / "plan.parquet", data / "trajectories"
+    rows = plan.read(plan_file)
+    known = verdicts(rows, trajectories)
+    store = TrajectoryStore(trajectories)
+    table = manifest.build(
+        rows,
+        outcome=plan.select(rows, known),
+        steps={trajectory_id: store.steps(trajectory_id) for trajectory_id in known},
+        rlds={episode: (shard, index) for episode, (shard, index) in json.loads((data / "rlds.json").read_text()).items()},
+        lerobot=json.loads((data / "lerobot.json").read_text()),
+    )
+    manifest.write(table, data / "manifest.parquet")
+
+    load = EpisodeLoader(plan_file, data / "frames", config.render)
+    ids = kept(rows, trajectories)
+    figures = stats.openvla(load.motion(episode_id) for episode_id in ids)
+    (data / "dataset_statistics.json").write_text(json.dumps({config.export.rlds.name: figures}, indent=1) + "\n")
+    (data / "counts.json").write_text(json.dumps(manifest.counts(table.to_pylist()), indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

@@ -1,0 +1,21 @@
+"""Stage plan: draw every perturbation of the run and write the plan, one row for each wanted episode."""
+
+import sys
+
+from pipeline import plan
+from pipeline.config import Config
+from pipeline.stage import main
+
+
+def run(config: Config) -> None:
+    index = config.demos.index()
+    for problem in index.problems:
+        print(f"left out: {problem.error}", file=sys.stderr)
+    rows = plan.make(index.entries, config.plan, config.replay)
+    plan.write(rows, config.data / "plan.parquet")
+    trajectories = len({row.trajectory_id for row in rows})
+    print(f"planned {sum(row.wanted for row in rows)} episodes from {trajectories} trajectories")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

@@ -1,0 +1,24 @@
+"""Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped."""
+
+from pipeline import gl, plan
+from pipeline.compute import runner
+from pipeline.config import Config
+from pipeline.files import keep_only
+from pipeline.stage import main
+
+
+def run(config: Config) -> None:
+    print(gl.choose())
+    # Not before the choice: MuJoCo reads it when it is imported.
+    from pipeline.render import render_plan
+
+    rows = plan.read(config.data / "plan.parquet")
+    folder = config.data / "frames"
+    with runner(config.compute) as workers:
+        rendered = render_plan(rows, config, config.data / "trajectories", folder, workers)
+    keep_only(folder, {f"{trajectory_id}.h5" for trajectory_id in rendered})
+    print(f"rendered {len(rendered)} trajectories into {folder}")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

@@ -1,0 +1,25 @@
+"""Stage replay: run the physics of every planned trajectory and judge it; needs no GL. Resumes where it was stopped."""
+
+import json
+
+from pipeline import plan
+from pipeline.compute import runner
+from pipeline.config import Config
+from pipeline.files import keep_only
+from pipeline.replay import replay_plan
+from pipeline.stage import main
+
+
+def run(config: Config) -> None:
+    rows = plan.read(config.data / "plan.parquet")
+    folder = config.data / "trajectories"
+    with runner(config.compute) as workers:
+        verdicts = replay_plan(rows, config, folder, workers)
+    keep_only(folder, {f"{trajectory_id}.h5" for trajectory_id in verdicts})
+    kept = sum(verdict.kept for verdict in verdicts.values())
+    (config.data / "replay.json").write_text(json.dumps({"replayed": len(verdicts), "kept": kept}) + "\n")
+    print(f"replayed {len(verdicts)} trajectories, {kept} reach their goal")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)
