@@ -43,12 +43,13 @@ def runner(config: ComputeConfig) -> Iterator[Run]:
     # otherwise each start a thread for every core in every worker. The environment is inherited by spawned workers.
     os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     import dask
+    from dask.system import CPU_COUNT
     from distributed import Client, LocalCluster
 
     if config.cluster == "local":
         dask.config.set({"distributed.worker.multiprocessing-method": "spawn", "distributed.admin.tick.limit": "60s"})
         cluster = LocalCluster(
-            n_workers=config.workers or os.cpu_count(),
+            n_workers=config.workers or CPU_COUNT,
             threads_per_worker=1,
             processes=True,
             dashboard_address=None,

@@ -78,12 +78,13 @@ class ReplayConfig(Frozen):
         mode: ``open_loop`` sends the recorded actions as they are.
         noops: ``drop`` skips every no-op (OpenVLA's rule), ``trim_ends`` only those before the first and after the
             last real action, ``keep`` none.
-        fixture_seed: seeds LIBERO's reset where the source did not record the scene.
+        fixture_seed: seeds LIBERO's reset where the source did not record the scene. Of the seeds 0 to 7, 4 lets the
+            most starter demonstrations of the four suites reach their goal (35 of 40).
     """
 
     mode: Literal["open_loop"] = "open_loop"
     noops: Literal["drop", "trim_ends", "keep"] = "drop"
-    fixture_seed: int = Field(default=0, ge=0, lt=2**32)
+    fixture_seed: int = Field(default=4, ge=0, lt=2**32)
 
 
 class RenderConfig(Frozen):
@@ -127,8 +128,8 @@ class Config(Frozen):
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     demos: DemosConfig
     plan: PlanConfig
-    replay: ReplayConfig = ReplayConfig()
-    render: RenderConfig = RenderConfig()
+    replay: ReplayConfig
+    render: RenderConfig
     export: ExportConfig
     compute: ComputeConfig = ComputeConfig()
 
@@ -156,7 +157,7 @@ def load(path: Path) -> Config:
         raise PipelineError(f"not valid YAML: {error}", where=path) from error
     except ValidationError as error:
         faults = [
-            f"{'.'.join(str(part) for part in fault['loc']) or 'top level'}: {fault['msg']} (got {fault['input']!r:.80})"
+            f"{'.'.join(map(str, fault['loc'])) or 'top level'}: {fault['msg']} (got {fault['input']!r:.80})"
             for fault in error.errors()
         ]
         raise PipelineError(

@@ -16,6 +16,8 @@ from pipeline.types import Episode
 
 SCHEMA_FILE = Path(__file__).resolve().parent.parent / "schemas" / "episode.json"
 
+JPEG_END = b"\xff\xd9"
+
 
 class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -149,6 +151,8 @@ def _check_frames(episode: Episode, steps: int) -> None:
                 raise _fault(episode, view, f"frame {index} is not an image", f"{expected}") from None
             if found != expected:
                 raise _fault(episode, view, f"frame {index} is {found}", f"{expected}")
+            if not data.endswith(JPEG_END):
+                raise _fault(episode, view, f"frame {index} is cut short", "a whole JPEG file")
 
 
 def _fault(episode: Episode, field: str, what: str, expected: str) -> PipelineError:

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from pipeline.axes import AnyPerturbation, Layer, from_json, in_layers, to_json
+from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, from_json, to_json
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.seeding import digest
 from pipeline.types import Frame
+
 
 @dataclass(frozen=True)
 class Stream:
@@ -32,7 +33,7 @@ class Stream:
 
 def streams_of(perturbations_json: str) -> dict[str, Stream]:
     """View name to the stream that shows it, for an episode with these perturbations."""
-    visible = in_layers(from_json(perturbations_json), Layer.RENDER, Layer.PIXELS)
+    visible = [p for p in from_json(perturbations_json) if isinstance(p, RenderPerturbation | PixelPerturbation)]
     return {view: Stream(view, tuple(p for p in visible if view in p.views)) for view in SCHEMA.views}
 
 
@@ -54,4 +55,7 @@ def encode(frame: Frame, config: RenderConfig) -> bytes:
 
 def decode(packed: bytes) -> Frame:
     """(H, W, 3) uint8 RGB of an encoded frame."""
-    return np.ascontiguousarray(cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_COLOR)[..., ::-1])
+    frame = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_COLOR_RGB)
+    if frame is None:
+        raise ValueError("not an image that OpenCV can decode")
+    return np.asarray(frame, np.uint8)

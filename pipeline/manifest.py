@@ -27,6 +27,7 @@ def build(
     rows: Sequence[Row],
     outcome: Mapping[str, Verdict],
     steps: Mapping[str, int],
+    devices: Mapping[str, str],
     rlds: Mapping[str, tuple[str, int]],
     lerobot: Mapping[str, int],
 ) -> pa.Table:
@@ -36,6 +37,7 @@ def build(
         rows: the plan.
         outcome: episode id to verdict.
         steps: trajectory id to the number of executed actions, for every replayed trajectory.
+        devices: trajectory id to the OpenGL device that rendered it, for every rendered trajectory.
         rlds: episode id to its shard's file name and its place in it, for every kept episode.
         lerobot: episode id to its ``episode_index``, for every kept episode.
     """
@@ -48,6 +50,7 @@ def build(
             "kept": verdict.kept,
             "reason": verdict.reason,
             "steps": steps.get(row.trajectory_id),
+            "gl_device": devices.get(row.trajectory_id),
             "rlds_shard": shard,
             "rlds_index": index,
             "lerobot_episode_index": lerobot.get(row.episode_id),

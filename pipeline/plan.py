@@ -10,8 +10,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.axes import AnyPerturbation, in_layers, to_json
-from pipeline.axes.base import Layer
+from pipeline.axes import AnyPerturbation, PhysicsPerturbation, TextPerturbation, of_layer, to_json
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.demos import DemoEntry
 from pipeline.errors import PipelineError
@@ -71,7 +70,11 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig) -> 
     by_task: dict[str, list[DemoEntry]] = defaultdict(list)
     for demo in demos:
         by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
-    rows = [_row(demo, (), plan.seed, 0, rank, True, replay) for group in by_task.values() for rank, demo in enumerate(group)]
+    rows = [
+        _row(demo, (), plan.seed, 0, rank, True, replay)
+        for group in by_task.values()
+        for rank, demo in enumerate(group)
+    ]
     for axis, episodes in plan.episodes.items():
         for (_, group), wanted in zip(by_task.items(), _shares(episodes, len(by_task)), strict=True):
             rows += _candidates(axis, group, wanted, plan, replay)
@@ -88,11 +91,13 @@ def _candidates(
 ) -> Iterator[Row]:
     """A task's candidates on one axis: every demonstration's first variant, then every second one, and so on."""
     sampler = getattr(plan.axes, axis)
+    first = {demo.demo_id: int(rng(plan.seed, axis, demo.demo_id).integers(2**31)) for demo in group}
     seen: set[str] = set()
     for rank in range(wanted + round(wanted * plan.reserve)):
         demo, variant = group[rank % len(group)], rank // len(group)
         for attempt in range(_ATTEMPTS):
-            draw = sampler.sample(rng(plan.seed, axis, demo.demo_id, variant, attempt), demo.task, variant)
+            key = rng(plan.seed, axis, demo.demo_id, variant, attempt)
+            draw = sampler.sample(key, demo.task, first[demo.demo_id] + variant)
             row = _row(demo, (draw,), plan.seed, variant, rank, rank < wanted, replay)
             if row.episode_id not in seen:
                 break
@@ -119,10 +124,10 @@ def _row(
     replay: ReplayConfig,
 ) -> Row:
     how = replay.model_dump()
-    physics = to_json(in_layers(perturbations, Layer.PHYSICS))
+    physics = to_json(of_layer(perturbations, PhysicsPerturbation))
     listed = to_json(perturbations)
     instruction = demo.task.instruction
-    for change in in_layers(perturbations, Layer.TEXT):
+    for change in of_layer(perturbations, TextPerturbation):
         instruction = change.apply(instruction)
     return Row(
         episode_id=digest("episode", demo.sha256, how, listed)[:16],
@@ -203,4 +208,3 @@ def _groups(rows: Iterable[Row]) -> list[list[Row]]:
     for row in rows:
         groups[row.axis, row.suite, row.task].append(row)
     return [sorted(group, key=lambda row: row.rank) for group in groups.values()]
-

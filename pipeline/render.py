@@ -7,11 +7,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import AnyPerturbation, Layer, from_json, in_layers, to_json
+from pipeline import gl
+from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
 from pipeline.compute import Run
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
@@ -20,6 +20,11 @@ from pipeline.frames import Stream, encode, streams_of, to_policy
 from pipeline.plan import Row, select
 from pipeline.store import FrameStore, Rendered, TrajectoryStore
 from pipeline.types import Frame, Trajectory
+
+GL = gl.choose()
+"""What renders in this process; chosen here because MuJoCo reads the choice when it is imported."""
+
+import mujoco  # noqa: E402
 
 VISUAL_FIELDS = ("cam_pos", "cam_quat")
 """The model's arrays that render-layer perturbations may write, put back after each."""
@@ -30,9 +35,6 @@ class Renderer:
 
     Args:
         model_xml: MJCF of the scene.
-
-    Raises:
-        PipelineError: when no GL back end was chosen (see ``pipeline.gl``).
     """
 
     def __init__(self, model_xml: str):
@@ -68,7 +70,7 @@ class Renderer:
         return state.astype(np.float32), np.array(joints, np.float32)
 
     @contextmanager
-    def perturbed(self, perturbations: Sequence[AnyPerturbation]) -> Iterator[None]:
+    def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
         """Apply render-layer perturbations to the model for a moment."""
         saved = {name: getattr(self.model, name).copy() for name in VISUAL_FIELDS}
         try:
@@ -90,7 +92,7 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
     """
     variants: dict[str, list[Stream]] = {}
     for stream in streams:
-        variants.setdefault(to_json(in_layers(stream.perturbations, Layer.RENDER)), []).append(stream)
+        variants.setdefault(to_json(of_layer(stream.perturbations, RenderPerturbation)), []).append(stream)
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     proprioception: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
     steps = len(trajectory.actions)
@@ -100,13 +102,13 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             proprioception.append(renderer.proprioception())
         for perturbations, members in variants.items():
-            with renderer.perturbed(from_json(perturbations)):
+            with renderer.perturbed(of_layer(from_json(perturbations), RenderPerturbation)):
                 for step in range(steps):
                     renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                     clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
                     for stream in members:
                         frame = clean[stream.view]
-                        for noise in in_layers(stream.perturbations, Layer.PIXELS):
+                        for noise in of_layer(stream.perturbations, PixelPerturbation):
                             frame = noise.apply(frame, step)
                         encoded[stream.stream_id].append(encode(to_policy(frame), config))
     finally:
@@ -136,13 +138,15 @@ class RenderJob:
 
     def __call__(self) -> None:
         """Render what is missing and store it with what an earlier run already rendered."""
-        store = FrameStore(self.frames, self.config)
+        store = FrameStore(self.frames, self.config, GL.device)
         there = store.streams(self.trajectory_id)
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
         rendered = render(trajectory, [s for s in self.streams if s.stream_id not in there], self.config)
         earlier = [stream.stream_id for stream in self.streams if stream.stream_id in there]
         if earlier:
-            rendered = replace(rendered, streams={**rendered.streams, **store.load(self.trajectory_id, earlier).streams})
+            rendered = replace(
+                rendered, streams={**rendered.streams, **store.load(self.trajectory_id, earlier).streams}
+            )
         store.save(self.trajectory_id, rendered)
 
 
@@ -160,7 +164,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
             shown = streams.setdefault(row.trajectory_id, {})
             shown |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
             steps[row.trajectory_id] = row.demo_steps
-    store = FrameStore(folder, config.render)
+    store = FrameStore(folder, config.render, GL.device)
     jobs = [
         RenderJob(trajectory_id, tuple(shown.values()), trajectories, folder, config.render)
         for trajectory_id, shown in streams.items()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import SCHEMA
 
 
-def openvla(episodes: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> dict[str, Any]:
+def openvla(episodes: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> dict[str, Any]:
     """Statistics of ``(action (T, 7), state (T, 8))`` pairs for OFT's ``dataset_statistics.json``.
 
     As OFT's ``libero_dataset_transform`` does before it measures, the gripper command is turned from LIBERO's -1 open,
@@ -21,7 +21,12 @@ def openvla(episodes: Iterable[tuple[NDArray[np.float32], NDArray[np.float32]]])
     actions = actions.copy()
     actions[:, -1] = 1.0 - np.clip(actions[:, -1], 0.0, 1.0)
     mask = [not name.startswith("gripper") for name in SCHEMA.action.names]
-    return {"action": _describe(actions) | {"mask": mask}, "proprio": _describe(states)}
+    return {
+        "action": _describe(actions) | {"mask": mask},
+        "proprio": _describe(states),
+        "num_transitions": len(actions),
+        "num_trajectories": len(episodes),
+    }
 
 
 def _describe(values: NDArray[np.float32]) -> dict[str, list[float]]:

@@ -96,10 +96,12 @@ class FrameStore:
     Args:
         root: the folder.
         config: how frames are encoded; what was encoded otherwise counts as missing.
+        device: what renders now, as OpenGL names it; with it, what another device rendered counts as missing too.
     """
 
-    def __init__(self, root: Path, config: RenderConfig):
+    def __init__(self, root: Path, config: RenderConfig, device: str | None = None):
         self.root = root
+        self._device = device
         self._made_by = digest(fingerprint(), config.model_dump())[:16]
 
     def path(self, trajectory_id: str) -> Path:
@@ -108,6 +110,7 @@ class FrameStore:
     def save(self, trajectory_id: str, rendered: Rendered) -> None:
         with replaced(self.path(trajectory_id)) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["made_by"] = self._made_by
+            file.attrs["device"] = self._device or ""
             for name in ("state", "joint_state", "action"):
                 file[name] = getattr(rendered, name)
             for stream, frames in sorted(rendered.streams.items()):
@@ -118,9 +121,15 @@ class FrameStore:
         """The streams that are already there; none when the file is missing, damaged or of other versions."""
         try:
             with _opened(self.path(trajectory_id), self._made_by, "render") as file:
-                return set(file["streams"])
+                same_device = self._device in (None, file.attrs["device"])
+                return set(file["streams"]) if same_device else set()
         except PipelineError:
             return set()
+
+    def device(self, trajectory_id: str) -> str:
+        """What rendered a trajectory, as OpenGL names it."""
+        with _opened(self.path(trajectory_id), self._made_by, "render") as file:
+            return str(file.attrs["device"])
 
     def load(self, trajectory_id: str, streams: Sequence[str]) -> Rendered:
         """Read the named streams of a trajectory.
@@ -159,7 +168,9 @@ def _opened(path: Path, made_by: str, stage: str) -> Iterator[h5py.File]:
     try:
         with h5py.File(path, "r") as file:
             if file.attrs.get("made_by") != made_by:
-                raise PipelineError("made under other versions or settings", where=path, remedy=f"run the {stage} stage again")
+                raise PipelineError(
+                    "made under other versions or settings", where=path, remedy=f"run the {stage} stage again"
+                )
             yield file
     except (OSError, KeyError) as error:
         raise PipelineError("missing or damaged", where=path, remedy=f"run the {stage} stage again") from error

@@ -6,7 +6,7 @@ from pipeline import manifest, plan, stats
 from pipeline.config import Config
 from pipeline.episodes import EpisodeLoader, kept, verdicts
 from pipeline.stage import main
-from pipeline.store import TrajectoryStore
+from pipeline.store import FrameStore, TrajectoryStore
 
 
 def run(config: Config) -> None:
@@ -14,19 +14,24 @@ def run(config: Config) -> None:
     plan_file, trajectories = data / "plan.parquet", data / "trajectories"
     rows = plan.read(plan_file)
     known = verdicts(rows, trajectories)
-    store = TrajectoryStore(trajectories)
+    outcome = plan.select(rows, known)
+    store, frames = TrajectoryStore(trajectories), FrameStore(data / "frames", config.render)
+    rendered = {row.trajectory_id for row in rows if outcome[row.episode_id].kept}
     table = manifest.build(
         rows,
-        outcome=plan.select(rows, known),
+        outcome=outcome,
         steps={trajectory_id: store.steps(trajectory_id) for trajectory_id in known},
-        rlds={episode: (shard, index) for episode, (shard, index) in json.loads((data / "rlds.json").read_text()).items()},
+        devices={trajectory_id: frames.device(trajectory_id) for trajectory_id in rendered},
+        rlds={
+            episode: (shard, index) for episode, (shard, index) in json.loads((data / "rlds.json").read_text()).items()
+        },
         lerobot=json.loads((data / "lerobot.json").read_text()),
     )
     manifest.write(table, data / "manifest.parquet")
 
     load = EpisodeLoader(plan_file, data / "frames", config.render)
     ids = kept(rows, trajectories)
-    figures = stats.openvla(load.motion(episode_id) for episode_id in ids)
+    figures = stats.openvla([load.motion(episode_id) for episode_id in ids])
     (data / "dataset_statistics.json").write_text(json.dumps({config.export.rlds.name: figures}, indent=1) + "\n")
     (data / "counts.json").write_text(json.dumps(manifest.counts(table.to_pylist()), indent=1) + "\n")
 

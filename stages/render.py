@@ -1,17 +1,15 @@
 """Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped."""
 
-from pipeline import gl, plan
+from pipeline import plan
 from pipeline.compute import runner
 from pipeline.config import Config
 from pipeline.files import keep_only
+from pipeline.render import GL, render_plan
 from pipeline.stage import main
 
 
 def run(config: Config) -> None:
-    print(gl.choose())
-    # Not before the choice: MuJoCo reads it when it is imported.
-    from pipeline.render import render_plan
-
+    print(GL)
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "frames"
     with runner(config.compute) as workers:

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from pydantic import Field, TypeAdapter
 
-from pipeline.axes.base import Frozen, Layer, Perturbation
+from pipeline.axes.base import (
+    Frozen,
+    Perturbation,
+    PhysicsPerturbation,
+    PixelPerturbation,
+    RenderPerturbation,
+    TextPerturbation,
+)
 from pipeline.axes.camera import CameraAxis, CameraPerturbation
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 
-AnyPerturbation = Annotated[
-    CameraPerturbation | NoisePerturbation | LanguagePerturbation, Field(discriminator="axis")
-]
+AnyPerturbation = Annotated[CameraPerturbation | NoisePerturbation | LanguagePerturbation, Field(discriminator="axis")]
 AnyAxis = CameraAxis | NoiseAxis | LanguageAxis
+
+Layered = TypeVar("Layered", bound=Perturbation)
 
 _LIST = TypeAdapter(tuple[AnyPerturbation, ...])
 
@@ -28,10 +35,10 @@ class Axes(Frozen):
     language: LanguageAxis | None = None
 
 
-def to_json(perturbations: Iterable[AnyPerturbation]) -> str:
+def to_json(perturbations: Iterable[Perturbation]) -> str:
     """Canonical JSON of a set of perturbations: the same whatever order they were listed in."""
     ordered = sorted(perturbations, key=lambda p: (-p.layer, p.axis))
-    return _LIST.dump_json(tuple(ordered)).decode()
+    return f"[{','.join(p.model_dump_json() for p in ordered)}]"
 
 
 def from_json(text: str) -> tuple[AnyPerturbation, ...]:
@@ -39,8 +46,20 @@ def from_json(text: str) -> tuple[AnyPerturbation, ...]:
     return _LIST.validate_json(text)
 
 
-def in_layers(perturbations: Sequence[AnyPerturbation], *layers: Layer) -> tuple[AnyPerturbation, ...]:
-    return tuple(p for p in perturbations if p.layer in layers)
+def of_layer(perturbations: Sequence[Perturbation], layer: type[Layered]) -> tuple[Layered, ...]:
+    """Those that act on one layer, named by its class."""
+    return tuple(p for p in perturbations if isinstance(p, layer))
 
 
-__all__ = ["AnyAxis", "AnyPerturbation", "Axes", "Layer", "Perturbation", "from_json", "in_layers", "to_json"]
+__all__ = [
+    "AnyAxis",
+    "AnyPerturbation",
+    "Axes",
+    "PhysicsPerturbation",
+    "PixelPerturbation",
+    "RenderPerturbation",
+    "TextPerturbation",
+    "from_json",
+    "of_layer",
+    "to_json",
+]

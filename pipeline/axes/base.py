@@ -2,7 +2,8 @@
 
 An axis comes as a pair of small frozen models in one file:
 
-* ``XAxis`` is the axis as configured, its ranges, and draws: ``sample(rng, task, variant) -> XPerturbation``.
+* ``XAxis`` is the axis as configured, its ranges, and draws: ``sample(rng, task, place) -> XPerturbation``.
+  Each demonstration counts its draws from a place of its own, for axes that deal from a list.
 * ``XPerturbation`` is one drawn change with every parameter, and acts: ``apply(...)`` on what its layer
   touches (text: the instruction; pixels: a clean frame; render and physics: the MuJoCo model).
 """
@@ -10,10 +11,15 @@ An axis comes as a pair of small frozen models in one file:
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict
+
+from pipeline.types import Frame
+
+if TYPE_CHECKING:
+    import mujoco
 
 
 class Layer(IntEnum):
@@ -45,6 +51,43 @@ class Perturbation(Frozen):
     layer: ClassVar[Layer]
     views: ClassVar[frozenset[str]]
     """The views of ``schemas/episode.json`` whose frames this can change; empty for text."""
+
+
+class TextPerturbation(Perturbation):
+    """Changes the instruction."""
+
+    layer: ClassVar[Layer] = Layer.TEXT
+    views: ClassVar[frozenset[str]] = frozenset()
+
+    def apply(self, instruction: str) -> str:
+        """The instruction to prompt with in place of ``instruction``."""
+        raise NotImplementedError
+
+
+class PixelPerturbation(Perturbation):
+    """Changes clean frames."""
+
+    layer: ClassVar[Layer] = Layer.PIXELS
+
+    def apply(self, frame: Frame, frame_index: int) -> Frame:
+        """A changed copy of a frame (H, W, 3), in the simulator's raw orientation, at its place in the episode."""
+        raise NotImplementedError
+
+
+class RenderPerturbation(Perturbation):
+    """Changes what a scene looks like and nothing that moves in it."""
+
+    layer: ClassVar[Layer] = Layer.RENDER
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        """Write the change into the model's visual fields."""
+        raise NotImplementedError
+
+
+class PhysicsPerturbation(Perturbation):
+    """Changes what happens: the scene before the first step, and so the whole replay."""
+
+    layer: ClassVar[Layer] = Layer.PHYSICS
 
 
 def _ordered(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.axes.base import Frozen, Intervals, Layer, Perturbation, draw
+from pipeline.axes.base import Frozen, Intervals, RenderPerturbation, draw
 from pipeline.types import Task
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ ORBIT_CENTRE_M = np.array([0.0, 0.0, 0.8])
 (`Problem._setup_camera` of LIBERO-Plus)."""
 
 
-class CameraPerturbation(Perturbation):
+class CameraPerturbation(RenderPerturbation):
     """A new pose for the agent view, relative to the scene's own.
 
     The order is LIBERO-Plus's: elevate about the orbit centre, turn about the world's z axis, dolly along the ray
@@ -43,7 +43,6 @@ class CameraPerturbation(Perturbation):
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
 
-    layer: ClassVar[Layer] = Layer.RENDER
     views: ClassVar[frozenset[str]] = frozenset({"image"})
 
     def pose(
@@ -95,7 +94,7 @@ class CameraAxis(Frozen):
         yaw_deg=((-15.0, -11.0), (11.0, 15.0)), pitch_deg=((-8.0, 8.0),)
     )
 
-    def sample(self, rng: np.random.Generator, task: Task, variant: int) -> CameraPerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
         ranges: dict[Component, Frozen] = {
             name: value
             for name in ("distance", "spherical", "orientation")
@@ -103,7 +102,7 @@ class CameraAxis(Frozen):
         }
         component = list(ranges)[rng.integers(len(ranges))]
         drawn = {name: draw(rng, intervals) for name, intervals in ranges[component]}
-        return CameraPerturbation(component=component, **drawn)
+        return CameraPerturbation.model_validate({"component": component, **drawn})
 
 
 def _about(axis: Literal["y", "z"], angle_deg: float) -> NDArray[np.float64]:
@@ -121,4 +120,5 @@ def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float
 
 def _rotate(quat: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
     """``vector`` (3,) turned by the unit quaternion ``quat`` (w, x, y, z)."""
-    return vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector)
+    turned: NDArray[np.float64] = vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector)
+    return turned

@@ -10,14 +10,14 @@ import re
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
-from typing import ClassVar, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import yaml
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
-from pipeline.axes.base import Frozen, Layer, Perturbation
+from pipeline.axes.base import Frozen, TextPerturbation
 from pipeline.errors import PipelineError
 from pipeline.types import Task
 
@@ -40,15 +40,12 @@ _DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|benchmark|hdf)\b", re
 _WELL_FORMED = re.compile(r"[a-z]+(?:[,.?!;:]? [a-z]+|['-][a-z]+)*")
 
 
-class LanguagePerturbation(Perturbation):
+class LanguagePerturbation(TextPerturbation):
     """One rewrite of one task's instruction."""
 
     axis: Literal["language"] = "language"
     component: Component
     text: str
-
-    layer: ClassVar[Layer] = Layer.TEXT
-    views: ClassVar[frozenset[str]] = frozenset()
 
     def apply(self, instruction: str) -> str:
         """The wording that takes the place of ``instruction``."""
@@ -64,17 +61,16 @@ class LanguageAxis(Frozen):
 
     classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
 
-    def sample(self, rng: np.random.Generator, task: Task, variant: int) -> LanguagePerturbation:
-        """The rewrite at place ``variant`` of the task's deal, which starts again once the bank is exhausted.
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
+        """The rewrite at ``place`` of the task's deal, which starts again once the bank is exhausted.
 
-        Independent draws would repeat, so ``variant`` alone decides and ``rng`` is left untouched. Count variants
-        through all demonstrations of a task, not from zero for each, and no two share a wording until they must.
+        Independent draws would repeat, so neighbouring places are different wordings and ``rng`` is left alone.
 
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
         rewrites = deal(task, self.classes)
-        component, text = rewrites[variant % len(rewrites)]
+        component, text = rewrites[place % len(rewrites)]
         return LanguagePerturbation(component=component, text=text)
 
 

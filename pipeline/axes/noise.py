@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from pipeline import seeding
-from pipeline.axes.base import Frozen, Layer, Perturbation
+from pipeline.axes.base import Frozen, PixelPerturbation
 from pipeline.types import Floats, Frame, Task
 
 Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
@@ -216,7 +216,7 @@ Levels = tuple[T, T, T, T, T]
 """One value for each strength, weakest first."""
 
 
-class NoisePerturbation(Perturbation):
+class NoisePerturbation(PixelPerturbation):
     """One corruption at one strength for a whole episode.
 
     Attributes:
@@ -231,7 +231,6 @@ class NoisePerturbation(Perturbation):
     level: Annotated[int, Field(ge=1, le=5)]
     seed: int
 
-    layer: ClassVar[Layer] = Layer.PIXELS
     views: ClassVar[frozenset[str]] = frozenset({"image"})
 
     @model_validator(mode="after")
@@ -269,8 +268,8 @@ class NoiseAxis(Frozen):
         Glass, sigma_px=(0.6, 0.95, 1.2, 1.65, 2.35), delta_px=(1, 2, 3, 4, 5), passes=(3, 3, 2, 2, 1)
     )
 
-    def sample(self, rng: np.random.Generator, task: Task, variant: int) -> NoisePerturbation:
-        """A component and a level, each with equal chance, whatever the task and the variant."""
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
+        """A component and a level, each with equal chance, whatever the task and the place."""
         grids: tuple[Levels[Effect], ...] = (self.motion, self.gaussian, self.zoom, self.fog, self.glass)
         grid = grids[rng.integers(len(grids))]
         level = int(rng.integers(1, 6))

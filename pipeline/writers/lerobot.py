@@ -1,12 +1,8 @@
 """LeRobotDataset v3.0, written by lerobot 0.4.4 itself: parts in parallel, then merged.
 
-Three things of lerobot's are replaced:
-
-- its streaming encoder, which drops frames when it falls behind, has its quality built in (33 dB with H.264) and takes
-  longer for its histograms than for the video;
-- the statistics in ``meta/stats.json``: the ``std`` of images overflows uint8 (huggingface/lerobot#3697) and merged
-  quantiles are averages of per-episode quantiles (#3804), so exact ones are written over them;
-- the cache folder of ``datasets`` while it merges, so that nothing is left in the user's home.
+Two things of lerobot's are replaced: its video encoder (see ``video``), and its statistics in ``meta/stats.json``,
+whose merged quantiles are averages of per-episode quantiles (huggingface/lerobot#3804). Beside lerobot's own files
+there is ``meta/provenance.parquet``, one row per episode.
 """
 
 from __future__ import annotations
@@ -16,10 +12,9 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from fractions import Fraction
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import av
 import cv2
@@ -34,31 +29,17 @@ from lerobot.datasets.utils import write_stats
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA, check
+from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.types import Episode, Floats, Frame
 from pipeline.writers.base import Load, folder_bytes, split
+from pipeline.writers.video import QUANTILES, Counts, VideoEncoder, statistics
 
 if TYPE_CHECKING:  # export imports no simulator, and this would
     from pipeline.compute import Run
 
-ENCODER: Final = "libx264"
-ENCODER_OPTIONS = {
-    # Measured on LIBERO frames: 40 dB (agent view) and 39 dB (wrist) at 7 kB a frame, no frame below 36 dB;
-    # "superfast" saves a tenth of the bytes for twice the time.
-    "preset": "ultrafast",
-    "crf": "20",
-    # lerobot's own choice: any frame is at most one frame away from a key frame, for random access in training.
-    "g": "2",
-    # The bytes depend on the number of threads; parts are parallel already.
-    "threads": "1",
-}
 PART_VIDEO_MB = 16
 """lerobot rewrites a video file for each episode that it appends: small files here, its own 200 MB after the merge."""
-
-QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-LEVELS = np.arange(256.0)
-Counts = NDArray[np.int64]
-"""(3, 256) how often each level occurs in each channel."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +129,7 @@ def _write_part(part: _Part, load: Load, repo_id: str) -> _Written:
         vcodec="h264",
     )
     dataset.meta.update_chunk_settings(video_files_size_in_mb=PART_VIDEO_MB)
-    encoder = _VideoEncoder()
+    encoder = VideoEncoder()
     # The slot that streaming_encoding=True fills; it has no public name.
     dataset._streaming_encoder = encoder
     steps = 0
@@ -174,93 +155,20 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> None:
             SCHEMA.action.lerobot_key: episode.action[t],
             "task": episode.instruction,
         }
-        frame |= {view.lerobot_key: _pixels(episode.frames[name][t]) for name, view in SCHEMA.views.items()}
+        frame |= {view.lerobot_key: _pixels(episode, name, t) for name, view in SCHEMA.views.items()}
         dataset.add_frame(frame)
     dataset.save_episode()
 
 
-def _pixels(data: bytes) -> Frame:
-    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB).astype(np.uint8, copy=False)
+def _pixels(episode: Episode, view: str, t: int) -> Frame:
+    pixels = cv2.imdecode(np.frombuffer(episode.frames[view][t], np.uint8), cv2.IMREAD_COLOR_RGB)
+    if pixels is None:
+        raise PipelineError(f"{view} frame {t} cannot be decoded", where=f"episode {episode.episode_id}")
+    return pixels.astype(np.uint8, copy=False)
 
 
-class _VideoEncoder:
-    """Fills lerobot's slot for a ``StreamingVideoEncoder``: encodes each frame as it comes and counts its levels."""
-
-    def __init__(self) -> None:
-        self.counts: dict[str, Counts] = {}
-        self._streams: dict[str, _Stream] = {}
-
-    def start_episode(self, video_keys: Sequence[str], temp_dir: Path) -> None:
-        # lerobot removes the folder of a file that it has taken over, so each file gets a folder of its own.
-        self._streams = {key: _Stream(Path(tempfile.mkdtemp(dir=temp_dir)) / "episode.mp4") for key in video_keys}
-
-    def feed_frame(self, video_key: str, image: Frame) -> None:
-        self._streams[video_key].add(image)
-
-    def finish_episode(self) -> dict[str, tuple[Path, dict[str, Floats]]]:
-        """Per video: its file, and statistics in grey levels, which lerobot scales to [0, 1]."""
-        finished = {}
-        for key, stream in self._streams.items():
-            stream.close()
-            self.counts[key] = self.counts.get(key, 0) + stream.counts
-            finished[key] = stream.path, _count_statistics(stream.counts)
-        self._streams = {}
-        return finished
-
-    def cancel_episode(self) -> None:
-        for stream in self._streams.values():
-            stream.close()
-        self._streams = {}
-
-    close = cancel_episode
-
-
-class _Stream:
-    """One video file in the making."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.counts: Counts = np.zeros((3, 256), np.int64)
-        self._frames = 0
-        self._file = av.open(str(path), "w")
-        self._video = self._file.add_stream(ENCODER, SCHEMA.fps_hz, options=ENCODER_OPTIONS)
-        self._video.height, self._video.width, _ = SCHEMA.frame.shape
-        self._video.pix_fmt = "yuv420p"
-        self._video.time_base = Fraction(1, SCHEMA.fps_hz)
-
-    def add(self, image: Frame) -> None:
-        frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-        frame.pts, frame.time_base = self._frames, Fraction(1, SCHEMA.fps_hz)
-        self._file.mux(self._video.encode(frame))
-        self._frames += 1
-        for channel in range(3):
-            self.counts[channel] += cv2.calcHist([image], [channel], None, [256], [0, 256])[:, 0].astype(np.int64)
-
-    def close(self) -> None:
-        self._file.mux(self._video.encode())
-        self._file.close()
-
-
-def _count_statistics(counts: Counts) -> dict[str, Floats]:
-    """lerobot's statistics of an image, each (3,) in grey levels, exact; ``count`` is the number of frames."""
-    height, width, _ = SCHEMA.frame.shape
-    pixels = counts.sum(axis=1)
-    mean = counts @ LEVELS / pixels
-    return {
-        "min": LEVELS[(counts > 0).argmax(axis=1)],
-        "max": LEVELS[255 - (counts > 0)[:, ::-1].argmax(axis=1)],
-        "mean": mean,
-        "std": np.sqrt((counts * (LEVELS - mean[:, None]) ** 2).sum(axis=1) / pixels),
-        "count": pixels[:1] // (height * width),
-        **{
-            name: np.array([np.quantile(LEVELS, q, weights=row, method="inverted_cdf") for row in counts])
-            for name, q in QUANTILES.items()
-        },
-    }
-
-
-def _column_statistics(values: Floats) -> dict[str, Floats]:
-    """lerobot's statistics of a (N, D) column, each (D,), exact."""
+def _column_statistics(values: Floats) -> dict[str, NDArray[Any]]:
+    """lerobot's statistics of a (N, D) column, each (D,); ``count`` is (1,)."""
     return {
         "min": values.min(axis=0),
         "max": values.max(axis=0),
@@ -272,19 +180,20 @@ def _column_statistics(values: Floats) -> dict[str, Floats]:
 
 
 def _write_statistics(root: Path, counts: Mapping[str, Counts]) -> None:
-    """Write ``meta/stats.json`` over lerobot's, every column from every row and every pixel."""
-    statistics = {}
+    """Write ``meta/stats.json`` over lerobot's, from every row and every pixel."""
+    exact = {}
     for name, view in SCHEMA.views.items():
-        levels = _count_statistics(counts[name])
-        statistics[view.lerobot_key] = {
-            key: value if key == "count" else value.reshape(3, 1, 1) / 255 for key, value in levels.items()
+        # (3, 1, 1) in [0, 1], as lerobot hands out images.
+        exact[view.lerobot_key] = {
+            key: value if key == "count" else value.reshape(3, 1, 1) / 255
+            for key, value in statistics(counts[name]).items()
         }
     data = pq.ParquetDataset(root / "data")
     for column in data.schema.names:
         values = data.read(columns=[column])[column].combine_chunks()
         flat = values.flatten() if pa.types.is_list(values.type) else values
-        statistics[column] = _column_statistics(flat.to_numpy().astype(np.float64).reshape(len(values), -1))
-    write_stats(statistics, root)
+        exact[column] = _column_statistics(flat.to_numpy().astype(np.float64).reshape(len(values), -1))
+    write_stats(exact, root)
 
 
 def _write_provenance(root: Path, rows: Sequence[Mapping[str, str]]) -> None:
@@ -296,7 +205,7 @@ def _write_provenance(root: Path, rows: Sequence[Mapping[str, str]]) -> None:
 
 @contextmanager
 def _local_only(cache: Path) -> Iterator[None]:
-    """lerobot reads through ``datasets``, which copies to a cache in the home folder; what it misses it asks the hub for."""
+    """Keep the copies that ``datasets`` makes of what lerobot reads out of the home folder, and lerobot off the hub."""
     saved = datasets.config.HF_DATASETS_CACHE, huggingface_hub.constants.HF_HUB_OFFLINE
     datasets.config.HF_DATASETS_CACHE, huggingface_hub.constants.HF_HUB_OFFLINE = cache, True
     try:

@@ -161,14 +161,25 @@ def _write_shard(shard: _Shard, load: Load) -> _Written:
         for episode_id in shard.episode_ids:
             episode = load(episode_id)
             check(episode)
-            example = features().serialize_example(_example(episode))
+            example = _serialize(episode)
             file.write(_record(example))
             steps += len(episode)
             example_bytes += len(example)
     return _Written(steps, example_bytes)
 
 
-def _example(episode: Episode) -> dict[str, Any]:
+def _serialize(episode: Episode) -> bytes:
+    """``tf.train.Example`` of an episode; left to itself, protobuf orders its map anew in every process."""
+    example = _serializer().get_tf_example(features().encode_example(_tree(episode)))
+    return bytes(example.SerializeToString(deterministic=True))
+
+
+@cache
+def _serializer() -> Any:
+    return tfds.core.ExampleSerializer(features().get_serialized_info())
+
+
+def _tree(episode: Episode) -> dict[str, Any]:
     last = len(episode) - 1
     steps = [
         {

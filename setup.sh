@@ -1,0 +1,94 @@
+#!/usr/bin/env bash
+# Installs what the pipeline needs on Debian 12 and is quick when it is there: bash setup.sh [run|test]
+#   run    then makes the datasets of the configuration that params.yaml names
+#   test   then checks style, types and behaviour
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")"
+
+UV_VERSION=0.13.8
+VERB=${1:-}
+
+fail() { printf 'setup.sh: %s\n' "$@" >&2; exit 1; }
+
+is_python311() { "$1" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; }
+
+find_python() {
+    local candidate
+    for candidate in python3.11 python3; do
+        # A pyenv shim is on PATH even for versions that are not there, so ask it instead of looking for it.
+        if is_python311 "$candidate"; then
+            echo "$candidate"
+            return
+        fi
+    done
+    fail "found no Python 3.11, neither as python3.11 nor as python3" "  try: sudo apt-get install -y python3.11"
+}
+
+# Looks for the libraries themselves: whoever installed them, and with or without dpkg.
+missing_packages() {
+    local libraries
+    libraries=$(PATH=$PATH:/usr/sbin:/sbin ldconfig -p)
+    has() { grep -qE "$1" <<<"$libraries"; }
+    has '\blibEGL\.so\.1' || echo libegl1
+    has '\blibEGL_(mesa|nvidia)\.so\.0' || echo libegl-mesa0
+    has '\blibGL\.so\.1' || echo libgl1
+    has '\blibOSMesa\.so' || echo libosmesa6
+    has '\blibgthread-2\.0\.so\.0' || echo libglib2.0-0   # OpenCV
+    has '\blibMagickWand-.*\.so' || echo libmagickwand-6.q16-6   # the tests' reference for the benchmark's noise
+    has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which links libpython too
+    "$PYTHON" -c 'import ctypes; ctypes.CDLL("libpython3.11.so.1.0")' 2>/dev/null || echo libpython3.11
+    command -v git >/dev/null || echo git
+    [[ -x .venv/bin/pip ]] || "$PYTHON" -c 'import ensurepip' 2>/dev/null || echo python3.11-venv
+}
+
+install_packages() {
+    local as_root=() install=(apt-get install -y --no-install-recommends "$@")
+    if [[ $(id -u) != 0 ]]; then as_root=(sudo -n); fi
+    if ! command -v apt-get >/dev/null || ! "${as_root[@]}" true 2>/dev/null; then
+        fail "these Debian packages are missing, and installing them takes root: $*" "  try: sudo ${install[*]}"
+    fi
+    # One broken third-party source must not stop the others.
+    "${as_root[@]}" apt-get update -qq || true
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive "${install[@]}" -qq
+}
+
+install_venv() {
+    local index
+    is_python311 .venv/bin/python || rm -rf .venv
+    [[ -x .venv/bin/pip ]] || "$PYTHON" -m venv .venv
+    .venv/bin/pip install --quiet "uv==$UV_VERSION"
+    # uv does not read pip's configuration: hand on the mirror that is named there.
+    index=${PIP_INDEX_URL:-$(.venv/bin/pip config get global.index-url 2>/dev/null || true)}
+    if [[ -n $index ]]; then export UV_DEFAULT_INDEX=${UV_DEFAULT_INDEX:-$index}; fi
+    export VIRTUAL_ENV=$PWD/.venv
+    .venv/bin/uv pip sync --require-hashes requirements.lock
+    # The lock holds the build back end, so the package itself needs no network.
+    .venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable .
+}
+
+[[ $VERB =~ ^(run|test|)$ ]] || fail "unknown verb '$VERB', expected run, test or none"
+PYTHON=$(find_python)
+packages=$(missing_packages)
+if [[ -n $packages ]]; then
+    # shellcheck disable=SC2086  # one word per package
+    install_packages $packages
+fi
+
+stamp=$(cat setup.sh requirements.lock pyproject.toml | sha256sum)
+if [[ ! -x .venv/bin/python || $(cat .venv/installed 2>/dev/null) != "$stamp" ]]; then
+    rm -f .venv/installed
+    install_venv
+    echo "$stamp" >.venv/installed
+fi
+
+# DVC's stages call `python`.
+export PATH=$PWD/.venv/bin:$PATH
+case $VERB in
+run) dvc repro ;;
+test)
+    ruff check
+    ruff format --check
+    mypy
+    pytest
+    ;;
+esac

@@ -1,0 +1,143 @@
+"""Real scenes and real demonstrations, cut short: the last second of three human demonstrations, in LIBERO's HDF5."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipeline import gl
+
+# Before anything imports MuJoCo.
+gl.choose()
+
+from pipeline import hdf5  # noqa: E402
+from pipeline.config import ReplayConfig  # noqa: E402
+from pipeline.demos import StarterSource  # noqa: E402
+from pipeline.environment import Environment  # noqa: E402
+from pipeline.replay import open_loop  # noqa: E402
+from pipeline.tasks import find_task  # noqa: E402
+from pipeline.types import Demo, Task, Trajectory  # noqa: E402
+
+REPOSITORY = Path(__file__).parent.parent
+
+STOVE = find_task("libero_goal", "turn_on_the_stove")
+PLATE = find_task("libero_goal", "push_the_plate_to_the_front_of_the_stove")
+MILK = find_task("libero_object", "pick_up_the_milk_and_place_it_in_the_basket")
+SHORT = {STOVE: 14, PLATE: 18, MILK: 18}
+"""How many of the last actions are kept; the goal is reached within them."""
+
+
+def starter_demo(task: Task) -> Demo:
+    source = StarterSource()
+    return source.load(source.index([task]).entries[0].demo_id)
+
+
+@pytest.fixture(scope="session")
+def whole() -> dict[Task, Trajectory]:
+    """The three demonstrations replayed from start to end."""
+    replayed = {}
+    for task in SHORT:
+        environment = Environment(task)
+        # Under this seed the stove's knob stands where the recorded hand turns it.
+        replayed[task] = open_loop(environment, starter_demo(task), "whole", ReplayConfig(fixture_seed=4))
+        assert replayed[task].verdict.kept, f"{task.name}: {replayed[task].verdict.reason}"
+        environment.close()
+    return replayed
+
+
+@pytest.fixture(scope="session")
+def short_demos(whole: dict[Task, Trajectory], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A root of HDF5 demonstrations: one of each task that succeeds, and one of the milk that only waits."""
+    root = tmp_path_factory.mktemp("demos")
+    for task, steps in SHORT.items():
+        trajectory = whole[task]
+        states = trajectory.states[-steps - 1 : -1]
+        good = hdf5.Recording(
+            actions=trajectory.actions[-steps:],
+            states=states,
+            robot_states=states[:, :9],
+            model_file=trajectory.model_xml,
+            obs={},
+        )
+        recordings = [good]
+        if task == MILK:
+            waiting = good.actions.copy()
+            waiting[:, :6], waiting[:, 6] = 0.05, 1.0
+            recordings.append(replace(good, actions=waiting))
+        hdf5.write(root / task.suite / f"{task.name}_demo.hdf5", task, recordings)
+    return root
+
+
+def tiny_config(demos: Path) -> dict[str, object]:
+    """A configuration of a whole run on the short demonstrations; tests change what they are about."""
+    return {
+        "name": "tiny",
+        "demos": {
+            "source": "hdf5",
+            "root": str(demos),
+            "tasks": [f"{task.suite}/{task.name}" for task in SHORT],
+        },
+        "plan": {
+            "seed": 7,
+            "axes": {"camera": {}, "noise": {}, "language": {}},
+            "episodes": {"camera": 3, "noise": 4, "language": 3},
+            "reserve": 0.5,
+        },
+        "replay": {"mode": "open_loop"},
+        "render": {"jpeg_quality": 95},
+        "export": {"rlds": {"name": "tiny", "shards": 2}, "lerobot": {"name": "tiny", "parts": 2}},
+        "compute": {"cluster": "local", "workers": 2},
+    }
+
+
+STAGES = ("plan", "replay", "render", "export_rlds", "export_lerobot", "manifest", "summary")
+
+
+def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = STAGES) -> str:
+    """Run stages as DVC does, in ``folder``; returns what they printed."""
+    file = folder / "tiny.yaml"
+    file.write_text(yaml.safe_dump(config))
+    printed = ""
+    for stage in stages:
+        done = subprocess.run(
+            [sys.executable, REPOSITORY / "stages" / f"{stage}.py", file],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, f"{stage} failed:\n{done.stdout}\n{done.stderr}"
+        printed += done.stdout
+    return printed
+
+
+@pytest.fixture(scope="session")
+def finished(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data folder of a finished ``dvc repro`` in a copy of the repository, on a configuration of its own."""
+    clone = tmp_path_factory.mktemp("clone")
+    for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml"):
+        source = REPOSITORY / name
+        (shutil.copytree if source.is_dir() else shutil.copy)(source, clone / name)
+    (clone / "configs").mkdir()
+    (clone / "configs" / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(short_demos)))
+    (clone / "params.yaml").write_text("run: tiny\n")
+    shutil.copytree(REPOSITORY / ".dvc", clone / ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
+    subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
+    done = dvc(clone, "repro")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return clone / "data" / "tiny"
+
+
+def dvc(clone: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    scripts = Path(sys.executable).parent
+    environment = {**os.environ, "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}"}
+    command = [str(scripts / "dvc"), *arguments]
+    return subprocess.run(command, cwd=clone, capture_output=True, text=True, check=False, env=environment)

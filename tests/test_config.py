@@ -1,0 +1,76 @@
+"""The configuration: what is not understood is refused, by file, field and remedy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+from conftest import REPOSITORY
+
+from pipeline.__main__ import config_schema
+from pipeline.config import load
+from pipeline.errors import PipelineError
+
+STARTER = REPOSITORY / "configs" / "starter.yaml"
+
+
+def changed(path: Path, value: Any, *keys: str) -> Path:
+    config = yaml.safe_load(STARTER.read_text())
+    section = config
+    for key in keys[:-1]:
+        section = section[key]
+    section[keys[-1]] = value
+    file = path / "changed.yaml"
+    file.write_text(yaml.safe_dump(config))
+    return file
+
+
+@pytest.mark.parametrize("file", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda file: file.stem)
+def test_every_config_is_valid_and_named_after_its_file(file: Path) -> None:
+    assert load(file).name == file.stem
+    jsonschema.validate(yaml.safe_load(file.read_text()), config_schema())
+
+
+def test_schema_file_is_that_of_the_code() -> None:
+    stored = json.loads((REPOSITORY / "schemas" / "config.schema.json").read_text())
+    assert stored == config_schema(), "run: python -m pipeline schema"
+
+
+@pytest.mark.parametrize(
+    ("value", "keys", "message"),
+    [
+        (1, ("render", "jpg_quality"), "render.jpg_quality: Extra inputs are not permitted"),
+        (30, ("render", "jpeg_quality"), "render.jpeg_quality: Input should be greater than or equal to 50"),
+        ("closed_loop", ("replay", "mode"), "replay.mode: Input should be"),
+        ({"camera": 0, "noise": 1, "language": 1}, ("plan", "episodes"), "plan.episodes.camera"),
+        ({"camera": 4}, ("plan", "episodes"), "axes and episodes must name the same axes"),
+        ({"camera": {"distance": {"distance_scale": [[2, 1]]}}}, ("plan", "axes"), "with low <= high"),
+        ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: Extra inputs"),
+        ("/tmp", ("demos", "root"), "root goes with source: hdf5"),
+        ("carrier pigeon", ("compute",), "compute"),
+    ],
+)
+def test_faults_name_file_and_field(tmp_path: Path, value: Any, keys: tuple[str, ...], message: str) -> None:
+    file = changed(tmp_path, value, *keys)
+    with pytest.raises(PipelineError) as caught:
+        load(file)
+    assert message in str(caught.value)
+    assert str(file) in str(caught.value)
+
+
+def test_missing_and_broken_files(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="cannot read the configuration"):
+        load(tmp_path / "no.yaml")
+    (tmp_path / "broken.yaml").write_text("plan: [1,\n")
+    with pytest.raises(PipelineError, match="not valid YAML"):
+        load(tmp_path / "broken.yaml")
+
+
+def test_unknown_task_pattern_names_the_closest(tmp_path: Path) -> None:
+    config = load(changed(tmp_path, ["libero_goal/put_the_bowl_on_the_plat"], "demos", "tasks"))
+    with pytest.raises(PipelineError, match="libero_goal/put_the_bowl_on_the_plate"):
+        config.demos.index()

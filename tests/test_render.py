@@ -1,0 +1,158 @@
+"""Rendering: pixel for pixel what LIBERO's own environment returns, and no more of the model changed than is said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import robosuite.utils.transform_utils as transform
+from conftest import MILK, STOVE
+from libero.libero.envs import OffScreenRenderEnv
+
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.noise import NoiseAxis
+from pipeline.config import RenderConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.frames import Stream, decode, encode, streams_of, to_policy
+from pipeline.render import VISUAL_FIELDS, Renderer, render
+from pipeline.seeding import rng
+from pipeline.types import Frame, Task, Trajectory
+
+MOVED = CameraPerturbation(component="spherical", azimuth_deg=30.0, elevation_deg=8.0)
+
+
+class Libero:
+    """LIBERO's environment as an evaluation uses it, in a recorded scene."""
+
+    def __init__(self, task: Task, model_xml: str):
+        self.env = OffScreenRenderEnv(bddl_file_name=str(task.bddl_file), camera_heights=256, camera_widths=256)
+        self.env.reset()
+        self.env.reset_from_xml_string(model_xml)
+
+    def observe(self, state: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
+        # robosuite makes its context current when it is created and relies on being alone in the process.
+        self.env.sim._render_context_offscreen.gl_ctx.make_current()
+        observation: dict[str, np.ndarray] = self.env.set_init_state(state)  # type: ignore[type-arg]
+        return observation
+
+
+@pytest.fixture(scope="module", params=[STOVE, MILK], ids=lambda task: task.name)
+def libero_frames(request: pytest.FixtureRequest, whole: dict[Task, Trajectory]) -> Iterator[tuple[Trajectory, Libero]]:
+    trajectory = whole[request.param]
+    libero = Libero(request.param, trajectory.model_xml)
+    yield trajectory, libero
+    libero.env.close()
+
+
+@pytest.mark.parametrize("perturbed", [False, True], ids=["clean", "camera moved"])
+def test_frames_and_proprioception_equal_libero(libero_frames: tuple[Trajectory, Libero], perturbed: bool) -> None:
+    trajectory, libero = libero_frames
+    ours: dict[int, tuple[dict[str, Frame], np.ndarray, np.ndarray]] = {}  # type: ignore[type-arg]
+    steps = (0, len(trajectory.actions) // 2, len(trajectory.actions))
+    renderer = Renderer(trajectory.model_xml)
+    with renderer.perturbed([MOVED] if perturbed else []):
+        for step in steps:
+            renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+            frames = {view: renderer.frame(spec.camera) for view, spec in SCHEMA.views.items()}
+            ours[step] = frames, *renderer.proprioception()
+    renderer.close()
+
+    model = libero.env.sim.model._model
+    saved = {name: getattr(model, name).copy() for name in VISUAL_FIELDS}
+    if perturbed:
+        MOVED.apply(model)
+    for step in steps:
+        theirs = libero.observe(trajectory.states[step])
+        frames, state, joint_state = ours[step]
+        for view, spec in SCHEMA.views.items():
+            assert np.array_equal(frames[view], theirs[f"{spec.camera}_image"]), f"{view} at step {step}"
+        # The state that OpenVLA's data and evaluation build from LIBERO's observations.
+        quat_xyzw = theirs["robot0_eef_quat"].copy()
+        expected = [theirs["robot0_eef_pos"], transform.quat2axisangle(quat_xyzw), theirs["robot0_gripper_qpos"]]
+        assert np.array_equal(state, np.concatenate(expected).astype(np.float32))
+        sine_cosine = np.concatenate([np.sin(joint_state), np.cos(joint_state)])
+        observed = np.concatenate([theirs["robot0_joint_pos_sin"], theirs["robot0_joint_pos_cos"]])
+        assert np.allclose(sine_cosine, observed, atol=1e-6)
+    for name, value in saved.items():
+        getattr(model, name)[:] = value
+
+
+def test_lit_burner_is_seen(whole: dict[Task, Trajectory]) -> None:
+    trajectory = whole[STOVE]
+    renderer = Renderer(trajectory.model_xml)
+    last = trajectory.states[-1]
+    renderer.restore(last, trajectory.site_alpha[-1])
+    lit = renderer.frame("agentview").astype(int)
+    renderer.restore(last, trajectory.site_alpha[0])
+    dark = renderer.frame("agentview").astype(int)
+    renderer.close()
+    assert np.abs(lit - dark).max() > 50
+
+
+def fields(model: mujoco.MjModel) -> dict[str, bytes]:
+    arrays = {name: getattr(model, name) for name in dir(model) if not name.startswith("_")}
+    return {name: value.tobytes() for name, value in arrays.items() if isinstance(value, np.ndarray)}
+
+
+def test_camera_changes_the_camera_alone_and_is_undone(whole: dict[Task, Trajectory]) -> None:
+    trajectory = whole[MILK]
+    renderer = Renderer(trajectory.model_xml)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    before, wrist = fields(renderer.model), renderer.frame("robot0_eye_in_hand")
+    agent = renderer.frame("agentview")
+    with renderer.perturbed([MOVED]):
+        renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+        during = fields(renderer.model)
+        assert {name for name in before if before[name] != during[name]} == {"cam_pos", "cam_quat"}
+        assert np.array_equal(renderer.frame("robot0_eye_in_hand"), wrist)
+        assert not np.array_equal(renderer.frame("agentview"), agent)
+    assert fields(renderer.model) == before
+    renderer.close()
+
+
+def test_streams_are_shared_where_nothing_shows() -> None:
+    clean = streams_of("[]")
+    noise = NoiseAxis().sample(rng("test"), MILK, 0)
+    moved = streams_of(f"[{MOVED.model_dump_json()}]")
+    noisy = streams_of(f"[{noise.model_dump_json()}]")
+    for changed in (moved, noisy):
+        assert changed["wrist_image"].stream_id == clean["wrist_image"].stream_id
+        assert changed["image"].stream_id != clean["image"].stream_id
+
+
+def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path) -> None:
+    """Noise is laid on the clean frame of its own camera, in the simulator's orientation, then the frame is turned."""
+    del short_demos
+    source = whole[MILK]
+    steps = 8
+    trajectory = Trajectory("t", source.model_xml, source.states[: steps + 1], source.actions[:steps],
+                            source.kept_mask, source.site_alpha[: steps + 1], source.verdict)  # fmt: skip
+    noise = NoiseAxis().sample(rng("order"), MILK, 0)
+    streams = [
+        Stream("image", ()),
+        Stream("image", (MOVED,)),
+        Stream("image", (MOVED, noise)),
+        Stream("wrist_image", ()),
+    ]
+    config = RenderConfig()
+    rendered = render(trajectory, streams, config)
+    assert set(rendered.streams) == {stream.stream_id for stream in streams}
+    assert rendered.state.shape == (steps, 8)
+    assert rendered.joint_state.shape == (steps, 7)
+    renderer = Renderer(trajectory.model_xml)
+    with renderer.perturbed([MOVED]):
+        renderer.restore(trajectory.states[5], trajectory.site_alpha[5])
+        raw = renderer.frame("agentview")
+    renderer.close()
+    assert rendered.streams[streams[1].stream_id][5] == encode(to_policy(raw), config)
+    assert rendered.streams[streams[2].stream_id][5] == encode(to_policy(noise.apply(raw, 5)), config)
+    assert np.abs(decode(rendered.streams[streams[1].stream_id][5]).astype(int) - raw[::-1, ::-1]).mean() < 3
+
+
+def test_turned_by_half_a_turn() -> None:
+    frame = rng("turn").integers(0, 256, (256, 256, 3), np.uint8)
+    assert SCHEMA.image_rotation_deg == 180
+    assert np.array_equal(to_policy(frame), np.rot90(frame, 2))

@@ -1,0 +1,228 @@
+"""Whole runs on real demonstrations: both datasets and the manifest agree; a killed run resumes to the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tensorflow_datasets as tfds
+import tf_readback
+import yaml
+from conftest import REPOSITORY, STAGES, STOVE, dvc, run_stages, tiny_config
+from PIL import Image
+from test_writers import records
+
+from pipeline import manifest, plan
+from pipeline.axes import from_json
+from pipeline.config import RenderConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.episodes import EpisodeLoader
+from pipeline.frames import decode
+from pipeline.render import Renderer
+from pipeline.store import TrajectoryStore
+
+
+@pytest.fixture(scope="session")
+def rows(finished: Path) -> list[dict[str, Any]]:
+    return manifest.read(finished / "manifest.parquet")
+
+
+def loader(data: Path) -> EpisodeLoader:
+    return EpisodeLoader(data / "plan.parquet", data / "frames", RenderConfig())
+
+
+def test_every_planned_episode_is_accounted_for(finished: Path, rows: list[dict[str, Any]]) -> None:
+    planned = plan.read(finished / "plan.parquet")
+    assert [row["episode_id"] for row in rows] == [row.episode_id for row in planned]
+    kept = [row for row in rows if row["kept"]]
+    assert {row["role"] for row in kept} == {"twin", "perturbed"}
+    # The second milk demonstration only waits: its twin is dropped, and every episode drawn on it was replaced.
+    reasons = {row["reason"] for row in rows if not row["kept"]}
+    assert "goal_not_reached" in reasons
+    assert reasons <= {"goal_not_reached", "reserve_not_needed"}
+    counts = json.loads((finished / "counts.json").read_text())
+    for axis, wanted in {"camera": 3, "noise": 4, "language": 3}.items():
+        assert sum(cell["kept"] for cell in counts[axis].values()) == wanted
+    assert {name for name in rows[0] if name.endswith("_version")} >= {"mujoco_version", "robosuite_version"}
+    for row in rows:
+        assert (row["rlds_shard"] is None) == (row["lerobot_episode_index"] is None) == (not row["kept"])
+    assert sorted(row["lerobot_episode_index"] for row in kept) == list(range(len(kept)))
+    assert len({(row["rlds_shard"], row["rlds_index"]) for row in kept}) == len(kept)
+
+
+def test_lerobot_reads_what_the_manifest_says(finished: Path, rows: list[dict[str, Any]]) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset("tiny", root=finished / "lerobot" / "tiny", video_backend="pyav")
+    kept = [row for row in rows if row["kept"]]
+    assert dataset.meta.total_episodes == len(kept)
+    assert dataset.fps == SCHEMA.fps_hz == 20
+    assert dataset.meta.total_frames == sum(row["steps"] for row in kept)
+    table = dataset.hf_dataset.with_format("numpy")
+    starts = np.searchsorted(np.asarray(table["episode_index"]), np.arange(len(kept)))
+    for row in kept:
+        episode = loader(finished)(row["episode_id"])
+        start = int(starts[row["lerobot_episode_index"]])
+        stored = table[start : start + row["steps"]]
+        assert (stored["episode_index"] == row["lerobot_episode_index"]).all()
+        assert np.array_equal(stored["action"], episode.action)
+        assert np.array_equal(stored["observation.state"], episode.state)
+        first = dataset[start]
+        assert first["task"] == row["instruction"]
+        for name, view in SCHEMA.views.items():
+            shown = np.rint(first[view.lerobot_key].numpy().transpose(1, 2, 0) * 255)
+            error = shown - decode(episode.frames[name][0]).astype(float)
+            assert 10 * np.log10(255**2 / np.mean(error**2)) > 32, f"{name} of {row['episode_id']}"
+
+
+def test_tfds_reads_what_the_manifest_says(finished: Path, rows: list[dict[str, Any]]) -> None:
+    folder = finished / "rlds" / "tiny" / "1.0.0"
+    kept = [row for row in rows if row["kept"]]
+    builder = tfds.builder_from_directory(folder)
+    assert builder.info.splits["train"].num_examples == len(kept)
+    stored = {shard.name: list(records(shard)) for shard in folder.glob("*.tfrecord-*")}
+    for row in kept:
+        record = stored[row["rlds_shard"]][row["rlds_index"]]
+        episode = loader(finished)(row["episode_id"])
+        read = tf_readback.columns(builder.info.features.deserialize_example_np(record))
+        assert read["metadata/episode_id"] == row["episode_id"]
+        assert len(read["action"]) == row["steps"]
+        assert np.array_equal(read["action"], episode.action)
+        assert np.array_equal(read["state"], episode.state)
+        assert set(read["language_instruction"].tolist()) == {row["instruction"]}
+        assert all(frame in record for frames in episode.frames.values() for frame in frames), "JPEG bytes, unchanged"
+
+
+def test_conventions(finished: Path, rows: list[dict[str, Any]]) -> None:
+    """Gripper sign, rotation and frame rate, each against the physics."""
+    twin = next(row for row in rows if row["role"] == "twin" and row["task"] == STOVE.name)
+    episode = loader(finished)(twin["episode_id"])
+    trajectory = TrajectoryStore(finished / "trajectories").load(twin["trajectory_id"])
+    assert np.array_equal(episode.action, trajectory.actions.astype(np.float32))
+    assert set(np.unique(episode.action[:, 6])) <= {SCHEMA.action.gripper.open, SCHEMA.action.gripper.close}
+    assert np.allclose(np.diff(trajectory.states[:, 0]), 1 / SCHEMA.fps_hz)
+    # LIBERO's raw frames have their first row at the bottom: turned by 180 degrees, the frame is upright, so the
+    # table is below and the wall behind the robot above; and it is a mirror image, as OpenVLA trains on it.
+    renderer = Renderer(trajectory.model_xml)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    raw = renderer.frame(SCHEMA.views["image"].camera)
+    renderer.close()
+    shown = decode(episode.frames["image"][0]).astype(float)
+    assert np.abs(shown - np.rot90(raw, 2)).mean() < 3 < np.abs(shown - raw).mean()
+
+
+def test_twins_share_what_does_not_differ(finished: Path, rows: list[dict[str, Any]]) -> None:
+    load = loader(finished)
+    for row in rows:
+        if not row["kept"] or row["role"] == "twin":
+            continue
+        episode, twin = load(row["episode_id"]), load(row["twin_id"])
+        (change,) = from_json(row["perturbations"])
+        for view in SCHEMA.views:
+            same = list(episode.frames[view]) == list(twin.frames[view])
+            assert same == (view not in change.views), f"{row['axis']}: {view}"
+        assert (episode.instruction == twin.instruction) == (row["axis"] != "language")
+        assert np.array_equal(episode.action, twin.action)
+
+
+def test_statistics_and_sheets(finished: Path, rows: list[dict[str, Any]]) -> None:
+    (figures,) = json.loads((finished / "dataset_statistics.json").read_text()).values()
+    kept = [row for row in rows if row["kept"]]
+    assert figures["num_transitions"] == sum(row["steps"] for row in kept)
+    assert figures["num_trajectories"] == len(kept)
+    actions = np.concatenate([loader(finished)(row["episode_id"]).action for row in kept]).astype(np.float64)
+    assert np.allclose(figures["action"]["mean"][:6], actions[:, :6].mean(0))
+    assert np.allclose(figures["action"]["q99"][:6], np.quantile(actions[:, :6], 0.99, axis=0))
+    # OFT turns LIBERO's -1 open, +1 close into 1 open, 0 close before it measures.
+    assert figures["action"]["mean"][6] == pytest.approx((actions[:, 6] < 0).mean())
+    assert figures["action"]["mask"] == [True] * 6 + [False]
+    for axis in ("camera", "noise", "language"):
+        with Image.open(finished / "sheets" / f"{axis}.png") as sheet:
+            assert sheet.width > 300
+
+
+def hashes(data: Path) -> dict[str, str]:
+    files = (path for path in sorted(data.rglob("*")) if path.is_file() and path.name != ".gitignore")
+    return {str(path.relative_to(data)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+def test_killed_and_resumed_with_another_number_of_workers(finished: Path, short_demos: Path, tmp_path: Path) -> None:
+    config = tiny_config(short_demos) | {"compute": {"cluster": "local", "workers": 1}}
+    run_stages(tmp_path, config, ["plan"])
+    data = tmp_path / "data" / "tiny"
+    for stage in ("replay", "render"):
+        folder = data / {"replay": "trajectories", "render": "frames"}[stage]
+        command = [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(tmp_path / "tiny.yaml")]
+        killed = subprocess.Popen(
+            command, cwd=tmp_path, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        deadline = time.monotonic() + 120
+        while not list(folder.glob("*.h5")) and time.monotonic() < deadline:
+            time.sleep(0.02)
+            assert killed.poll() is None, f"{stage} ended before it could be killed"
+        os.killpg(killed.pid, signal.SIGKILL)
+        killed.wait()
+        finished_before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
+        total = len(list((finished / folder.name).glob("*.h5")))
+        assert 0 < len(finished_before) < total, "killed in the middle"
+        run_stages(tmp_path, config, [stage])
+        after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
+        assert len(after) == total
+        assert finished_before.items() <= after.items(), "what was finished is not made again"
+    run_stages(tmp_path, config, STAGES[3:])
+    assert hashes(data) == hashes(finished)
+
+
+def test_damaged_shards_are_made_again(finished: Path, short_demos: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    shard = next((data / "trajectories").glob("*.h5"))
+    whole = shard.read_bytes()
+    shard.write_bytes(whole[: len(whole) // 2])
+    (data / "trajectories" / "stale.h5").write_bytes(b"of an earlier plan")
+    run_stages(tmp_path, tiny_config(short_demos) | {"compute": {"cluster": "loop"}}, ["replay"])
+    assert shard.read_bytes() == whole
+    assert not (data / "trajectories" / "stale.h5").exists()
+
+
+def stages_to_run(clone: Path) -> set[str]:
+    status = json.loads(dvc(clone, "status", "--json").stdout)
+    return {stage.split(":")[-1] for stage in status}
+
+
+def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path) -> None:
+    clone = finished.parent.parent
+    assert stages_to_run(clone) == set()
+    again = dvc(clone, "repro")
+    assert again.returncode == 0
+    assert "Running stage" not in again.stdout
+    file = clone / "configs" / "tiny.yaml"
+    original = file.read_text()
+    cases: list[tuple[tuple[str, ...], Any, set[str]]] = [
+        (("export", "rlds", "shards"), 3, {"export_rlds"}),
+        (("export", "lerobot", "parts"), 3, {"export_lerobot"}),
+        (("render", "jpeg_quality"), 90, {"render"}),
+        (("compute", "workers"), 5, set()),
+        (("plan", "seed"), 8, {"plan"}),
+    ]
+    try:
+        for keys, value, expected in cases:
+            config = yaml.safe_load(original)
+            section = config
+            for key in keys[:-1]:
+                section = section.setdefault(key, {})
+            section[keys[-1]] = value
+            file.write_text(yaml.safe_dump(config))
+            assert stages_to_run(clone) == expected, keys
+    finally:
+        file.write_text(original)

@@ -1,0 +1,397 @@
+"""Both writers on synthetic episodes: what is read back is what went in, and bad episodes leave nothing behind."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import datasets
+import google_crc32c
+import lerobot.datasets.aggregate
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import tensorflow_datasets as tfds
+import tf_readback
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from numpy.typing import NDArray
+
+from pipeline import seeding
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.types import Episode
+from pipeline.writers import lerobot as lerobot_writer
+from pipeline.writers import rlds
+from pipeline.writers.base import split
+
+IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
+NAME = "synthetic"
+REPO = "local/synthetic"
+MIN_PSNR_DB = 36.0
+
+Tree = dict[str, bytes]
+
+
+@cache
+def episode(episode_id: str) -> Episode:
+    """12 to 20 steps of a disc crossing a soft background."""
+    rng = seeding.rng("test_writers", episode_id)
+    steps = int(rng.integers(12, 21))
+    noise = rng.integers(0, 256, (256, 256, 3), np.uint8)
+    background = cv2.convertScaleAbs(cv2.GaussianBlur(noise, (0, 0), 12), alpha=6, beta=-640)
+
+    def frame(t: int, gray: int) -> bytes:
+        canvas = background.copy()
+        cv2.circle(canvas, (40 + 8 * t, 120 + 3 * t), 24, (gray, 120, 90), -1, cv2.LINE_AA)
+        return cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+    action = rng.uniform(-1, 1, (steps, 7)).astype(np.float32)
+    action[:, 6] = np.where(np.arange(steps) < 6, -1, 1)
+    return Episode(
+        episode_id=episode_id,
+        frames={
+            "image": [frame(t, 60) for t in range(steps)],
+            "wrist_image": [frame(t, 170) for t in range(steps)],
+        },
+        state=rng.normal(size=(steps, 8)).astype(np.float32),
+        joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
+        action=action,
+        instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
+        provenance={column: f"{column} of {episode_id}" for column in SCHEMA.provenance} | {"episode_id": episode_id},
+    )
+
+
+def pixels(jpeg: bytes) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR_RGB), np.uint8)
+
+
+def psnr_db(a: NDArray[Any], b: NDArray[Any]) -> float:
+    return float(10 * np.log10(255**2 / np.mean((a.astype(np.float64) - b) ** 2)))
+
+
+def loop(fn: Callable[[Any], Any], items: Sequence[Any], description: str) -> list[Any]:
+    return [fn(item) for item in items]
+
+
+def spread(
+    executor: ProcessPoolExecutor, fn: Callable[[Any], Any], items: Sequence[Any], description: str
+) -> list[Any]:
+    return list(executor.map(fn, items))
+
+
+def loaded_packages() -> set[str]:
+    return {name.split(".")[0] for name in sys.modules}
+
+
+def files(folder: Path) -> Tree:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def write_rlds(out: Path, load: Callable[[str], Episode] = episode, run: Any = loop) -> rlds.RldsReport:
+    return rlds.write(IDS, load, out, name=NAME, shards=3, run=run)
+
+
+def write_lerobot(out: Path, load: Callable[[str], Episode] = episode, run: Any = loop) -> lerobot_writer.LeRobotReport:
+    return lerobot_writer.write(IDS, load, out / "lerobot", repo_id=REPO, parts=3, run=run)
+
+
+@dataclass(frozen=True)
+class Written:
+    rlds: rlds.RldsReport
+    lerobot: lerobot_writer.LeRobotReport
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Written]:
+    """Both sets, made without a network and without a trace in the cache of ``datasets``."""
+    out, cache_folder = tmp_path_factory.mktemp("out"), tmp_path_factory.mktemp("cache") / "datasets"
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a writer reached for the network")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(datasets.config, "HF_DATASETS_CACHE", cache_folder)
+        with pytest.MonkeyPatch.context() as offline:
+            offline.setattr(socket.socket, "connect", refuse)
+            both = Written(write_rlds(out), write_lerobot(out))
+        assert not cache_folder.exists()
+        assert sorted(path.name for path in out.iterdir()) == ["lerobot", NAME]
+        yield both
+
+
+def records(shard: Path) -> Iterator[bytes]:
+    """The records of a TFRecord file, checksums verified independently of the writer."""
+    data, start = shard.read_bytes(), 0
+    while start < len(data):
+        (length,) = struct.unpack_from("<Q", data, start)
+        end = start + 12 + length
+        for begin, stop in ((start, start + 8), (start + 12, end)):
+            crc = google_crc32c.value(data[begin:stop])
+            rotated = ((crc >> 15) | (crc << 17 & 0xFFFFFFFF)) + 0xA282EAD8
+            assert struct.unpack_from("<I", data, stop)[0] == rotated % 2**32
+        yield data[start + 12 : end]
+        start = end + 4
+
+
+def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
+    """What a reader of RLDS must find, whichever reader it is."""
+    assert len(read) == len(IDS)
+    for found, source in zip(read, map(episode, IDS), strict=True):
+        last = np.arange(len(source)) == len(source) - 1
+        for name in ("action", "state", "joint_state"):
+            assert found[name].dtype == np.float32
+            np.testing.assert_array_equal(found[name], getattr(source, name))
+        np.testing.assert_array_equal(found["discount"], np.ones(len(source)))
+        np.testing.assert_array_equal(found["reward"], last)
+        np.testing.assert_array_equal(found["is_last"], last)
+        np.testing.assert_array_equal(found["is_terminal"], last)
+        np.testing.assert_array_equal(found["is_first"], np.arange(len(source)) == 0)
+        assert found["language_instruction"].tolist() == [source.instruction] * len(source)
+        for view in SCHEMA.views:
+            # TensorFlow decodes JPEG with the fast DCT: one grey level off in the mean, measured 5 at most.
+            off = np.abs(found[view].astype(int) - pixels(source.frames[view][0]))
+            assert (off.mean() < 1.5, off.max() <= 8) == (True, True)
+        metadata = {name.removeprefix("metadata/"): str(text) for name, text in found.items() if "/" in name}
+        assert metadata == {"file_path": source.provenance["demo_source"], **source.provenance}
+
+
+def test_rlds_features_are_openvlas(written: Written) -> None:
+    builder = tfds.builder_from_directory(written.rlds.folder)
+    features = builder.info.features
+    assert features.to_json() == rlds.features().to_json()
+    specs = {
+        name: (spec.shape, np.dtype(spec.np_dtype))
+        for name, spec in features["steps"].feature.items()
+        if name != "observation"
+    }
+    text = ((), np.dtype(object))
+    assert specs == {
+        "action": ((7,), np.float32),
+        "discount": ((), np.float32),
+        "reward": ((), np.float32),
+        "is_first": ((), np.bool_),
+        "is_last": ((), np.bool_),
+        "is_terminal": ((), np.bool_),
+        "language_instruction": text,
+    }
+    observation = features["steps"].feature["observation"]
+    assert {name: (spec.shape, np.dtype(spec.np_dtype)) for name, spec in observation.items()} == {
+        "image": ((256, 256, 3), np.uint8),
+        "wrist_image": ((256, 256, 3), np.uint8),
+        "state": ((8,), np.float32),
+        "joint_state": ((7,), np.float32),
+    }
+    assert observation["image"].encoding_format == "jpeg"
+    assert set(features["episode_metadata"]) == {"file_path", *SCHEMA.provenance}
+    assert (builder.info.name, str(builder.info.version)) == (NAME, "1.0.0")
+    assert builder.info.splits["train"].shard_lengths == [2, 2, 2]
+
+
+def test_rlds_holds_the_episodes(written: Written) -> None:
+    features = tfds.builder_from_directory(written.rlds.folder).info.features
+    shards = sorted(written.rlds.folder.glob("*.tfrecord-*"))
+    assert [shard.name for shard in shards] == [f"{NAME}-train.tfrecord-0000{k}-of-00003" for k in range(3)]
+    stored = {shard.name: list(records(shard)) for shard in shards}
+    for episode_id, (shard, position) in written.rlds.locations.items():
+        # The very bytes of every frame, not a second encoding.
+        assert all(frame in stored[shard][position] for view in episode(episode_id).frames.values() for frame in view)
+    examples = [features.deserialize_example_np(record) for shard in stored.values() for record in shard]
+    assert_episodes([tf_readback.columns(example) for example in examples])
+    assert written.rlds.steps == sum(len(episode(episode_id)) for episode_id in IDS)
+    assert written.rlds.bytes == sum(map(len, files(written.rlds.folder).values()))
+    assert "tensorflow" not in sys.modules
+
+
+@pytest.mark.skipif(shutil.which("uv") is None, reason="uv makes the environment with TensorFlow")
+def test_rlds_reads_with_tensorflow(written: Written, tmp_path: Path) -> None:
+    requirements = ["--with", "tensorflow-cpu==2.21.0", "--with", "tensorflow-datasets==4.9.10"]
+    script, target = Path(tf_readback.__file__), tmp_path / "read.npz"
+    command = ["uv", "run", "--no-project", "--isolated", "--python", "3.11", *requirements, "python", str(script)]
+    done = subprocess.run([*command, str(written.rlds.folder), str(target)], capture_output=True, text=True)
+    if not done.stdout.startswith("tensorflow"):
+        pytest.skip(f"TensorFlow cannot be installed here: {done.stderr[-500:]}")
+    assert done.returncode == 0, done.stderr[-2000:]
+    read = np.load(target)
+    assert_episodes(
+        [
+            {name.split("/", 1)[1]: read[name] for name in read.files if name.startswith(f"{index}/")}
+            for index in range(len({name.split("/")[0] for name in read.files}))
+        ]
+    )
+
+
+def assert_lerobot_episodes(folder: Path) -> None:
+    dataset = LeRobotDataset(REPO, root=folder, video_backend="pyav")
+    assert (dataset.num_episodes, dataset.fps, dataset.meta.robot_type) == (len(IDS), 20, "panda")
+    assert dataset.num_frames == sum(len(episode(episode_id)) for episode_id in IDS)
+    start = 0
+    for index, source in enumerate(map(episode, IDS)):
+        assert dataset.meta.episodes[index]["length"] == len(source)
+        items = [dataset[t] for t in range(start, start + len(source))]
+        start += len(source)
+        assert {int(item["episode_index"]) for item in items} == {index}
+        assert {item["task"] for item in items} == {source.instruction}
+        np.testing.assert_array_equal([item["frame_index"] for item in items], np.arange(len(source)))
+        for key in ("state", "joint_state", "action"):
+            name = key if key == "action" else f"observation.{key}"
+            np.testing.assert_array_equal(np.stack([item[name] for item in items]), getattr(source, key))
+        for key, view in (("image", "image"), ("image2", "wrist_image")):
+            decoded = [item[f"observation.images.{key}"].numpy().transpose(1, 2, 0) * 255 for item in items]
+            for shown, frame in zip(decoded, source.frames[view], strict=True):
+                assert psnr_db(shown, pixels(frame)) > MIN_PSNR_DB
+
+
+def test_lerobot_holds_the_episodes(written: Written) -> None:
+    assert_lerobot_episodes(written.lerobot.folder)
+    assert written.lerobot.episode_index == {episode_id: index for index, episode_id in enumerate(IDS)}
+    info = json.loads((written.lerobot.folder / "meta" / "info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    assert info["features"]["action"]["names"] == list(SCHEMA.action.names)
+    assert info["features"]["observation.images.image"]["info"]["video.codec"] == "h264"
+
+
+def test_lerobot_provenance_has_a_row_for_each_episode(written: Written) -> None:
+    rows = pq.read_table(written.lerobot.folder / "meta" / "provenance.parquet").to_pylist()
+    assert rows == [{"episode_index": k, **episode(episode_id).provenance} for k, episode_id in enumerate(IDS)]
+
+
+def test_lerobot_statistics_are_exact(written: Written) -> None:
+    stats = LeRobotDataset(REPO, root=written.lerobot.folder, video_backend="pyav").meta.stats
+    sources = [episode(episode_id) for episode_id in IDS]
+    actions = np.concatenate([source.action for source in sources]).astype(np.float64)
+    frames = np.stack([pixels(frame) for source in sources for frame in source.frames["image"]]) / 255
+    for found, values, axes in (
+        (stats["action"], actions, 0),
+        (stats["observation.images.image"], frames, (0, 1, 2)),
+    ):
+        shape = (3, 1, 1) if values is frames else (7,)
+        for name, expected in (
+            ("min", values.min(axis=axes)),
+            ("max", values.max(axis=axes)),
+            ("mean", values.mean(axis=axes)),
+            ("std", values.std(axis=axes)),
+            ("q01", np.quantile(values, 0.01, axis=axes)),
+            ("q50", np.quantile(values, 0.50, axis=axes)),
+            ("q99", np.quantile(values, 0.99, axis=axes)),
+        ):
+            np.testing.assert_allclose(found[name], expected.reshape(shape), atol=1e-6, err_msg=name)
+        np.testing.assert_array_equal(found["count"], [len(actions)])
+    assert set(stats) >= {"observation.state", "observation.joint_state", "observation.images.image2", "timestamp"}
+
+
+def test_lerobot_reads_when_videos_spread_over_many_files(written: Written, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lerobot_writer, "PART_VIDEO_MB", 0.05)
+        patch.setattr(lerobot.datasets.aggregate, "DEFAULT_VIDEO_FILE_SIZE_IN_MB", 0.15)
+        report = write_lerobot(tmp_path)
+    assert len(list(report.folder.rglob("*.mp4"))) > 2
+    assert_lerobot_episodes(report.folder)
+
+
+def test_formats_carry_the_same_numbers(written: Written) -> None:
+    table = pq.read_table(written.lerobot.folder / "data").to_pydict()
+    features = tfds.builder_from_directory(written.rlds.folder).info.features
+    for episode_id, (shard, position) in written.rlds.locations.items():
+        record = list(records(written.rlds.folder / shard))[position]
+        steps = tf_readback.columns(features.deserialize_example_np(record))
+        index = written.lerobot.episode_index[episode_id]
+        rows = [row for row, found in enumerate(table["episode_index"]) if found == index]
+        for name, key in (
+            ("action", "action"),
+            ("state", "observation.state"),
+            ("joint_state", "observation.joint_state"),
+        ):
+            np.testing.assert_array_equal(np.array([table[key][row] for row in rows], np.float32), steps[name])
+
+
+def test_bytes_do_not_depend_on_the_workers(written: Written, tmp_path: Path) -> None:
+    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
+        run = partial(spread, executor)
+        again = Written(write_rlds(tmp_path, run=run), write_lerobot(tmp_path, run=run))
+        modules = executor.submit(loaded_packages).result()
+    for first, second in ((written.rlds.folder, again.rlds.folder), (written.lerobot.folder, again.lerobot.folder)):
+        one, two = files(first), files(second)
+        assert one.keys() == two.keys()
+        assert [name for name in one if one[name] != two[name]] == []
+        assert [name for name, data in two.items() if str(tmp_path).encode() in data] == []
+    # Export imports no simulator; TensorFlow would crash a process that renders.
+    assert not {"mujoco", "robosuite", "libero", "tensorflow"} & modules
+
+
+def truncated(source: Episode, steps: int) -> Episode:
+    frames = {view: frames[:steps] for view, frames in source.frames.items()}
+    arrays = {name: getattr(source, name)[:steps] for name in ("state", "joint_state", "action")}
+    return replace(source, frames=frames, **arrays)
+
+
+BAD: dict[str, tuple[str, Callable[[Episode], Episode]]] = {
+    "empty text": ("instruction", lambda e: replace(e, instruction=" ")),
+    "file name": ("instruction", lambda e: replace(e, instruction="put_the_bowl_on_the_plate")),
+    "too short": ("action", lambda e: truncated(e, SCHEMA.min_steps - 1)),
+    "nan": ("state", lambda e: replace(e, state=np.full_like(e.state, np.nan))),
+    "wrong shape": ("joint_state", lambda e: replace(e, joint_state=e.joint_state[:, :6])),
+    "wrong dtype": ("state", lambda e: replace(e, state=e.state.astype(np.float64))),
+    "out of range": ("action", lambda e: replace(e, action=e.action * 2)),
+    "lost frame": (
+        "wrist_image",
+        lambda e: replace(e, frames={**e.frames, "wrist_image": e.frames["wrist_image"][1:]}),
+    ),
+    "lost view": ("frames", lambda e: replace(e, frames={"image": e.frames["image"]})),
+    "no image": ("image", lambda e: replace(e, frames={**e.frames, "image": [b"noise"] * len(e)})),
+    "cut image": ("image", lambda e: replace(e, frames={**e.frames, "image": [f[:-99] for f in e.frames["image"]]})),
+    "lost column": ("provenance", lambda e: replace(e, provenance={"episode_id": e.episode_id})),
+    "wrong id": ("provenance", lambda e: replace(e, provenance={**e.provenance, "episode_id": "other"})),
+    "no text": ("provenance", lambda e: replace(e, provenance={**e.provenance, "seed": 7})),  # type: ignore[dict-item]
+}
+
+
+def load_spoilt(episode_id: str, spoil: Callable[[Episode], Episode]) -> Episode:
+    return spoil(episode(episode_id)) if episode_id == IDS[-1] else episode(episode_id)
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_rlds_refuses_a_bad_episode(fault: str, tmp_path: Path) -> None:
+    field, spoil = BAD[fault]
+    with pytest.raises(PipelineError, match=rf"episode {IDS[-1]}: {field} "):
+        write_rlds(tmp_path, load=partial(load_spoilt, spoil=spoil))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_lerobot_refuses_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "lerobot").mkdir()
+    (tmp_path / "lerobot" / "earlier").write_text("set")
+    field, spoil = BAD["nan"]
+    with pytest.raises(PipelineError, match=rf"episode {IDS[-1]}: {field} "):
+        write_lerobot(tmp_path, load=partial(load_spoilt, spoil=spoil))
+    assert files(tmp_path) == {"lerobot/earlier": b"set"}
+    assert [path.name for path in tmp_path.iterdir()] == ["lerobot"]
+
+
+def test_split_keeps_order_and_balance() -> None:
+    ids = [str(k) for k in range(11)]
+    pieces = split(ids, 4)
+    assert [name for piece in pieces for name in piece] == ids
+    assert sorted(map(len, pieces)) == [2, 3, 3, 3]
+    assert split(ids[:2], 4) == [["0"], ["1"]]
+    for wrong in ([], ["0", "0"]):
+        with pytest.raises(PipelineError):
+            split(wrong, 2)
+    with pytest.raises(PipelineError):
+        split(ids, 0)
+
+
+def test_rlds_refuses_a_name_tfds_would_not_find(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="not a TFDS name"):
+        rlds.write(IDS, episode, tmp_path, name="LIBERO-plus", shards=1, run=loop)
