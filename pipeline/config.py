@@ -58,7 +58,7 @@ class PlanConfig(Frozen):
 
     seed: int
     axes: Axes
-    episodes: dict[Literal["camera", "noise", "language"], Count]
+    episodes: dict[str, Count]
     reserve: float = Field(default=0.0, ge=0.0, le=10.0)
 
     @model_validator(mode="after")

@@ -20,14 +20,26 @@ def replaced(path: Path) -> Iterator[Path]:
     _remove(temporary)
     try:
         yield temporary
+        for made in (*temporary.rglob("*"), temporary):
+            _sync(made)
         if temporary.is_dir():
             _remove(path)
-        else:
-            with open(temporary, "rb") as written:
-                os.fsync(written.fileno())
         os.replace(temporary, path)
+        _sync(path.parent)
     finally:
-        _remove(temporary)
+        # After a failure other workers may still be writing into a folder: what they leave is removed next time.
+        if temporary.is_dir():
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def keep_only(folder: Path, names: set[str]) -> None:

@@ -26,7 +26,7 @@ _TYPES = {"string": pa.string(), "int": pa.int64(), "bool": pa.bool_()}
 def build(
     rows: Sequence[Row],
     outcome: Mapping[str, Verdict],
-    steps: Mapping[str, int],
+    replayed: Mapping[str, tuple[int, str]],
     devices: Mapping[str, str],
     rlds: Mapping[str, tuple[str, int]],
     lerobot: Mapping[str, int],
@@ -36,7 +36,7 @@ def build(
     Args:
         rows: the plan.
         outcome: episode id to verdict.
-        steps: trajectory id to the number of executed actions, for every replayed trajectory.
+        replayed: trajectory id to the number of executed actions and what physics perturbations came to.
         devices: trajectory id to the OpenGL device that rendered it, for every rendered trajectory.
         rlds: episode id to its shard's file name and its place in it, for every kept episode.
         lerobot: episode id to its ``episode_index``, for every kept episode.
@@ -45,11 +45,13 @@ def build(
     table = []
     for row in rows:
         verdict = outcome[row.episode_id]
+        steps, resolved = replayed.get(row.trajectory_id, (None, None))
         shard, index = rlds.get(row.episode_id, (None, None))
         made: dict[str, Any] = {
             "kept": verdict.kept,
             "reason": verdict.reason,
-            "steps": steps.get(row.trajectory_id),
+            "steps": steps,
+            "resolved": resolved,
             "gl_device": devices.get(row.trajectory_id),
             "rlds_shard": shard,
             "rlds_index": index,
@@ -85,7 +87,7 @@ def counts(manifest: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
             continue
         cell = table.setdefault(row["axis"], {}).setdefault(row["suite"], {"planned": 0, "replayed": 0, "kept": 0})
         cell["planned"] += 1
-        cell["replayed"] += row["steps"] is not None
+        cell["replayed"] += bool(row["steps"])
         cell["kept"] += row["kept"]
     return table
 

@@ -26,9 +26,6 @@ GL = gl.choose()
 
 import mujoco  # noqa: E402
 
-VISUAL_FIELDS = ("cam_pos", "cam_quat")
-"""The model's arrays that render-layer perturbations may write, put back after each."""
-
 
 class Renderer:
     """Renders one scene through one GL context; close it before the next is made.
@@ -72,7 +69,8 @@ class Renderer:
     @contextmanager
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
         """Apply render-layer perturbations to the model for a moment."""
-        saved = {name: getattr(self.model, name).copy() for name in VISUAL_FIELDS}
+        written = {name for perturbation in perturbations for name in perturbation.fields}
+        saved = {name: getattr(self.model, name).copy() for name in written}
         try:
             for perturbation in perturbations:
                 perturbation.apply(self.model)

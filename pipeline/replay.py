@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,13 +11,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.axes import PhysicsPerturbation, RefusedError, from_json, of_layer
 from pipeline.compute import Run
 from pipeline.config import Config, DemosConfig, ReplayConfig
 from pipeline.environment import Environment
 from pipeline.judge import verdict
 from pipeline.plan import Row, pending
 from pipeline.store import TrajectoryStore
-from pipeline.types import Demo, Floats, Task, Trajectory, Verdict
+from pipeline.types import Demo, Floats, Scene, Task, Trajectory, Verdict
 
 NOOP_NORM = 1e-4
 """Largest norm of the six pose deltas that still counts as no motion (OpenVLA's `regenerate_libero_dataset.py`)."""
@@ -50,12 +52,24 @@ def kept_actions(actions: Floats, noops: str) -> NDArray[np.bool_]:
     return real
 
 
-def open_loop(environment: Environment, demo: Demo, trajectory_id: str, config: ReplayConfig) -> Trajectory:
-    """Send the demonstration's actions as they were recorded, from its exact first state."""
-    model_xml = demo.model_xml or environment.place_fixtures(config.fixture_seed)
+def open_loop(
+    environment: Environment,
+    demo: Demo,
+    trajectory_id: str,
+    config: ReplayConfig,
+    perturbations: Sequence[PhysicsPerturbation] = (),
+) -> Trajectory:
+    """Send the demonstration's actions as they were recorded, from its exact first state or a perturbed one."""
     mask = kept_actions(demo.actions, config.noops)
     actions = demo.actions[mask]
-    environment.restore(model_xml, demo.init_state)
+    scene = Scene(demo.model_xml or environment.place_fixtures(config.fixture_seed), demo.init_state)
+    refusal: Verdict | None = None
+    try:
+        for perturbation in perturbations:
+            scene = perturbation.apply(scene, demo)
+    except RefusedError as refused:
+        refusal, actions = Verdict(False, refused.reason), actions[:0]
+    environment.restore(scene.model_xml, scene.state)
     states, alphas, succeeded = [environment.state], [environment.site_alpha], []
     for action in actions:
         environment.step(action)
@@ -64,12 +78,13 @@ def open_loop(environment: Environment, demo: Demo, trajectory_id: str, config: 
         succeeded.append(environment.succeeded())
     return Trajectory(
         trajectory_id=trajectory_id,
-        model_xml=model_xml,
+        model_xml=scene.model_xml,
         states=np.stack(states),
         actions=actions,
         kept_mask=mask,
         site_alpha=np.stack(alphas),
-        verdict=verdict(np.stack(states), np.array(succeeded, bool)),
+        resolved=json.dumps(scene.resolved, sort_keys=True),
+        verdict=refusal or verdict(np.stack(states), np.array(succeeded, bool)),
     )
 
 
@@ -79,6 +94,7 @@ class ReplayJob:
 
     trajectory_id: str
     demo_id: str
+    perturbations: str
     demos: DemosConfig
     config: ReplayConfig
     folder: Path
@@ -86,7 +102,8 @@ class ReplayJob:
     def __call__(self) -> Verdict:
         """Replay, judge and store; returns the verdict."""
         demo = self.demos.open().load(self.demo_id)
-        trajectory = open_loop(_environment(demo.task), demo, self.trajectory_id, self.config)
+        physics = of_layer(from_json(self.perturbations), PhysicsPerturbation)
+        trajectory = open_loop(_environment(demo.task), demo, self.trajectory_id, self.config, physics)
         TrajectoryStore(self.folder).save(trajectory)
         return trajectory.verdict
 
@@ -98,15 +115,22 @@ def replay_plan(rows: Sequence[Row], config: Config, folder: Path, run: Run) -> 
         Trajectory id to verdict, for every trajectory that was needed.
     """
     store = TrajectoryStore(folder)
-    demo_of = {row.trajectory_id: row.demo_id for row in rows}
+    row_of = {row.trajectory_id: row for row in rows}
     verdicts: dict[str, Verdict] = {}
     while needed := pending(rows, verdicts):
         found = {trajectory_id: store.verdict(trajectory_id) for trajectory_id in needed}
         verdicts |= {trajectory_id: verdict for trajectory_id, verdict in found.items() if verdict is not None}
         # Ordered by task: a worker builds a task's environment once.
         jobs = [
-            ReplayJob(trajectory_id, demo_of[trajectory_id], config.demos, config.replay, folder)
-            for trajectory_id in sorted(needed, key=lambda trajectory_id: demo_of[trajectory_id])
+            ReplayJob(
+                trajectory_id,
+                row_of[trajectory_id].demo_id,
+                row_of[trajectory_id].perturbations,
+                config.demos,
+                config.replay,
+                folder,
+            )
+            for trajectory_id in sorted(needed, key=lambda trajectory_id: row_of[trajectory_id].demo_id)
             if found[trajectory_id] is None
         ]
         if jobs:

@@ -38,6 +38,7 @@ class TrajectoryStore:
             file.attrs["made_by"] = fingerprint()
             file.attrs["kept"] = trajectory.verdict.kept
             file.attrs["reason"] = trajectory.verdict.reason
+            file.attrs["resolved"] = trajectory.resolved
             file["model_xml"] = np.frombuffer(trajectory.model_xml.encode(), np.uint8)
             file["states"] = trajectory.states
             file["actions"] = trajectory.actions
@@ -58,6 +59,7 @@ class TrajectoryStore:
                 actions=file["actions"][()],
                 kept_mask=file["kept_mask"][()],
                 site_alpha=file["site_alpha"][()],
+                resolved=str(file.attrs["resolved"]),
                 verdict=_verdict(file),
             )
 
@@ -69,10 +71,10 @@ class TrajectoryStore:
         except PipelineError:
             return None
 
-    def steps(self, trajectory_id: str) -> int:
-        """How many actions were executed."""
+    def outcome(self, trajectory_id: str) -> tuple[int, str]:
+        """How many actions were executed, and JSON of what physics perturbations came to."""
         with _opened(self.path(trajectory_id), fingerprint(), "replay") as file:
-            return len(file["actions"])
+            return len(file["actions"]), str(file.attrs["resolved"])
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,21 @@ class Demo:
 
 
 @dataclass(frozen=True)
+class Scene:
+    """Where a replay starts.
+
+    Attributes:
+        model_xml: MJCF with asset paths of this machine.
+        state: (S,) flattened MuJoCo state: time, qpos, qvel.
+        resolved: axis to what its perturbation came to in this scene, JSON-serialisable, such as where objects ended.
+    """
+
+    model_xml: str
+    state: Floats
+    resolved: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Verdict:
     """Whether something planned is kept, and the reason when it is not."""
 
@@ -79,6 +95,7 @@ class Trajectory:
         actions: (K, 7) executed actions.
         kept_mask: (T,) which of the demonstration's actions were executed.
         site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
+        resolved: JSON of what physics perturbations came to in this scene.
         verdict: the judge's word after the last action.
     """
 
@@ -88,6 +105,7 @@ class Trajectory:
     actions: Floats
     kept_mask: NDArray[np.bool_]
     site_alpha: NDArray[np.float32]
+    resolved: str
     verdict: Verdict
 
 

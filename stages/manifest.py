@@ -20,7 +20,7 @@ def run(config: Config) -> None:
     table = manifest.build(
         rows,
         outcome=outcome,
-        steps={trajectory_id: store.steps(trajectory_id) for trajectory_id in known},
+        replayed={trajectory_id: store.outcome(trajectory_id) for trajectory_id in known},
         devices={trajectory_id: frames.device(trajectory_id) for trajectory_id in rendered},
         rlds={
             episode: (shard, index) for episode, (shard, index) in json.loads((data / "rlds.json").read_text()).items()

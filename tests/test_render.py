@@ -17,7 +17,7 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import Stream, decode, encode, streams_of, to_policy
-from pipeline.render import VISUAL_FIELDS, Renderer, render
+from pipeline.render import Renderer, render
 from pipeline.seeding import rng
 from pipeline.types import Frame, Task, Trajectory
 
@@ -61,7 +61,7 @@ def test_frames_and_proprioception_equal_libero(libero_frames: tuple[Trajectory,
     renderer.close()
 
     model = libero.env.sim.model._model
-    saved = {name: getattr(model, name).copy() for name in VISUAL_FIELDS}
+    saved = {name: getattr(model, name).copy() for name in MOVED.fields}
     if perturbed:
         MOVED.apply(model)
     for step in steps:
@@ -129,7 +129,7 @@ def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path
     source = whole[MILK]
     steps = 8
     trajectory = Trajectory("t", source.model_xml, source.states[: steps + 1], source.actions[:steps],
-                            source.kept_mask, source.site_alpha[: steps + 1], source.verdict)  # fmt: skip
+                            source.kept_mask, source.site_alpha[: steps + 1], "{}", source.verdict)  # fmt: skip
     noise = NoiseAxis().sample(rng("order"), MILK, 0)
     streams = [
         Stream("image", ()),

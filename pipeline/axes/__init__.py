@@ -12,6 +12,7 @@ from pipeline.axes.base import (
     Perturbation,
     PhysicsPerturbation,
     PixelPerturbation,
+    RefusedError,
     RenderPerturbation,
     TextPerturbation,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "Axes",
     "PhysicsPerturbation",
     "PixelPerturbation",
+    "RefusedError",
     "RenderPerturbation",
     "TextPerturbation",
     "from_json",

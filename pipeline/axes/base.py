@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from pipeline.types import Frame
+from pipeline.types import Demo, Frame, Scene
 
 if TYPE_CHECKING:
     import mujoco
@@ -75,12 +75,17 @@ class PixelPerturbation(Perturbation):
 
 
 class RenderPerturbation(Perturbation):
-    """Changes what a scene looks like and nothing that moves in it."""
+    """Changes what a scene looks like and nothing that moves in it.
+
+    Attributes:
+        fields: the arrays of the model that ``apply`` may write; they are put back afterwards.
+    """
 
     layer: ClassVar[Layer] = Layer.RENDER
+    fields: ClassVar[tuple[str, ...]]
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Write the change into the model's visual fields."""
+        """Write the change into the model's ``fields``."""
         raise NotImplementedError
 
 
@@ -88,6 +93,27 @@ class PhysicsPerturbation(Perturbation):
     """Changes what happens: the scene before the first step, and so the whole replay."""
 
     layer: ClassVar[Layer] = Layer.PHYSICS
+    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
+
+    def apply(self, scene: Scene, demo: Demo) -> Scene:
+        """The scene that ``demo`` is replayed in.
+
+        Raises:
+            RefusedError: when the change cannot be made here; its reason ends in the manifest.
+        """
+        raise NotImplementedError
+
+
+class RefusedError(Exception):
+    """A perturbation that does not go with its scene.
+
+    Args:
+        reason: short and in snake_case, such as ``robot_in_collision``.
+    """
+
+    def __init__(self, reason: str):
+        super().__init__(reason)
+        self.reason = reason
 
 
 def _ordered(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:

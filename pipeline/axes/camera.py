@@ -44,6 +44,7 @@ class CameraPerturbation(RenderPerturbation):
     pitch_deg: float = 0.0
 
     views: ClassVar[frozenset[str]] = frozenset({"image"})
+    fields: ClassVar[tuple[str, ...]] = ("cam_pos", "cam_quat")
 
     def pose(
         self, pos_m: NDArray[np.float64], quat_wxyz: NDArray[np.float64]
