@@ -96,7 +96,9 @@ def counts_table(manifest: Sequence[Mapping[str, Any]]) -> Table:
     """``counts`` as a table for people, with a line of totals."""
     cells = counts(manifest)
     suites = list(dict.fromkeys(row["suite"] for row in manifest))
-    table = Table("axis", *suites, "all", title="planned / replayed / kept episodes")
+    table = Table(
+        "axis", *(suite.removeprefix("libero_") for suite in suites), "all", title="planned / replayed / kept episodes"
+    )
     for column in table.columns[1:]:
         column.justify = "right"
     for axis, by_suite in cells.items():
