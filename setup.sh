@@ -84,7 +84,10 @@ fi
 # DVC's stages call `python`.
 export PATH=$PWD/.venv/bin:$PATH
 case $VERB in
-run) dvc repro ;;
+run)
+    python -m pipeline doctor
+    dvc repro
+    ;;
 test)
     ruff check
     ruff format --check

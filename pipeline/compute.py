@@ -16,6 +16,9 @@ from pipeline.errors import PipelineError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+CONNECT_S = 30
+"""How long to wait for a scheduler's answer."""
+
 
 class Run(Protocol):
     """Apply ``fn`` to every item, in any order and place; the results come back in the order of the items."""
@@ -52,14 +55,14 @@ def runner(config: ComputeConfig) -> Iterator[Run]:
             n_workers=config.workers or CPU_COUNT,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=None,
+            dashboard_address=":0",
             memory_limit=None,
         )
         with cluster, Client(cluster) as client:
             yield _on(client)
     else:
         try:
-            client = Client(config.cluster, timeout="30s")
+            client = Client(config.cluster, timeout=CONNECT_S)
         except OSError as error:
             raise PipelineError(
                 "no Dask scheduler answers", where=config.cluster, remedy="start one, or set compute.cluster: local"
@@ -73,12 +76,13 @@ def _on(client: Any) -> Run:
 
     def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         # Not pure: equal items are still separate work, and the scheduler must not remember earlier runs.
-        futures = client.map(fn, items, pure=False, retries=1)
+        futures = client.map(fn, items, pure=False)
         with _progress(description, len(items)) as advance:
             for future in as_completed(futures):
                 if future.status == "error":
+                    error = future.exception()
                     client.cancel(futures)
-                    future.result()
+                    raise error
                 advance()
         return list(client.gather(futures))
 
