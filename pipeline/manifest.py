@@ -97,7 +97,7 @@ def counts_table(manifest: Sequence[Mapping[str, Any]]) -> Table:
     cells = counts(manifest)
     suites = list(dict.fromkeys(row["suite"] for row in manifest))
     table = Table(
-        "axis", *(suite.removeprefix("libero_") for suite in suites), "all", title="planned / replayed / kept episodes"
+        "axis", *(suite.removeprefix("libero_") for suite in suites), "all", title="planned/replayed/kept episodes"
     )
     for column in table.columns[1:]:
         column.justify = "right"
@@ -115,4 +115,4 @@ def _sum(cells: Sequence[Mapping[str, int]]) -> dict[str, int]:
 
 
 def _cell(cell: Mapping[str, int]) -> str:
-    return " / ".join(str(number) for number in cell.values()) or "-"
+    return "/".join(map(str, cell.values())) or "-"
