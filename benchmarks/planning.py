@@ -7,7 +7,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from pipeline import plan
+from pipeline import plan, testset
 from pipeline.axes import Axes
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis
@@ -20,8 +20,9 @@ def main() -> None:
     config = PlanConfig(seed=1, axes=axes, episodes={"camera": 11_200, "noise": 9_600, "language": 1_600})
     start = time.perf_counter()
     index = DemosConfig().index()
+    test = testset.load()
     indexed = time.perf_counter()
-    rows = plan.make(index.entries, config, ReplayConfig())
+    rows = plan.make(index.entries, config, ReplayConfig(), test)
     drawn = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         plan.write(rows, Path(folder) / "plan.parquet")

@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import doctor
-from pipeline.config import Config
+from pipeline.axes import Axes
+from pipeline.chat import Chat
+from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.fetch import fetch
-from pipeline.tasks import SUITES
+from pipeline.files import replaced
+from pipeline.rewrite import extend
+from pipeline.tasks import SUITES, select_tasks
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 
@@ -32,11 +36,37 @@ def _fetch(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _preview(arguments: argparse.Namespace) -> int:
+    # Rendering starts OpenGL on import, which the other commands can do without.
+    from pipeline import preview
+
+    config = load(arguments.config)
+    tasks = select_tasks([arguments.task])
+    with preview.staged(tasks, config) as stage, replaced(arguments.out) as temporary:
+        preview.draw(stage, arguments.axis, config).save(temporary, format="PNG")
+        of = f", the first of {len(tasks)} tasks" if len(tasks) > 1 else ""
+        print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")
+    return 0
+
+
+def _rewrite(arguments: argparse.Namespace) -> int:
+    extend(arguments.bddl_file, arguments.out, arguments.per_class, Chat(arguments.endpoint, arguments.model))
+    print(f"{arguments.out} holds {arguments.per_class} rewrites of each class for {arguments.bddl_file.stem}")
+    return 0
+
+
 def _schema(arguments: argparse.Namespace) -> int:
     file = SCHEMAS / "config.schema.json"
     file.write_text(json.dumps(config_schema(), indent=2) + "\n")
     print(f"wrote {file}")
     return 0
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is less than 1")
+    return number
 
 
 def parser() -> argparse.ArgumentParser:
@@ -45,7 +75,8 @@ def parser() -> argparse.ArgumentParser:
         description="Perturbed fine-tuning data from LIBERO demonstrations. `dvc repro` makes the datasets of the "
         "configuration that params.yaml names; the commands here are for what comes before and after.",
         epilog="Examples: `python -m pipeline doctor` before a long run; `python -m pipeline fetch demos "
-        "libero_goal` for all 50 demonstrations of each task where the hub can be reached.",
+        "libero_goal` for all 50 demonstrations of each task where the hub can be reached; `python -m pipeline preview "
+        "'libero_goal/turn_on*' camera` to look at what an axis does.",
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -61,6 +92,45 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("suites", nargs="+", choices=SUITES, metavar="SUITE", help=f"any of {', '.join(SUITES)}")
     command.add_argument("--endpoint", help="address of a mirror of the hub")
     command.set_defaults(run=_fetch)
+
+    command = commands.add_parser(
+        "preview",
+        help="draw what an axis does to a task: its first frame, and eleven draws over the components and levels",
+    )
+    command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
+    command.add_argument(
+        "axis", choices=Axes.model_fields, metavar="AXIS", help=f"any of {', '.join(Axes.model_fields)}"
+    )
+    command.add_argument(
+        "--config",
+        type=Path,
+        default=Path("configs/starter.yaml"),
+        help="whose seed, ranges and demonstrations to use (default: configs/starter.yaml); an axis that it does not "
+        "name has its default ranges",
+    )
+    command.add_argument("--out", type=Path, default=Path("sheet.png"), help="picture to write (default: sheet.png)")
+    command.set_defaults(run=_preview)
+
+    command = commands.add_parser(
+        "rewrite",
+        help="have a language model reword a task's instruction, lint what it says, and add it to a bank of rewrites",
+        description="Asks an OpenAI-compatible endpoint for rewrites of each class (distraction, common sense, "
+        "reasoning chain, paraphrase) until the bank has enough of each. The same lint as of the shipped bank decides "
+        "what is let in. Run again, it goes on where it was stopped. A key is read from OPENAI_API_KEY.",
+    )
+    command.add_argument("bddl_file", type=Path, metavar="BDDL_FILE", help="the task, <suite>/<task>.bddl")
+    command.add_argument("--out", type=Path, required=True, help="bank to extend or to begin, such as bank.yaml")
+    command.add_argument(
+        "--per-class", type=_positive, default=9, metavar="N", help="rewrites of each class wanted (default: 9)"
+    )
+    command.add_argument(
+        "--endpoint",
+        required=True,
+        metavar="URL",
+        help="what /chat/completions is appended to: http://localhost:8000/v1",
+    )
+    command.add_argument("--model", required=True, metavar="NAME", help="name of the model at the endpoint")
+    command.set_defaults(run=_rewrite)
 
     command = commands.add_parser("schema", help="write schemas/config.schema.json from the code")
     command.set_defaults(run=_schema)

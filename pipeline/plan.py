@@ -16,6 +16,7 @@ from pipeline.demos import DemoEntry
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.seeding import digest, rng
+from pipeline.testset import TestSet
 from pipeline.types import Verdict
 
 _ATTEMPTS = 100
@@ -59,11 +60,13 @@ class Row:
     variant: int
 
 
-def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig) -> list[Row]:
+def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, test: TestSet) -> list[Row]:
     """Draw the plan: a clean twin of every demonstration, then each axis's candidates, task by task.
 
+    A draw that comes closer to one of the benchmark's ``test`` tasks than its axis allows is drawn anew.
+
     Raises:
-        PipelineError: when there is nothing to plan from, or an axis has too few distinct draws for its quota.
+        PipelineError: when there is nothing to plan from.
     """
     if not demos:
         raise PipelineError("no demonstrations to plan from", remedy="widen demos.tasks or check demos.root")
@@ -77,8 +80,16 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig) -> 
     ]
     for axis, episodes in plan.episodes.items():
         for (_, group), wanted in zip(by_task.items(), _shares(episodes, len(by_task)), strict=True):
-            rows += _candidates(axis, group, wanted, plan, replay)
+            rows += _candidates(axis, group, wanted, plan, replay, test)
     return rows
+
+
+def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
+    """Axis to the number of wanted episodes that no different draw was left for, where there are any."""
+    missing = {
+        axis: wanted - sum(row.axis == axis and row.wanted for row in rows) for axis, wanted in plan.episodes.items()
+    }
+    return {axis: number for axis, number in missing.items() if number}
 
 
 def _shares(total: int, parts: int) -> list[int]:
@@ -87,9 +98,12 @@ def _shares(total: int, parts: int) -> list[int]:
 
 
 def _candidates(
-    axis: str, group: Sequence[DemoEntry], wanted: int, plan: PlanConfig, replay: ReplayConfig
+    axis: str, group: Sequence[DemoEntry], wanted: int, plan: PlanConfig, replay: ReplayConfig, test: TestSet
 ) -> Iterator[Row]:
-    """A task's candidates on one axis: every demonstration's first variant, then every second one, and so on."""
+    """A task's candidates on one axis: every demonstration's first variant, then every second one, and so on.
+
+    There are fewer than wanted when an axis has no more different draws that keep clear of the test set.
+    """
     sampler = getattr(plan.axes, axis)
     first = {demo.demo_id: int(rng(plan.seed, axis, demo.demo_id).integers(2**31)) for demo in group}
     seen: set[str] = set()
@@ -97,18 +111,11 @@ def _candidates(
         demo, variant = group[rank % len(group)], rank // len(group)
         for attempt in range(_ATTEMPTS):
             key = rng(plan.seed, axis, demo.demo_id, variant, attempt)
-            draw = sampler.sample(key, demo.task, first[demo.demo_id] + variant)
+            draw = sampler.sample(key, demo.task, first[demo.demo_id] + variant + attempt)
             row = _row(demo, (draw,), plan.seed, variant, rank, rank < wanted, replay)
-            if row.episode_id not in seen:
+            if row.episode_id not in seen and draw.nearest(test, demo.task).distance >= draw.clearance:
                 break
         else:
-            if rank < wanted:
-                raise PipelineError(
-                    f"the {axis} axis has no {rank + 1} different draws for {demo.task.suite}/{demo.task.name}",
-                    where=f"plan.episodes.{axis}",
-                    expected=f"at most {rank} episodes for this task",
-                    remedy="ask for fewer episodes, widen the axis's ranges or use more demonstrations",
-                )
             return
         seen.add(row.episode_id)
         yield row

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -71,13 +71,45 @@ class Renderer:
         """Apply render-layer perturbations to the model for a moment."""
         written = {name for perturbation in perturbations for name in perturbation.fields}
         saved = {name: getattr(self.model, name).copy() for name in written}
+        # Textures are a hundred megabytes and more, and copied to the GL context: keep only those that change.
+        pixels = saved.pop("tex_data", None)
+        replaced: dict[int, NDArray[np.uint8]] = {}
         try:
-            for perturbation in perturbations:
-                perturbation.apply(self.model)
+            try:
+                for perturbation in perturbations:
+                    perturbation.apply(self.model)
+            finally:
+                if pixels is not None:
+                    replaced = self._changed(pixels)
+                    del pixels
+            self._upload(replaced)
             yield
         finally:
             for name, value in saved.items():
                 getattr(self.model, name)[:] = value
+            for texture, value in replaced.items():
+                self.model.tex_data[self._texels()[texture]] = value
+            self._upload(replaced)
+
+    def _texels(self) -> list[slice]:
+        """Where each texture's bytes lie in the model's ``tex_data``."""
+        starts = self.model.tex_adr
+        sizes = self.model.tex_height * self.model.tex_width * self.model.tex_nchannel
+        return [slice(start, start + size) for start, size in zip(starts.tolist(), sizes.tolist(), strict=True)]
+
+    def _changed(self, pixels: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
+        """The former bytes of the textures that differ from ``pixels``, an earlier copy of ``tex_data``."""
+        return {
+            texture: pixels[texels].copy()
+            for texture, texels in enumerate(self._texels())
+            if not np.array_equal(pixels[texels], self.model.tex_data[texels])
+        }
+
+    def _upload(self, textures: Iterable[int]) -> None:
+        """Copy textures of the model to the GL context."""
+        self._renderer._gl_context.make_current()
+        for texture in textures:
+            mujoco.mjr_uploadTexture(self.model, self._renderer._mjr_context, texture)
 
     def close(self) -> None:
         self._renderer.close()

@@ -1,25 +1,42 @@
-"""Contact sheets: for each axis one picture of its episodes, each beside its clean twin."""
+"""Contact sheets: captioned pictures in rows; and for each axis of a run its episodes beside their clean twins."""
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.axes import from_json
+from pipeline.axes.base import Perturbation
 from pipeline.files import replaced
 from pipeline.frames import decode
-from pipeline.types import Episode
+from pipeline.types import Episode, Frame
 
-SIDE_PX = 192
 LINE_PX = 16
-HEADER = "in each pair: the clean twin on the left, the perturbed episode on the right"
+GAP_PX = 8
 COLUMNS = 4
+UNSHOWN = {"sha256", "licence", "attribution", "category"}
+"""Parameters that captions leave out."""
+
+LONGEST_CAPTION = 10
+"""Lines; what does not fit is cut off, the manifest has it in full."""
+
+PAIR_SIDE_PX = 192
+HEADER = "in each pair: the clean twin on the left, the perturbed episode on the right"
 MOMENT = 0.35
 """Share of the episode after which it is shown: the arm is in view and the objects still stand apart."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One captioned picture of a sheet; all pictures of a sheet have the same size."""
+
+    picture: Image.Image
+    caption: str
 
 
 def draw(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], folder: Path) -> dict[str, Path]:
@@ -33,10 +50,9 @@ def draw(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], 
     Returns:
         Axis to picture, for the axes with a kept episode.
     """
-    kept = {row["episode_id"]: row for row in manifest if row["kept"]}
     by_axis: dict[str, list[Mapping[str, Any]]] = {}
-    for row in kept.values():
-        if row["role"] == "perturbed":
+    for row in manifest:
+        if row["kept"] and row["role"] == "perturbed":
             by_axis.setdefault(row["axis"], []).append(row)
     drawn = {}
     with replaced(folder) as temporary:
@@ -44,8 +60,8 @@ def draw(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], 
         for axis, rows in by_axis.items():
             # One of each component in turn, so that a sheet shows them all.
             rows = sorted(rows, key=lambda row: (_before(rows, row), row["component"]))
-            shown = [(_pair(row, load), _caption(row)) for row in rows[: 4 * COLUMNS]]
-            _sheet(f"{axis}; {HEADER}", shown).save(temporary / f"{axis}.png")
+            tiles = [_pair(row, load) for row in rows[: 4 * COLUMNS]]
+            sheet(f"{axis}; {HEADER}", tiles).save(temporary / f"{axis}.png")
             drawn[axis] = folder / f"{axis}.png"
     return drawn
 
@@ -55,53 +71,93 @@ def _before(rows: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> int:
     return sum(other["component"] == row["component"] for other in rows[: rows.index(row)])
 
 
-def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Image.Image:
+def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
     """The twin and the perturbed episode beside it, at the same step."""
-    pair = Image.new("RGB", (2 * SIDE_PX, SIDE_PX), "white")
-    for column, episode_id in enumerate((row["twin_id"], row["episode_id"])):
+    shown = []
+    for episode_id in (row["twin_id"], row["episode_id"]):
         frames = load(episode_id).frames["image"]
-        frame = Image.fromarray(decode(frames[int(MOMENT * len(frames))]))
-        pair.paste(frame.resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS), (column * SIDE_PX, 0))
-    return pair
+        shown.append(decode(frames[int(MOMENT * len(frames))]))
+    changes = "; ".join(describe(perturbation) for perturbation in from_json(row["perturbations"]))
+    return Tile(side_by_side(shown, PAIR_SIDE_PX), f"{row['suite']}: {changes}")
 
 
-def _caption(row: Mapping[str, Any]) -> list[str]:
-    return textwrap.wrap(f"{row['suite']}: {_described(row)}", 62)
+def side_by_side(frames: Sequence[Frame], side_px: int) -> Image.Image:
+    """Frames as one picture, each ``side_px`` wide and high."""
+    picture = Image.new("RGB", (len(frames) * side_px, side_px))
+    for column, frame in enumerate(frames):
+        scaled = Image.fromarray(frame).resize((side_px, side_px), Image.Resampling.LANCZOS)
+        picture.paste(scaled, (column * side_px, 0))
+    return picture
 
 
-def _described(row: Mapping[str, Any]) -> str:
-    described = []
-    for perturbation in from_json(row["perturbations"]):
-        parameters = perturbation.model_dump(exclude={"axis", "component", "seed"}, exclude_defaults=True)
-        values = ", ".join(f"{name} {value}".removeprefix("text ") for name, value in _flat(parameters))
-        described.append(f"{perturbation.component}: {values}")
-    return "; ".join(described)
+def describe(perturbation: Perturbation) -> str:
+    """What was drawn, in one line: component, level and the parameters that are not at their defaults."""
+    parameters = perturbation.model_dump(exclude={"axis", "component", "level", "seed"}, exclude_defaults=True)
+    # A space that does not break lines keeps a value with its name; a wording needs no name.
+    values = ", ".join(
+        f"{name}\N{NO-BREAK SPACE}{value}".removeprefix("text\N{NO-BREAK SPACE}") for name, value in _flat(parameters)
+    )
+    return f"{perturbation.component}, level {perturbation.level}: {values}".removesuffix(": ")
 
 
-def _flat(parameters: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    """Parameters in one level, whatever their nesting."""
-    flat: list[tuple[str, Any]] = []
+def _flat(parameters: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """Names and values for people: in one level whatever their nesting, figures rounded."""
     for name, value in parameters.items():
-        flat += _flat(value) if isinstance(value, Mapping) else [(name, value)]
-    return flat
+        if isinstance(value, Mapping):
+            yield from _flat(value)
+        elif name not in UNSHOWN:
+            yield name, _shown(value)
 
 
-def _sheet(title: str, shown: Sequence[tuple[Image.Image, list[str]]]) -> Image.Image:
+def _shown(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return " ".join(shown for _, shown in _flat(value))
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return " ".join(map(_shown, value))
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+def sheet(title: str, tiles: Sequence[Tile]) -> Image.Image:
     """Captioned pictures in rows of ``COLUMNS``; each row is as high as its longest caption needs."""
-    gap = 8
-    width, height = shown[0][0].size
-    rows = [shown[start : start + COLUMNS] for start in range(0, len(shown), COLUMNS)]
-    heights = [height + LINE_PX * (max(len(lines) for _, lines in row) + 1) for row in rows]
-    columns = min(COLUMNS, len(shown))
-    sheet = Image.new("RGB", (columns * (width + gap) + gap, sum(heights) + 2 * LINE_PX), "white")
-    pen, font = ImageDraw.Draw(sheet), ImageFont.load_default(12)
-    pen.text((gap, gap), title, fill="black", font=font)
-    top = 2 * LINE_PX
-    for row, row_height in zip(rows, heights, strict=True):
-        for column, (picture, lines) in enumerate(row):
-            left = gap + column * (width + gap)
-            sheet.paste(picture, (left, top))
-            for number, line in enumerate(lines):
-                pen.text((left, top + height + 2 + number * LINE_PX), line, fill="black", font=font)
+    width, height = tiles[0].picture.size
+    columns = min(COLUMNS, len(tiles))
+    sheet_width = columns * (width + GAP_PX) + GAP_PX
+    heading = _wrapped(title, sheet_width - 2 * GAP_PX)
+    captions = [_wrapped(tile.caption, width)[:LONGEST_CAPTION] for tile in tiles]
+    rows = [range(first, min(first + columns, len(tiles))) for first in range(0, len(tiles), columns)]
+    row_heights = [height + LINE_PX * (max(len(captions[i]) for i in row) + 1) for row in rows]
+    top = LINE_PX * (len(heading) + 1)
+    page = Image.new("RGB", (sheet_width, top + sum(row_heights)), "white")
+    _write(page, heading, GAP_PX, GAP_PX)
+    for row, row_height in zip(rows, row_heights, strict=True):
+        for column, i in enumerate(row):
+            left = GAP_PX + column * (width + GAP_PX)
+            page.paste(tiles[i].picture, (left, top))
+            _write(page, captions[i], left, top + height + 2)
         top += row_height
-    return sheet
+    return page
+
+
+def _write(page: Image.Image, lines: Sequence[str], left: int, top: int) -> None:
+    pen = ImageDraw.Draw(page)
+    for number, line in enumerate(lines):
+        pen.text((left, top + number * LINE_PX), line, fill="black", font=_font())
+
+
+def _wrapped(text: str, width_px: int) -> list[str]:
+    """Lines of ``text``, none wider than ``width_px`` unless a single word is."""
+    lines: list[str] = []
+    for word in text.split(" "):
+        # The font has no glyph for the space that does not break lines.
+        word = word.replace("\N{NO-BREAK SPACE}", " ")
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and _font().getlength(longer) <= width_px:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
+
+
+@cache
+def _font() -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
+    return ImageFont.load_default(12)

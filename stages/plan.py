@@ -2,7 +2,7 @@
 
 import sys
 
-from pipeline import plan
+from pipeline import plan, testset
 from pipeline.config import Config
 from pipeline.stage import main
 
@@ -11,7 +11,13 @@ def run(config: Config) -> None:
     index = config.demos.index()
     for problem in index.problems:
         print(f"left out: {problem.error}", file=sys.stderr)
-    rows = plan.make(index.entries, config.plan, config.replay)
+    rows = plan.make(index.entries, config.plan, config.replay, testset.load())
+    for axis, number in plan.shortage(rows, config.plan).items():
+        print(
+            f"{axis}: {number} of {config.plan.episodes[axis]} wanted episodes cannot be planned, for want of "
+            "different draws; use more demonstrations or ask for fewer",
+            file=sys.stderr,
+        )
     plan.write(rows, config.data / "plan.parquet")
     trajectories = len({row.trajectory_id for row in rows})
     print(f"planned {sum(row.wanted for row in rows)} episodes from {trajectories} trajectories")

@@ -1,8 +1,9 @@
-"""Stage summary: draw a contact sheet for each axis and print what the run made."""
+"""Stage summary: draw contact sheets, of the run and of one task per suite, and print what the run made."""
 
 from rich.console import Console
 
-from pipeline import manifest, sheets
+from pipeline import manifest, preview, sheets
+from pipeline.compute import runner
 from pipeline.config import Config
 from pipeline.episodes import EpisodeLoader
 from pipeline.stage import main
@@ -12,6 +13,8 @@ def run(config: Config) -> None:
     rows = manifest.read(config.data / "manifest.parquet")
     load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
     drawn = sheets.draw(rows, load, config.data / "sheets")
+    with runner(config.compute) as workers:
+        previews = preview.for_run(config, config.data / "previews", workers)
     console = Console()
     console.print(manifest.counts_table(rows))
     for name, path in {
@@ -19,8 +22,9 @@ def run(config: Config) -> None:
         "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
         "manifest": config.data / "manifest.parquet",
         **{f"{axis} sheet": path for axis, path in drawn.items()},
+        **{f"{suite} previews": path for suite, path in previews.items()},
     }.items():
-        console.print(f"{name:>16}  {path}", soft_wrap=True, highlight=False)
+        console.print(f"{name:>23}  {path}", soft_wrap=True, highlight=False)
 
 
 if __name__ == "__main__":

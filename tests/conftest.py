@@ -18,12 +18,13 @@ from pipeline import gl
 # Before anything imports MuJoCo.
 gl.choose()
 
-from pipeline import hdf5  # noqa: E402
+from pipeline import hdf5, testset  # noqa: E402
 from pipeline.config import ReplayConfig  # noqa: E402
 from pipeline.demos import StarterSource  # noqa: E402
 from pipeline.environment import Environment  # noqa: E402
 from pipeline.replay import open_loop  # noqa: E402
 from pipeline.tasks import find_task  # noqa: E402
+from pipeline.testset import fetch_testset  # noqa: E402
 from pipeline.types import Demo, Task, Trajectory  # noqa: E402
 
 REPOSITORY = Path(__file__).parent.parent
@@ -98,7 +99,14 @@ def tiny_config(demos: Path) -> dict[str, object]:
     }
 
 
-STAGES = ("plan", "replay", "render", "export_rlds", "export_lerobot", "manifest", "summary")
+STAGES = ("plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest", "summary")
+
+
+def link_testset(folder: Path) -> None:
+    """Give a run elsewhere the test set's wheel, which is downloaded once."""
+    wheel = fetch_testset(REPOSITORY / testset.FOLDER)
+    (folder / testset.FOLDER).parent.mkdir(parents=True, exist_ok=True)
+    (folder / testset.FOLDER).symlink_to(wheel.parent)
 
 
 def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = STAGES) -> str:
@@ -130,6 +138,7 @@ def finished(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     (clone / "configs" / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(short_demos)))
     (clone / "params.yaml").write_text("run: tiny\n")
     shutil.copytree(REPOSITORY / ".dvc", clone / ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
+    link_testset(clone)
     subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
     done = dvc(clone, "repro")
     assert done.returncode == 0, done.stdout + done.stderr

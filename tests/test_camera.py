@@ -2,22 +2,64 @@
 
 from __future__ import annotations
 
+import itertools
+import time
+from collections.abc import Iterator, Mapping
+
 import numpy as np
 import pytest
 from conftest import MILK
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.camera import CameraAxis, CameraPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.seeding import rng
+from pipeline.testset import TestSet, TestTask
 
 TABLETOP_POS_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
 TABLETOP_QUAT_WXYZ = np.array([0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349])
+NOMINAL_RAYS_M = {
+    "tabletop": (0.6586, 0.0, 0.8104),
+    "study": (0.4586, 0.0, 0.8104),
+    "floor": (0.8966, 0.0, -0.15),
+    "living_room": (0.6066, 0.0, 0.16),
+}
 ANGLE = st.floats(-75, 75)
+COMPONENTS = ("distance", "spherical", "orientation")
+
+
+def camera(component: str, **parameters: float) -> CameraPerturbation:
+    return CameraPerturbation.model_validate({"component": component, "level": 1, **parameters})
+
+
+def benchmark_cameras() -> Iterator[tuple[str, dict[str, float]]]:
+    """The whole grid that LIBERO-Plus chose its 1,599 test cameras from."""
+    for azimuth, elevation in itertools.product(range(-75, 76), (0, 15)):
+        yield "spherical", {"azimuth_deg": azimuth, "elevation_deg": elevation}
+    for percent in (115, *range(119, 201)):
+        yield "distance", {"distance_scale": percent / 100}
+    turns = (-10, -8, -6, -4, -2, 2, 4, 6, 8, 10)
+    for yaw, pitch in itertools.product(turns, turns):
+        yield "orientation", {"yaw_deg": yaw, "pitch_deg": pitch}
+
+
+def whole(parameters: Mapping[str, float]) -> dict[str, float]:
+    return {"azimuth_deg": 0, "elevation_deg": 0, "distance_scale": 1.0, "yaw_deg": 0, "pitch_deg": 0, **parameters}
+
+
+@pytest.fixture(scope="module")
+def test_set() -> TestSet:
+    tasks = [
+        TestTask("libero_goal", "base", f"base_{n}", "camera", component, whole(parameters))
+        for n, (component, parameters) in enumerate(benchmark_cameras())
+        if parameters != {"azimuth_deg": 0, "elevation_deg": 0}  # H = 0 is in the grid at 15 degrees only
+    ]
+    return TestSet(tuple(tasks))
 
 
 def benchmark_pose(
@@ -38,13 +80,8 @@ def benchmark_pose(
 
 @given(ANGLE, st.floats(-10, 30), st.floats(0.5, 2), ANGLE, ANGLE)
 def test_pose_is_the_benchmarks(azimuth: float, elevation: float, scale: float, yaw: float, pitch: float) -> None:
-    perturbation = CameraPerturbation(
-        component="spherical",
-        azimuth_deg=azimuth,
-        elevation_deg=elevation,
-        distance_scale=scale,
-        yaw_deg=yaw,
-        pitch_deg=pitch,
+    perturbation = camera(
+        "spherical", azimuth_deg=azimuth, elevation_deg=elevation, distance_scale=scale, yaw_deg=yaw, pitch_deg=pitch
     )
     pos, quat = perturbation.pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
     expected_pos, expected = benchmark_pose(azimuth, elevation, scale, yaw, pitch)
@@ -54,39 +91,110 @@ def test_pose_is_the_benchmarks(azimuth: float, elevation: float, scale: float, 
 
 
 def test_nominal_is_exactly_nominal() -> None:
-    pos, quat = CameraPerturbation(component="distance").pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
+    pos, quat = camera("distance").pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
     assert np.allclose(pos, TABLETOP_POS_M, rtol=0, atol=1e-15)
     assert np.array_equal(quat, TABLETOP_QUAT_WXYZ)
 
 
 def test_directions_mean_what_the_docstrings_say() -> None:
-    lifted, _ = CameraPerturbation(component="spherical", elevation_deg=10).pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
+    lifted, _ = camera("spherical", elevation_deg=10).pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
     assert lifted[2] > TABLETOP_POS_M[2]
-    turned, _ = CameraPerturbation(component="spherical", azimuth_deg=10).pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
+    turned, _ = camera("spherical", azimuth_deg=10).pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
     assert turned[1] > 0, "counter-clockwise seen from above takes +x towards +y"
 
     def looks(quat: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(Rotation.from_quat(quat, scalar_first=True).apply([0, 0, -1]))
 
-    _, pitched = CameraPerturbation(component="orientation", pitch_deg=5).pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
+    _, pitched = camera("orientation", pitch_deg=5).pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
     assert looks(pitched)[2] < looks(TABLETOP_QUAT_WXYZ)[2]
 
 
-@given(st.integers(0, 10_000))
-def test_draws_are_keyed_in_range_and_off_the_test_grid(variant: int) -> None:
+def draws(axis: CameraAxis, count: int = 1000) -> list[CameraPerturbation]:
+    return [axis.sample(rng(1, "camera", "demo", variant), MILK, variant) for variant in range(count)]
+
+
+def test_draws_are_keyed_and_cover_every_component_and_level() -> None:
+    drawn = draws(CameraAxis())
+    assert drawn == draws(CameraAxis())
+    assert from_json(to_json(drawn[:1])) == (drawn[0],)
+    assert {(p.component, p.level) for p in drawn} == set(itertools.product(COMPONENTS, range(1, 6)))
+
+
+def test_draws_keep_to_the_ranges_of_their_level() -> None:
     axis = CameraAxis()
-    drawn = axis.sample(rng(1, "camera", "demo", variant), MILK, variant)
-    assert drawn == axis.sample(rng(1, "camera", "demo", variant), MILK, variant)
-    assert from_json(to_json([drawn])) == (drawn,)
-    match drawn.component:
-        case "distance":
-            assert 0.75 <= drawn.distance_scale <= 0.95 or 1.05 <= drawn.distance_scale <= 1.13
-        case "spherical":
-            # The test set's elevations are 0 and 15 degrees, at any whole azimuth.
-            assert min(abs(drawn.elevation_deg), abs(drawn.elevation_deg - 15)) >= 5
-        case "orientation":
-            # The test set turns by at most 10 degrees about either axis.
-            assert abs(drawn.yaw_deg) >= 11
+    for p in draws(axis):
+        if p.component == "orientation":
+            assert axis.orientation is not None
+            large, small = sorted(("yaw_deg", "pitch_deg"), key=lambda name: -abs(getattr(p, name)))
+            allowed = {large: getattr(axis.orientation, large), small: axis.orientation.other_deg}
+        else:
+            allowed = dict(getattr(axis, p.component))
+        for name, by_level in allowed.items():
+            assert any(low <= getattr(p, name) <= high for low, high in by_level[p.level - 1]), (name, p)
+        untouched = whole({}).keys() - allowed.keys()
+        assert all(getattr(p, name) == whole({})[name] for name in untouched)
+
+
+def test_levels_and_components_can_be_chosen() -> None:
+    axis = CameraAxis(levels=(2, 5), distance=None, orientation=None)
+    assert {(p.component, p.level) for p in draws(axis, 50)} == {("spherical", 2), ("spherical", 5)}
+    with pytest.raises(ValidationError, match="at least one of distance"):
+        CameraAxis(distance=None, spherical=None, orientation=None)
+
+
+def test_default_draws_are_clear_of_every_test_camera(test_set: TestSet) -> None:
+    start = time.perf_counter()
+    found = [p.nearest(test_set, MILK) for p in draws(CameraAxis())]
+    elapsed_ms = 1e3 * (time.perf_counter() - start) / len(found)
+    assert {near.compared for near in found} == {len(test_set.tasks)}
+    assert np.mean([near.distance >= CameraPerturbation.clearance for near in found]) > 0.99
+    assert elapsed_ms < 1, "a plan asks this tens of thousands of times"
+
+
+def test_every_test_camera_is_found(test_set: TestSet) -> None:
+    for task in test_set.tasks:
+        copied = camera(task.component, **{name: float(value) for name, value in task.parameters.items()})
+        assert copied.nearest(test_set, MILK).distance == pytest.approx(0, abs=1e-4)
+
+
+def test_distance_is_a_bound_on_the_angle_between_rays_in_every_arena() -> None:
+    """Checked against the rays that the poses themselves give, arena by arena."""
+    test = TestSet((TestTask("libero_10", "base", "one", "camera", "spherical", whole({"azimuth_deg": 40})),))
+    for azimuth, elevation in ((0, 7), (33, -5), (47, 5), (60, 25)):
+        moved = camera("spherical", azimuth_deg=azimuth, elevation_deg=elevation)
+        claimed = moved.nearest(test, MILK).distance
+        for arena, ray in NOMINAL_RAYS_M.items():
+            own, other = (
+                p.pose(np.array([0, 0, 0.8]) + ray, TABLETOP_QUAT_WXYZ)[0] - [0, 0, 0.8]
+                for p in (moved, camera("spherical", azimuth_deg=40))
+            )
+            cosine = own @ other / np.linalg.norm(own) / np.linalg.norm(other)
+            assert claimed <= np.rad2deg(np.arccos(cosine)) + 0.05, arena
+
+
+@pytest.mark.parametrize(
+    ("near", "clear"),
+    [
+        # From the turns in place by 2 degrees, which stand at the nominal distance.
+        (camera("distance", distance_scale=0.92), camera("distance", distance_scale=0.915)),
+        # From the farthest dolly.
+        (camera("distance", distance_scale=2.18), camera("distance", distance_scale=2.19)),
+        (camera("spherical", elevation_deg=4.9), camera("spherical", elevation_deg=5.1)),
+        (
+            camera("spherical", azimuth_deg=60, elevation_deg=19.9),
+            camera("spherical", azimuth_deg=60, elevation_deg=20.1),
+        ),
+        (camera("orientation", yaw_deg=14, pitch_deg=1), camera("orientation", yaw_deg=15.1, pitch_deg=2)),
+        (camera("orientation", yaw_deg=6.5, pitch_deg=-9), camera("orientation", pitch_deg=-15.2)),
+    ],
+)
+def test_where_the_line_is_drawn(near: CameraPerturbation, clear: CameraPerturbation, test_set: TestSet) -> None:
+    assert near.nearest(test_set, MILK).distance < CameraPerturbation.clearance
+    assert clear.nearest(test_set, MILK).distance >= CameraPerturbation.clearance
+
+
+def test_nothing_to_compare_with() -> None:
+    assert camera("distance", distance_scale=2).nearest(TestSet(()), MILK) == (np.inf, 0)
 
 
 def test_order_of_listing_does_not_matter() -> None:

@@ -48,7 +48,7 @@ def test_schema_file_is_that_of_the_code() -> None:
         ("closed_loop", ("replay", "mode"), "replay.mode: Input should be"),
         ({"camera": 0, "noise": 1, "language": 1}, ("plan", "episodes"), "plan.episodes.camera"),
         ({"camera": 4}, ("plan", "episodes"), "axes and episodes must name the same axes"),
-        ({"camera": {"distance": {"distance_scale": [[2, 1]]}}}, ("plan", "axes"), "with low <= high"),
+        ({"camera": {"distance": {"distance_scale": [[[2, 1]]] * 5}}}, ("plan", "axes"), "with low <= high"),
         ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: Extra inputs"),
         ("/tmp", ("demos", "root"), "root goes with source: hdf5"),
         ("carrier pigeon", ("compute",), "compute"),

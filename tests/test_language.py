@@ -6,12 +6,28 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+import yaml
+from conftest import REPOSITORY
+from hypothesis import given
+from hypothesis import strategies as st
 from libero.libero.benchmark.libero_suite_task_map import libero_task_map
 from pydantic import ValidationError
 
-from pipeline import seeding
-from pipeline.axes.language import CLASSES, LanguageAxis, LanguagePerturbation, lint, load_bank, normalise
+from pipeline import seeding, testset
+from pipeline.axes.base import Level
+from pipeline.axes.language import (
+    CLASSES,
+    LanguageAxis,
+    LanguagePerturbation,
+    deal,
+    distance,
+    level_of,
+    lint,
+    load_bank,
+    normalise,
+)
 from pipeline.errors import PipelineError
+from pipeline.testset import TestSet
 from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
@@ -156,3 +172,77 @@ def test_rewrite_equal_to_the_instruction_is_refused() -> None:
 def test_no_classes_is_refused() -> None:
     with pytest.raises(ValidationError):
         LanguageAxis(classes=())
+
+
+def test_levels_follow_the_distance_to_the_original(task: Task) -> None:
+    cards = deal(task)
+    by_level = sorted(cards, key=lambda card: distance(card.text, task.instruction))
+    assert [card.level for card in by_level] == sorted(card.level for card in cards)
+    assert {card.text for card in cards if card.level == 1} == {
+        card.text for card in cards if distance(card.text, task.instruction) < 0.5
+    }
+
+
+def test_only_the_levels_asked_for_are_drawn() -> None:
+    levels: tuple[Level, ...] = (1, 5)
+    axis = LanguageAxis(levels=levels)
+    for known in TASKS[::7]:
+        drawn = [draw(known, variant, axis) for variant in range(60)]
+        assert {card.level for card in drawn} <= set(levels)
+        assert {card.text for card in drawn} == {card.text for card in deal(known) if card.level in levels}
+    assert {card.level for known in TASKS for card in deal(known)} == {1, 2, 3, 4, 5}
+
+
+def slow_edits(one: str, two: str) -> int:
+    """Levenshtein distance by its definition."""
+    if not one or not two:
+        return len(one) + len(two)
+    changed = slow_edits(one[:-1], two[:-1]) + (one[-1] != two[-1])
+    return min(changed, slow_edits(one[:-1], two) + 1, slow_edits(one, two[:-1]) + 1)
+
+
+@given(st.text("abc", max_size=5), st.text("abc", max_size=5))
+def test_distance_is_the_normalised_edit_distance(one: str, two: str) -> None:
+    assert distance(one, two) == slow_edits(one, two) / max(len(one), len(two), 1)
+
+
+def test_distance_forgets_case_and_punctuation() -> None:
+    assert distance("Put the bowl, please!", "put the bowl please") == 0
+    assert distance("put the bowl", "put the bowls") == pytest.approx(1 / 13)
+    assert level_of("put the bowl", "put the bowls") == 1
+    assert level_of("would you be so kind as to see to the supper things", "put the bowl on it") == 5
+
+
+@pytest.fixture(scope="module")
+def test() -> TestSet:
+    return testset.load(REPOSITORY / testset.FOLDER)
+
+
+def test_the_bank_is_clear_of_the_test_set(task: Task, test: TestSet) -> None:
+    tested = [str(other.parameters["text"]) for other in test.on(task, "language")]
+    assert 10 < len(tested) <= 50
+    close = []
+    for card in deal(task):
+        nearest = card.nearest(test, task)
+        assert nearest.compared == len(tested)
+        if nearest.distance < card.clearance:
+            close.append((card.text, nearest.distance))
+    assert close == []
+
+
+def test_a_test_instruction_is_found_whatever_its_case_and_for_its_own_task_only(test: TestSet) -> None:
+    known, other = TASKS[0], TASKS[15]
+    text = str(test.on(known, "language")[0].parameters["text"])
+    planted = LanguagePerturbation(component="paraphrase", level=1, text=text.upper() + "!")
+    assert planted.nearest(test, known).distance == 0
+    assert planted.nearest(test, other).distance > planted.clearance
+
+
+def test_a_further_bank_joins_the_shipped_one(tmp_path: Path) -> None:
+    known = TASKS[0]
+    bank = tmp_path / "bank.yaml"
+    bank.write_text(yaml.safe_dump({known.suite: {known.name: {"paraphrase": ["kindly move that one over there"]}}}))
+    texts = {card.text for card in deal(known, CLASSES, bank=bank)}
+    assert texts - {card.text for card in deal(known)} == {"kindly move that one over there"}
+    with pytest.raises(PipelineError, match=r"missing\.yaml"):
+        deal(known, CLASSES, bank=tmp_path / "missing.yaml")

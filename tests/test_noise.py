@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -15,8 +16,9 @@ from pydantic import ValidationError
 from scipy.ndimage import zoom
 from skimage.filters import gaussian
 
-from pipeline import seeding
+from pipeline import seeding, testset
 from pipeline.axes.noise import Effect, Fog, Gaussian, Glass, Motion, NoiseAxis, NoisePerturbation, Zoom
+from pipeline.testset import TestSet
 from pipeline.types import Floats, Frame, Task
 
 Image = NDArray[np.floating]
@@ -213,6 +215,65 @@ def test_levels_lie_between_neighbouring_severities() -> None:
             for name, weaker, stronger in zip(names, tested[2 * level], tested[2 * level + 1], strict=True):
                 low, high = sorted((weaker, stronger))
                 assert low <= getattr(effect, name) <= high, (component, level + 1, name)
+
+
+@pytest.fixture(scope="module")
+def test() -> TestSet:
+    return testset.load(REPOSITORY / testset.FOLDER)
+
+
+def test_the_parsed_severities_are_the_published_ones(test: TestSet) -> None:
+    for component, published in TEST_GRID.items():
+        parsed = {int(t.parameters["severity"]): t.parameters for t in test.of("noise") if t.component == component}
+        assert sorted(parsed) == list(range(1, 11))
+        for severity, row in enumerate(published, 1):
+            values = tuple(parsed[severity].values())[1:]
+            if component == "zoom":
+                scales = np.arange(1, *row)
+                assert values == (round(float(scales[-1]), 6), len(scales))
+            else:
+                assert values == row
+
+
+def perturbation(effect: Effect) -> NoisePerturbation:
+    return NoisePerturbation(component=effect.component, effect=effect, level=1, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("effect", "steps"),
+    [
+        (Gaussian(sigma_px=3), 0),
+        (Gaussian(sigma_px=3.25), 0.25),
+        (Gaussian(sigma_px=9.5), 0.5),
+        (Gaussian(sigma_px=0.4), 0.6),  # between a clean frame and the weakest severity
+        (Gaussian(sigma_px=12), 2),  # beyond the strongest
+        (Motion(radius_px=99, sigma_px=17.5), 0.5),  # half way from 15 to 20
+        (Motion(radius_px=99, sigma_px=20), 0),
+        (Fog(density=0.75, roughness_decay=3), 0.5),
+        (Zoom(max_scale=1.13, copies=14), 0.5),
+        (Glass(sigma_px=2.2, delta_px=1, passes=1), 0),
+    ],
+    ids=repr,
+)
+def test_distance_counts_in_steps_between_severities(effect: Effect, steps: float, test: TestSet) -> None:
+    nearest = perturbation(effect).nearest(test, TASK)
+    assert nearest.distance == pytest.approx(steps)
+    assert nearest.compared == {"motion": 336, "gaussian": 341, "zoom": 288, "fog": 272, "glass": 364}[effect.component]
+
+
+@pytest.mark.parametrize("component", COMPONENTS)
+def test_the_default_grid_is_clear(component: str, test: TestSet) -> None:
+    distances = [perturbation(effect).nearest(test, TASK).distance for effect in levels(component)]
+    assert min(distances) >= 0.39 > NoisePerturbation.clearance
+
+
+def test_only_the_levels_asked_for_are_drawn() -> None:
+    axis = NoiseAxis(levels=(2, 5))
+    drawn = [axis.sample(seeding.rng(seed, "noise"), TASK, 0) for seed in range(200)]
+    assert {(p.component, p.level) for p in drawn} == {
+        (component, level) for component in COMPONENTS for level in (2, 5)
+    }
+    assert all(p.effect == levels(p.component)[p.level - 1] for p in drawn)
 
 
 def sample(seed: int) -> NoisePerturbation:

@@ -11,15 +11,17 @@ from hypothesis import strategies as st
 from pipeline import plan
 from pipeline.axes import Axes, from_json
 from pipeline.axes.camera import CameraAxis
-from pipeline.axes.language import LanguageAxis
+from pipeline.axes.language import LanguageAxis, deal
 from pipeline.axes.noise import NoiseAxis
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.demos import DemoEntry
 from pipeline.errors import PipelineError
 from pipeline.tasks import tasks
+from pipeline.testset import TestSet, TestTask
 from pipeline.types import Verdict
 
 REPLAY = ReplayConfig()
+NO_TESTS = TestSet(())
 TASKS = tasks("libero_goal")[:3]
 ALL = Axes(camera=CameraAxis(), noise=NoiseAxis(), language=LanguageAxis())
 
@@ -37,21 +39,21 @@ def config(**changes: object) -> PlanConfig:
 
 def test_a_row_depends_on_its_key_alone() -> None:
     """Order of the demonstrations, other axes and other demonstrations leave a draw as it is."""
-    whole = {row.episode_id: row for row in plan.make(entries(), config(), REPLAY)}
-    backwards = plan.make(entries()[::-1], config(), REPLAY)
+    whole = {row.episode_id: row for row in plan.make(entries(), config(), REPLAY, NO_TESTS)}
+    backwards = plan.make(entries()[::-1], config(), REPLAY, NO_TESTS)
     drawn = {(r.demo_id, r.axis, r.variant): r.perturbations for r in whole.values()}
     again = {(r.demo_id, r.axis, r.variant): r.perturbations for r in backwards}
     common = drawn.keys() & again.keys()
     assert len(common) > 20
     assert all(drawn[key] == again[key] for key in common)
-    camera_only = plan.make(entries(), config(axes=Axes(camera=CameraAxis()), episodes={"camera": 9}), REPLAY)
+    camera_only = plan.make(entries(), config(axes=Axes(camera=CameraAxis()), episodes={"camera": 9}), REPLAY, NO_TESTS)
     assert {row.episode_id for row in camera_only} <= whole.keys()
-    other_seed = plan.make(entries(), config(seed=4), REPLAY)
+    other_seed = plan.make(entries(), config(seed=4), REPLAY, NO_TESTS)
     assert not {r.perturbations for r in other_seed if r.axis == "camera"} & set(drawn.values())
 
 
 def test_quotas_are_spread_evenly_and_twins_complete() -> None:
-    rows = plan.make(entries(), config(), REPLAY)
+    rows = plan.make(entries(), config(), REPLAY, NO_TESTS)
     assert len({row.episode_id for row in rows}) == len(rows)
     wanted = {axis: [r for r in rows if r.axis == axis and r.wanted] for axis in ("camera", "noise", "language")}
     assert {axis: len(of_axis) for axis, of_axis in wanted.items()} == {"camera": 9, "noise": 10, "language": 6}
@@ -71,7 +73,7 @@ def test_quotas_are_spread_evenly_and_twins_complete() -> None:
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    rows = plan.make(entries(), config(), REPLAY)
+    rows = plan.make(entries(), config(), REPLAY, NO_TESTS)
     plan.write(rows, tmp_path / "plan.parquet")
     assert plan.read(tmp_path / "plan.parquet") == rows
     plan.write(rows, tmp_path / "again.parquet")
@@ -82,13 +84,13 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 def test_a_replay_setting_is_part_of_the_identity() -> None:
-    kept = {row.episode_id for row in plan.make(entries(), config(), ReplayConfig(noops="keep"))}
-    assert not kept & {row.episode_id for row in plan.make(entries(), config(), REPLAY)}
+    kept = {row.episode_id for row in plan.make(entries(), config(), ReplayConfig(noops="keep"), NO_TESTS)}
+    assert not kept & {row.episode_id for row in plan.make(entries(), config(), REPLAY, NO_TESTS)}
 
 
 @given(st.lists(st.booleans(), min_size=12, max_size=12))
 def test_replacements_in_plan_order_until_full_or_exhausted(succeeds: list[bool]) -> None:
-    rows = plan.make(entries(), config(), REPLAY)
+    rows = plan.make(entries(), config(), REPLAY, NO_TESTS)
     truth = {
         row.trajectory_id: Verdict(True, "kept") if good else Verdict(False, "goal_not_reached")
         for row, good in zip((r for r in rows if r.role == "twin"), succeeds, strict=True)
@@ -117,21 +119,39 @@ def test_replacements_in_plan_order_until_full_or_exhausted(succeeds: list[bool]
                     assert verdict.reason == expected
 
 
-def test_too_few_different_draws_are_refused() -> None:
-    with pytest.raises(
-        PipelineError, match=r"plan\.episodes\.language: the language axis has no \d+ different"
-    ) as caught:
-        plan.make(entries(1), config(axes=Axes(language=LanguageAxis()), episodes={"language": 300}), REPLAY)
-    assert "ask for fewer" in str(caught.value)
+def test_an_exhausted_axis_is_said_and_planned_as_far_as_it_goes() -> None:
+    wanted = config(axes=Axes(language=LanguageAxis()), episodes={"language": 300})
+    rows = plan.make(entries(1), wanted, REPLAY, NO_TESTS)
+    texts = {(row.task, row.instruction) for row in rows if row.axis == "language"}
+    bank = {(task.name, drawn.text) for task in TASKS for drawn in deal(task, LanguageAxis().classes)}
+    assert texts == bank, "every rewrite once"
+    assert plan.shortage(rows, wanted) == {"language": 300 - len(bank)}
+    assert plan.shortage(plan.make(entries(), config(), REPLAY, NO_TESTS), config()) == {}
+
+
+def test_draws_that_overlap_with_a_test_task_are_drawn_anew() -> None:
+    """Plant what was drawn first into the test set: the plan moves away from it, and nothing else changes."""
+    camera = config(axes=Axes(camera=CameraAxis()), episodes={"camera": 9})
+    first = [row for row in plan.make(entries(), camera, REPLAY, NO_TESTS) if row.axis == "camera"]
+    (planted,) = from_json(first[0].perturbations)
+    names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
+    known = {name: getattr(planted, name) for name in names}
+    test = TestSet((TestTask("libero_goal", TASKS[0].name, "planted", "camera", planted.component, known),))
+    again = [row for row in plan.make(entries(), camera, REPLAY, test) if row.axis == "camera"]
+    assert again[0].perturbations != first[0].perturbations
+    for row in again:
+        (drawn,) = from_json(row.perturbations)
+        assert drawn.nearest(test, TASKS[0]).distance >= drawn.clearance
+    assert sum(one.perturbations == other.perturbations for one, other in zip(first, again, strict=True)) >= 5
 
 
 def test_nothing_to_plan_from() -> None:
     with pytest.raises(PipelineError, match="no demonstrations to plan from"):
-        plan.make([], config(), REPLAY)
+        plan.make([], config(), REPLAY, NO_TESTS)
 
 
 def test_perturbations_are_readable_and_complete() -> None:
-    for row in plan.make(entries(), config(), REPLAY):
+    for row in plan.make(entries(), config(), REPLAY, NO_TESTS):
         (changed,) = from_json(row.perturbations) or (None,)
         assert row.axis == (changed.axis if changed else "clean")
         assert row.component == (changed.component if changed else "clean")

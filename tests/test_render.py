@@ -21,7 +21,7 @@ from pipeline.render import Renderer, render
 from pipeline.seeding import rng
 from pipeline.types import Frame, Task, Trajectory
 
-MOVED = CameraPerturbation(component="spherical", azimuth_deg=30.0, elevation_deg=8.0)
+MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
 
 
 class Libero:

@@ -18,7 +18,7 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 import yaml
-from conftest import REPOSITORY, STAGES, STOVE, dvc, run_stages, tiny_config
+from conftest import REPOSITORY, STAGES, STOVE, dvc, link_testset, run_stages, tiny_config
 from PIL import Image
 from test_writers import records
 
@@ -158,7 +158,8 @@ def hashes(data: Path) -> dict[str, str]:
 
 def test_killed_and_resumed_with_another_number_of_workers(finished: Path, short_demos: Path, tmp_path: Path) -> None:
     config = tiny_config(short_demos) | {"compute": {"cluster": "local", "workers": 1}}
-    run_stages(tmp_path, config, ["plan"])
+    link_testset(tmp_path)
+    run_stages(tmp_path, config, ["plan", "leakage"])
     data = tmp_path / "data" / "tiny"
     for stage in ("replay", "render"):
         folder = data / {"replay": "trajectories", "render": "frames"}[stage]
@@ -179,7 +180,7 @@ def test_killed_and_resumed_with_another_number_of_workers(finished: Path, short
         after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
         assert len(after) == total
         assert finished_before.items() <= after.items(), "what was finished is not made again"
-    run_stages(tmp_path, config, STAGES[3:])
+    run_stages(tmp_path, config, STAGES[4:])
     assert hashes(data) == hashes(finished)
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, TypeVar
 
 from pydantic import Field, TypeAdapter
 
+from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
 from pipeline.axes.base import (
     Frozen,
     Perturbation,
@@ -18,10 +19,22 @@ from pipeline.axes.base import (
 )
 from pipeline.axes.camera import CameraAxis, CameraPerturbation
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation
+from pipeline.axes.light import LightAxis, LightPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
+from pipeline.axes.pose import PoseAxis, PosePerturbation
+from pipeline.axes.robot import RobotAxis, RobotPerturbation
 
-AnyPerturbation = Annotated[CameraPerturbation | NoisePerturbation | LanguagePerturbation, Field(discriminator="axis")]
-AnyAxis = CameraAxis | NoiseAxis | LanguageAxis
+AnyPerturbation = Annotated[
+    CameraPerturbation
+    | LightPerturbation
+    | BackgroundPerturbation
+    | NoisePerturbation
+    | LanguagePerturbation
+    | PosePerturbation
+    | RobotPerturbation,
+    Field(discriminator="axis"),
+]
+AnyAxis = CameraAxis | LightAxis | BackgroundAxis | NoiseAxis | LanguageAxis | PoseAxis | RobotAxis
 
 Layered = TypeVar("Layered", bound=Perturbation)
 
@@ -32,8 +45,12 @@ class Axes(Frozen):
     """The axes that a run draws from; an axis left out is not drawn."""
 
     camera: CameraAxis | None = None
+    light: LightAxis | None = None
+    background: BackgroundAxis | None = None
     noise: NoiseAxis | None = None
     language: LanguageAxis | None = None
+    pose: PoseAxis | None = None
+    robot: RobotAxis | None = None
 
 
 def to_json(perturbations: Iterable[Perturbation]) -> str:

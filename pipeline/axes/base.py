@@ -11,15 +11,17 @@ An axis comes as a pair of small frozen models in one file:
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from pipeline.types import Demo, Frame, Scene
+from pipeline.types import Demo, Frame, Scene, Task
 
 if TYPE_CHECKING:
     import mujoco
+
+    from pipeline.testset import TestSet
 
 
 class Layer(IntEnum):
@@ -37,20 +39,60 @@ class Frozen(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
+Level = Literal[1, 2, 3, 4, 5]
+"""Strength, weakest first."""
+
+
+class Axis(Frozen):
+    """The ranges that an axis draws from.
+
+    Attributes:
+        levels: the strengths to draw, each as often as the others.
+    """
+
+    levels: Annotated[tuple[Level, ...], Field(min_length=1)] = (1, 2, 3, 4, 5)
+
+    def draw_level(self, rng: np.random.Generator) -> Level:
+        return self.levels[rng.integers(len(self.levels))]
+
+
+class Nearest(NamedTuple):
+    """How close a perturbation comes to the benchmark's test tasks.
+
+    Attributes:
+        distance: to the nearest of them, in the axis's own measure; infinite when there is none to compare with.
+        compared: how many it was compared with.
+    """
+
+    distance: float
+    compared: int
+
+
 class Perturbation(Frozen):
     """One change on one axis, with all of its parameters; JSON in and out through pydantic.
 
     Attributes:
         axis: name of the axis, the discriminator when a perturbation is read back.
         component: which of the axis's components was drawn.
+        level: strength, 1 to 5, by the ranges that the axis states.
+        clearance: the least distance to any test task; a draw that comes closer is drawn anew.
+        measure: what the distance is and its unit.
     """
 
     axis: str
     component: str
+    level: Level
+
+    clearance: ClassVar[float]
+    measure: ClassVar[str]
 
     layer: ClassVar[Layer]
     views: ClassVar[frozenset[str]]
     """The views of ``schemas/episode.json`` whose frames this can change; empty for text."""
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """The distance to the nearest of the test tasks that this could coincide with, for an episode of ``task``."""
+        raise NotImplementedError
 
 
 class TextPerturbation(Perturbation):

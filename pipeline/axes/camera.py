@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, Literal
+from functools import lru_cache
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from pipeline.axes.base import Frozen, Intervals, RenderPerturbation, draw
-from pipeline.types import Task
+from pipeline.axes.base import Axis, Frozen, Intervals, Nearest, RenderPerturbation, draw
+from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
     import mujoco
+
+    from pipeline.testset import TestSet
 
 Component = Literal["distance", "spherical", "orientation"]
 
 ORBIT_CENTRE_M = np.array([0.0, 0.0, 0.8])
 """World point that LIBERO-Plus turns and dollies the camera about, the same for every arena
 (`Problem._setup_camera` of LIBERO-Plus)."""
+
+STEEPEST_DEG = 60.5
+"""How far the study's agent view, the steepest of the five arenas, stands above the orbit centre's horizon. There a
+degree of azimuth spans the least of the sphere, so what is clear of the test cameras there is clear in every arena."""
 
 
 class CameraPerturbation(RenderPerturbation):
@@ -33,6 +40,12 @@ class CameraPerturbation(RenderPerturbation):
         distance_scale: multiple of the distance to the orbit centre.
         yaw_deg: turn in place about the world's z axis.
         pitch_deg: turn in place about the world's y axis; positive looks further down.
+
+    The paper keeps training cameras 5 degrees from test cameras on the sphere. Two cameras can also stand on one ray
+    from the orbit centre: the test set's dollies and turns in place all do. So the distance between two cameras is the
+    largest of three angles, and is zero only for the same picture: the one between their rays; the one between their
+    turns in place; and the logarithm of the ratio of their distances read as radians, because along the ray it moves
+    a camera by as much as the angle does across it (5 degrees are a ratio of 1.091).
     """
 
     axis: Literal["camera"] = "camera"
@@ -45,6 +58,11 @@ class CameraPerturbation(RenderPerturbation):
 
     views: ClassVar[frozenset[str]] = frozenset({"image"})
     fields: ClassVar[tuple[str, ...]] = ("cam_pos", "cam_quat")
+    clearance: ClassVar[float] = 5.0
+    measure: ClassVar[str] = (
+        "degrees: the largest of the angle on the sphere about the orbit centre, the angle between the turns in place, "
+        "and the logarithm of the distance ratio (5 degrees: 1.091)"
+    )
 
     def pose(
         self, pos_m: NDArray[np.float64], quat_wxyz: NDArray[np.float64]
@@ -65,45 +83,149 @@ class CameraPerturbation(RenderPerturbation):
         camera = model.camera("agentview")
         camera.pos[:], camera.quat[:] = self.pose(camera.pos.copy(), camera.quat.copy())
 
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """The nearest of all test cameras, whichever task they are for: many tasks share one nominal view."""
+        cameras, compared = _test_cameras(test)
+        if not compared:
+            return Nearest(np.inf, 0)
+        own = _embed(*np.array([self._parameters()]).T)
+        sphere = _angle_deg(cameras.rays @ own.rays[0])
+        turn = 2 * _angle_deg(np.abs(cameras.turns @ own.turns[0]))
+        dolly = np.rad2deg(np.abs(cameras.log_scales - own.log_scales[0]))
+        return Nearest(float(np.maximum(np.maximum(sphere, turn), dolly).min()), compared)
+
+    def _parameters(self) -> tuple[float, ...]:
+        return self.azimuth_deg, self.elevation_deg, self.distance_scale, self.yaw_deg, self.pitch_deg
+
+
+class _Cameras(NamedTuple):
+    """Cameras relative to the nominal one: unit rays (N, 3), turns as unit quaternions (N, 4), log scales (N,)."""
+
+    rays: Floats
+    turns: Floats
+    log_scales: Floats
+
+
+def _embed(azimuth_deg: Floats, elevation_deg: Floats, scale: Floats, yaw_deg: Floats, pitch_deg: Floats) -> _Cameras:
+    """Parameters (N,) each, in the steepest arena."""
+    h, v = np.deg2rad(azimuth_deg), np.deg2rad(STEEPEST_DEG + elevation_deg)
+    rays = np.stack([np.cos(v) * np.cos(h), np.cos(v) * np.sin(h), np.sin(v)], axis=1)
+    y, p = np.deg2rad(yaw_deg) / 2, -np.deg2rad(pitch_deg) / 2
+    turns = np.stack(
+        [np.cos(p) * np.cos(y), np.sin(p) * np.sin(y), np.sin(p) * np.cos(y), np.cos(p) * np.sin(y)], axis=1
+    )
+    return _Cameras(rays, turns, np.log(scale))
+
+
+def _angle_deg(cosine: Floats) -> Floats:
+    angle: Floats = np.rad2deg(np.arccos(cosine.clip(-1, 1)))
+    return angle
+
+
+@lru_cache(maxsize=4)
+def _test_cameras(test: TestSet) -> tuple[_Cameras, int]:
+    """The distinct cameras of the test set, and how many of its tasks have one of them."""
+    names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
+    listed = [[float(task.parameters[name]) for name in names] for task in test.of("camera")]
+    return _embed(*np.unique(np.array(listed).reshape(-1, len(names)), axis=0).T), len(listed)
+
+
+ByLevel = tuple[Intervals, Intervals, Intervals, Intervals, Intervals]
+"""What to draw from at each level, weakest first."""
+
+
+def _both_ways(low: float, high: float) -> Intervals:
+    return ((-high, -low), (low, high))
+
 
 class DistanceRange(Frozen):
-    distance_scale: Intervals
+    """The defaults come closer by up to a quarter, where the nearest objects still stand in the frame.
+
+    Scales above 2.183 are clear of the test set too, but the orbit centre hangs so far above the floor arena that its
+    objects leave the frame.
+    """
+
+    distance_scale: ByLevel = (
+        ((0.882, 0.915),),
+        ((0.849, 0.882),),
+        ((0.816, 0.849),),
+        ((0.783, 0.816),),
+        ((0.75, 0.783),),
+    )
 
 
 class SphericalRange(Frozen):
-    azimuth_deg: Intervals
-    elevation_deg: Intervals
+    """The defaults pass below, between and above the test set's elevations, 0 and 15.
+
+    The lower the camera, the more a cabinet hides of what stands behind it, hence at most 10 degrees down.
+    """
+
+    azimuth_deg: ByLevel = (
+        ((-12.0, 12.0),),
+        _both_ways(12.0, 24.0),
+        _both_ways(24.0, 36.0),
+        _both_ways(36.0, 48.0),
+        _both_ways(48.0, 60.0),
+    )
+    elevation_deg: ByLevel = (
+        ((-7.0, -5.0), (5.0, 10.0)),
+        ((-8.0, -5.0), (5.0, 10.0)),
+        ((-9.0, -5.0), (5.0, 10.0), (20.0, 21.0)),
+        ((-10.0, -5.0), (5.0, 10.0), (20.0, 23.0)),
+        ((-10.0, -5.0), (5.0, 10.0), (20.0, 25.0)),
+    )
 
 
 class OrientationRange(Frozen):
-    yaw_deg: Intervals
-    pitch_deg: Intervals
+    """A large turn about one of the two axes, each as often as the other, and a small one about the other.
+
+    The test set fills the turns up to 10 degrees, so the levels differ little in the large turn and more in the small
+    one. Looking up by 15 degrees would lose what stands in front, so the default pitches only look down. A yaw loses
+    what stands at one edge of the frame.
+
+    Attributes:
+        yaw_deg, pitch_deg: the large turns.
+        other_deg: the small turn.
+    """
+
+    yaw_deg: ByLevel = (
+        _both_ways(15.0, 15.4),
+        _both_ways(15.4, 15.8),
+        _both_ways(15.8, 16.2),
+        _both_ways(16.2, 16.6),
+        _both_ways(16.6, 17.0),
+    )
+    pitch_deg: ByLevel = (((15.0, 15.4),), ((15.4, 15.8),), ((15.8, 16.2),), ((16.2, 16.6),), ((16.6, 17.0),))
+    other_deg: ByLevel = (((-1.0, 1.0),), ((-2.0, 2.0),), ((-3.0, 3.0),), ((-4.0, 4.0),), ((-5.0, 5.0),))
 
 
-class CameraAxis(Frozen):
+class CameraAxis(Axis):
     """The ranges to draw from; the defaults keep clear of LIBERO-Plus's test cameras.
 
     The test set moves on azimuths of whole degrees in [-75, 75] at elevations 0 and 15, at distance scales
-    1.15 to 2.00, and turns in place by 2 to 10 degrees about both axes at once.
+    1.15 to 2.00, and turns in place by 2 to 10 degrees about both axes at once. What the defaults show was looked at
+    in all five arenas.
     """
 
-    distance: DistanceRange | None = DistanceRange(distance_scale=((0.75, 0.95), (1.05, 1.13)))
-    spherical: SphericalRange | None = SphericalRange(
-        azimuth_deg=((-60.0, 60.0),), elevation_deg=((5.0, 10.0), (20.0, 30.0))
-    )
-    orientation: OrientationRange | None = OrientationRange(
-        yaw_deg=((-15.0, -11.0), (11.0, 15.0)), pitch_deg=((-8.0, 8.0),)
-    )
+    distance: DistanceRange | None = DistanceRange()
+    spherical: SphericalRange | None = SphericalRange()
+    orientation: OrientationRange | None = OrientationRange()
+
+    @model_validator(mode="after")
+    def _some_component(self) -> CameraAxis:
+        if not (self.distance or self.spherical or self.orientation):
+            raise ValueError("leave at least one of distance, spherical and orientation")
+        return self
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        ranges: dict[Component, Frozen] = {
-            name: value
-            for name in ("distance", "spherical", "orientation")
-            if (value := getattr(self, name)) is not None
-        }
-        component = list(ranges)[rng.integers(len(ranges))]
-        drawn = {name: draw(rng, intervals) for name, intervals in ranges[component]}
-        return CameraPerturbation.model_validate({"component": component, **drawn})
+        components = [name for name in ("distance", "spherical", "orientation") if getattr(self, name) is not None]
+        component = components[rng.integers(len(components))]
+        level = self.draw_level(rng)
+        drawn = {name: draw(rng, by_level[level - 1]) for name, by_level in getattr(self, component)}
+        if component == "orientation":
+            small = ("yaw_deg", "pitch_deg")[rng.integers(2)]
+            drawn[small] = drawn.pop("other_deg")
+        return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
 
 
 def _about(axis: Literal["y", "z"], angle_deg: float) -> NDArray[np.float64]:

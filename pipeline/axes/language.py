@@ -1,25 +1,35 @@
 """Language: the instruction reworded; the demonstration and its frames stay as they are.
 
+How far two wordings are apart is their normalised edit distance: the fewest characters to insert, delete or replace
+to turn one into the other, by the length of the longer, both without case and punctuation.
+
 The rewrites live in ``language_bank.yaml``, one list for each task and class. All are lower-case ASCII without a
 final full stop, as LIBERO's own instructions are, and each keeps one reading among the objects of its scene.
 """
 
 from __future__ import annotations
 
+import bisect
+import math
 import re
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 import numpy as np
 import yaml
+from numba import njit
+from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
-from pipeline.axes.base import Frozen, TextPerturbation
+from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
 from pipeline.errors import PipelineError
 from pipeline.types import Task
+
+if TYPE_CHECKING:
+    from pipeline.testset import TestSet
 
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
 CLASSES: tuple[Component, ...] = get_args(Component)
@@ -29,6 +39,8 @@ Bank = dict[str, dict[str, dict[Component, tuple[str, ...]]]]
 
 BANK_FILE = Path(__file__).with_name("language_bank.yaml")
 MIN_WORDS, MAX_WORDS = 3, 60
+LEVELS = (0.5, 0.6, 0.67, 0.72)
+"""Distances to the original wording at which the levels 2 to 5 begin."""
 
 _PREAMBLE = re.compile(
     r"^(sure|certainly|of course)\b\W*here\b"
@@ -47,19 +59,28 @@ class LanguagePerturbation(TextPerturbation):
     component: Component
     text: str
 
+    clearance: ClassVar[float] = 0.15
+    measure: ClassVar[str] = "share of characters to edit, to the task's test instructions without case and punctuation"
+
     def apply(self, instruction: str) -> str:
         """The wording that takes the place of ``instruction``."""
         return self.text
 
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """The distance to the nearest of the task's test instructions; a clearance of about one word in seven."""
+        return _nearest(self.text, test, task)
 
-class LanguageAxis(Frozen):
-    """Draws rewrites from the bank.
+
+class LanguageAxis(Axis):
+    """Draws rewrites from the bank: all those of the chosen levels, none more often than another.
 
     Attributes:
         classes: the classes drawn from.
+        bank: a further bank, such as the command ``rewrite`` makes; its rewrites join those that are shipped.
     """
 
     classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
+    bank: Path | None = None
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
         """The rewrite at ``place`` of the task's deal, which starts again once the bank is exhausted.
@@ -69,62 +90,110 @@ class LanguageAxis(Frozen):
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
-        rewrites = deal(task, self.classes)
-        component, text = rewrites[place % len(rewrites)]
-        return LanguagePerturbation(component=component, text=text)
+        rewrites = deal(task, self.classes, self.levels, self.bank)
+        return rewrites[place % len(rewrites)]
 
 
 @cache
-def load_bank() -> Bank:
-    """The bank as stored.
+def load_bank(file: Path = BANK_FILE) -> Bank:
+    """A bank as stored; the one that is shipped by default.
 
     Raises:
         PipelineError: when the file does not have the bank's form.
     """
     try:
-        return TypeAdapter(Bank).validate_python(yaml.safe_load(BANK_FILE.read_text(encoding="ascii")))
-    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
+        return TypeAdapter(Bank).validate_python(yaml.safe_load(file.read_text(encoding="ascii")))
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         raise PipelineError(
             f"the bank of rewrites cannot be read ({error})",
-            where=BANK_FILE,
+            where=file,
             expected=f"ASCII YAML: suite, task name, class ({', '.join(CLASSES)}), list of sentences",
-            remedy="restore the file from version control",
+            remedy="restore the file, or make it again with the command rewrite",
         ) from error
 
 
 @cache
-def deal(task: Task, classes: tuple[Component, ...]) -> tuple[tuple[Component, str], ...]:
+def deal(
+    task: Task,
+    classes: tuple[Component, ...] = CLASSES,
+    levels: tuple[Level, ...] = get_args(Level),
+    bank: Path | None = None,
+) -> tuple[LanguagePerturbation, ...]:
     """All rewrites of a task in the order they are drawn: shuffled by task, one class after the other in turn."""
-    stored = load_bank().get(task.suite, {}).get(task.name, {})
+    banks = (load_bank(), load_bank(bank)) if bank else (load_bank(),)
+    of_task = [one.get(task.suite, {}).get(task.name, {}) for one in banks]
+    stored = {component: tuple(text for one in of_task for text in one.get(component, ())) for component in CLASSES}
     turn = seeding.rng("language", task.suite, task.name).permutation(list(dict.fromkeys(classes)))
-    columns = [_shuffled(task, component, stored.get(component, ())) for component in turn.tolist()]
+    columns = [_shuffled(task, component, stored[component], levels) for component in turn.tolist()]
     dealt = tuple(card for row in zip_longest(*columns) for card in row if card is not None)
     if not dealt:
         raise PipelineError(
-            f"task {task.suite}/{task.name} has no rewrites of class {' or '.join(classes)}",
-            where=BANK_FILE,
+            f"task {task.suite}/{task.name} has no rewrites of class {' or '.join(classes)} "
+            f"at level {' or '.join(map(str, levels))}",
+            where=bank or BANK_FILE,
             expected=f"a task of {', '.join(load_bank())}",
             remedy="add rewrites of the task to the bank, or take language out of the configured axes",
         )
-    for component, text in dealt:
-        if fault := lint(text, task.instruction):
+    for card in dealt:
+        if fault := lint(card.text, task.instruction):
             raise PipelineError(
-                f"{component} rewrite {text!r} of {task.suite}/{task.name} is refused: {fault}",
-                where=BANK_FILE,
+                f"{card.component} rewrite {card.text!r} of {task.suite}/{task.name} is refused: {fault}",
+                where=bank or BANK_FILE,
                 expected=f"lower-case ASCII, {MIN_WORDS} to {MAX_WORDS} words, no final punctuation",
                 remedy="correct or delete the sentence",
             )
     return dealt
 
 
-def _shuffled(task: Task, component: Component, texts: tuple[str, ...]) -> list[tuple[Component, str]]:
+def _shuffled(
+    task: Task, component: Component, texts: tuple[str, ...], levels: tuple[Level, ...]
+) -> list[LanguagePerturbation]:
     order = seeding.rng("language", task.suite, task.name, component).permutation(len(texts))
-    return [(component, texts[i]) for i in order]
+    cards = (
+        LanguagePerturbation(component=component, text=texts[i], level=level_of(texts[i], task.instruction))
+        for i in order
+    )
+    return [card for card in cards if card.level in levels]
+
+
+def level_of(text: str, original: str) -> Level:
+    """The strength of a rewrite, by the ranges of ``LEVELS``."""
+    level: Level = get_args(Level)[bisect.bisect_right(LEVELS, distance(text, original))]
+    return level
 
 
 def normalise(text: str) -> str:
     """``text`` without case, punctuation and surplus white space: what two wordings are compared by."""
     return " ".join(re.sub(r"[^a-z0-9]+", " ", text.lower().replace("'", "")).split())
+
+
+def distance(text: str, other: str) -> float:
+    """Normalised edit distance: 0 for wordings that differ in case and punctuation at most, 1 at most."""
+    one, two = _characters(text), _characters(other)
+    return int(_edits(one, two)) / max(len(one), len(two), 1)
+
+
+def _characters(text: str) -> NDArray[np.uint8]:
+    return np.frombuffer(normalise(text).encode(), np.uint8)
+
+
+@njit(cache=True)
+def _edits(one: NDArray[np.uint8], two: NDArray[np.uint8]) -> int:
+    """Levenshtein distance, row by row: ``row[j]`` is that of what was read of ``one`` to the first j of ``two``."""
+    row = np.arange(len(two) + 1)
+    for i in range(len(one)):
+        diagonal, row[0] = row[0], i + 1
+        for j in range(len(two)):
+            replaced = diagonal + (one[i] != two[j])
+            diagonal = row[j + 1]
+            row[j + 1] = min(replaced, diagonal + 1, row[j] + 1)
+    return int(row[-1])
+
+
+@cache
+def _nearest(text: str, test: TestSet, task: Task) -> Nearest:
+    wordings = [str(tested.parameters["text"]) for tested in test.on(task, "language")]
+    return Nearest(min((distance(text, wording) for wording in wordings), default=math.inf), len(wordings))
 
 
 def lint(text: str, original: str) -> str | None:

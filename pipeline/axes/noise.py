@@ -7,8 +7,10 @@ arithmetic, in the same order where that decides a grey level, because every com
 
 from __future__ import annotations
 
+import bisect
 import math
-from typing import Annotated, ClassVar, Literal, TypeVar
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeVar
 
 import numpy as np
 from numba import njit
@@ -16,8 +18,11 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from pipeline import seeding
-from pipeline.axes.base import Frozen, PixelPerturbation
+from pipeline.axes.base import Axis, Frozen, Nearest, PixelPerturbation
 from pipeline.types import Floats, Frame, Task
+
+if TYPE_CHECKING:
+    from pipeline.testset import TestSet
 
 Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
 AboveOne = Annotated[float, Field(gt=1)]
@@ -63,6 +68,7 @@ class Motion(Frozen):
     """
 
     component: ClassVar[Component] = "motion"
+    strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
     radius_px: PositiveInt
     sigma_px: PositiveFloat
 
@@ -85,6 +91,7 @@ class Gaussian(Frozen):
     """Defocus as a Gaussian blur; scikit-image's ``gaussian`` with its defaults."""
 
     component: ClassVar[Component] = "gaussian"
+    strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
     sigma_px: PositiveFloat
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
@@ -121,6 +128,7 @@ class Zoom(Frozen):
     """Mean of the frame and of ``copies`` magnifications, evenly spaced from 1 to ``max_scale``."""
 
     component: ClassVar[Component] = "zoom"
+    strength: ClassVar[tuple[str, float]] = ("max_scale", 1)
     max_scale: AboveOne
     copies: Annotated[int, Field(ge=2)]
 
@@ -163,6 +171,7 @@ class Fog(Frozen):
     """A fractal veil added to the frame x in [0, 1]: ``(x + density veil) m / (m + density)``, m = max(x)."""
 
     component: ClassVar[Component] = "fog"
+    strength: ClassVar[tuple[str, float]] = ("density", 0)
     density: PositiveFloat
     roughness_decay: AboveOne
 
@@ -197,6 +206,7 @@ class Glass(Frozen):
     """
 
     component: ClassVar[Component] = "glass"
+    strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
     sigma_px: PositiveFloat
     delta_px: PositiveInt
     passes: PositiveInt
@@ -210,10 +220,11 @@ class Glass(Frozen):
 
 
 Effect = Motion | Gaussian | Zoom | Fog | Glass
+"""Their ``strength`` names the parameter that grows with the severity, and gives its value for a clean frame."""
 T = TypeVar("T")
 E = TypeVar("E", Motion, Gaussian, Zoom, Fog, Glass)
 Levels = tuple[T, T, T, T, T]
-"""One value for each strength, weakest first."""
+"""One value for each level, weakest first."""
 
 
 class NoisePerturbation(PixelPerturbation):
@@ -221,17 +232,18 @@ class NoisePerturbation(PixelPerturbation):
 
     Attributes:
         effect: the corruption and its parameters.
-        level: 1 to 5, the row of the axis's grid that ``effect`` is.
+        level: the row of the axis's grid that ``effect`` is.
         seed: with the index of the frame, the key of everything drawn in :meth:`apply`.
     """
 
     axis: Literal["noise"] = "noise"
     component: Component
     effect: Effect
-    level: Annotated[int, Field(ge=1, le=5)]
     seed: int
 
     views: ClassVar[frozenset[str]] = frozenset({"image"})
+    clearance: ClassVar[float] = 0.25
+    measure: ClassVar[str] = "steps between the benchmark's severities, by the parameter that sets the strength"
 
     @model_validator(mode="after")
     def _component_is_that_of_effect(self) -> NoisePerturbation:
@@ -249,6 +261,30 @@ class NoisePerturbation(PixelPerturbation):
         """
         return self.effect.apply(frame, seeding.rng(self.seed, "noise", frame_index))
 
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """The distance to the nearest test severity of the same component, whatever its task: 0.5 is half way.
+
+        The clearance keeps to the middle half between two severities. The parameters that do not set the strength
+        are not looked at, so an equal strength counts as equal.
+        """
+        name, clean = self.effect.strength
+        tested, compared = _tested(test, self.component, name)
+        if not compared:
+            return Nearest(math.inf, 0)
+        steps = (clean, *tested)
+        value = float(getattr(self.effect, name))
+        # Beyond the strongest severity the last step goes on.
+        upper = min(max(bisect.bisect_left(steps, value), 1), len(tested))
+        severity = upper - (steps[upper] - value) / (steps[upper] - steps[upper - 1])
+        return Nearest(abs(severity - min(max(round(severity), 1), len(tested))), compared)
+
+
+@cache
+def _tested(test: TestSet, component: Component, name: str) -> tuple[tuple[float, ...], int]:
+    """The values of a parameter among a component's test tasks, ascending, and the number of these tasks."""
+    tasks = [tested for tested in test.of("noise") if tested.component == component]
+    return tuple(sorted({float(tested.parameters[name]) for tested in tasks})), len(tasks)
+
 
 def _grid(effect: type[E], **parameters: Levels[float]) -> Levels[E]:
     """An effect at five levels, from one column of values per parameter."""
@@ -257,7 +293,7 @@ def _grid(effect: type[E], **parameters: Levels[float]) -> Levels[E]:
     return one, two, three, four, five
 
 
-class NoiseAxis(Frozen):
+class NoiseAxis(Axis):
     """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none."""
 
     motion: Levels[Motion] = _grid(Motion, radius_px=(7, 11, 17, 23, 33), sigma_px=(2.5, 4.5, 7, 11, 17.5))
@@ -272,7 +308,7 @@ class NoiseAxis(Frozen):
         """A component and a level, each with equal chance, whatever the task and the place."""
         grids: tuple[Levels[Effect], ...] = (self.motion, self.gaussian, self.zoom, self.fog, self.glass)
         grid = grids[rng.integers(len(grids))]
-        level = int(rng.integers(1, 6))
+        level = self.draw_level(rng)
         effect = grid[level - 1]
         seed = int(rng.integers(2**53))  # what every JSON reader keeps exactly
         return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=seed)

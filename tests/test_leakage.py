@@ -1,0 +1,197 @@
+"""Test tasks planted in a plan are found, on every axis, and stop the run; what cannot be known is said."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import yaml
+from conftest import REPOSITORY, tiny_config
+
+from pipeline import leakage, plan, seeding, testset
+from pipeline.axes import AnyPerturbation, Axes, from_json, to_json
+from pipeline.axes.noise import NoiseAxis
+from pipeline.axes.robot import HOME_RAD, benchmark_offsets_rad
+from pipeline.errors import PipelineError
+from pipeline.plan import Row
+from pipeline.tasks import SUITES, find_task, tasks
+from pipeline.testset import TestSet, TestTask
+from pipeline.types import Task
+
+FOLDER = REPOSITORY / testset.FOLDER
+
+AS_DRAWN: dict[str, Callable[[TestTask], dict[str, Any]]] = {
+    "camera": lambda tested: dict(tested.parameters),
+    "noise": lambda tested: {
+        "effect": {name: value for name, value in tested.parameters.items() if name != "severity"},
+        "seed": 1,
+    },
+    "language": lambda tested: {"component": "paraphrase", **tested.parameters},
+    "background": lambda tested: {
+        "coverings": [{"part": "surface", "texture": tested.parameters["surface"], "licence": "-", "sha256": "-"}],
+        "colour_scale": 1,
+    },
+    "robot": lambda tested: {"joint_offsets_rad": benchmark_offsets_rad()[int(tested.parameters["id"]) - 1].tolist()},
+    "pose": lambda tested: {
+        "component": "target",
+        "dyaw_deg": 0,
+        **{name: tested.parameters[name] for name in ("target", "dx_m", "dy_m")},
+    },
+}
+"""Axis to the fields of the perturbation that would repeat a test task. Light's values are in no file of the wheel."""
+
+AXES = [kind.model_fields["axis"].default for kind in get_args(get_args(AnyPerturbation)[0])]
+
+
+@pytest.fixture(scope="module")
+def test() -> TestSet:
+    return testset.load(FOLDER)
+
+
+def repeated(tested: TestTask) -> AnyPerturbation:
+    """The test task as if the planner had drawn it."""
+    fields = {"axis": tested.axis, "component": tested.component, "level": 1, **AS_DRAWN[tested.axis](tested)}
+    (perturbation,) = from_json(json.dumps([fields]))
+    return perturbation
+
+
+def row(task: Task, perturbations: Iterable[AnyPerturbation], name: str) -> Row:
+    listed = to_json(perturbations)
+    changed = [(p.axis, p.component) for p in from_json(listed)]
+    return Row(
+        episode_id=name,
+        twin_id="twin",
+        trajectory_id="trajectory",
+        role="perturbed",
+        suite=task.suite,
+        task=task.name,
+        demo_id=f"{task.suite}/{task.name}/demo_0",
+        demo_sha256="0",
+        demo_source="test",
+        demo_steps=100,
+        axis="+".join(axis for axis, _ in changed),
+        component="+".join(component for _, component in changed),
+        perturbations=listed,
+        instruction=task.instruction,
+        replay_mode="open_loop",
+        rank=0,
+        wanted=True,
+        seed=0,
+        variant=0,
+    )
+
+
+@pytest.mark.parametrize("axis", [axis for axis in AXES if axis in AS_DRAWN])
+def test_every_test_task_is_found_when_it_is_drawn(axis: str, test: TestSet) -> None:
+    known = [tested for tested in test.of(axis) if axis != "pose" or "target" in tested.parameters]
+    assert len(known) > 600
+    rows = [row(find_task(tested.suite, tested.base), [repeated(tested)], f"{n}") for n, tested in enumerate(known)]
+    finding = leakage.check(rows, test)[axis]
+    assert finding.overlaps == finding.rows == len(known)
+    assert finding.test_tasks == len(test.of(axis))
+    assert finding.verdict == "overlap"
+    assert finding.smallest == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_draws_are_mostly_clear_and_the_rest_is_counted(axis: str, test: TestSet) -> None:
+    sampler = Axes.model_fields[axis].annotation
+    drawn = get_args(sampler)[0]()
+    rows, overlaps = [], 0
+    for suite in SUITES[:4]:
+        task = tasks(suite)[3]
+        for variant in range(40):
+            perturbation = drawn.sample(seeding.rng(5, axis, suite, variant), task, variant)
+            assert 1 <= perturbation.level <= 5
+            overlaps += perturbation.nearest(test, task).distance < perturbation.clearance
+            rows.append(row(task, [perturbation], f"{suite}{variant}"))
+    finding = leakage.check(rows, test)[axis]
+    assert (finding.rows, finding.overlaps, finding.test_tasks) == (160, overlaps, len(test.of(axis)))
+    assert finding.measure
+    assert overlaps <= 16
+    if finding.comparisons:
+        assert finding.verdict == ("overlap" if overlaps else "disjoint")
+
+
+@pytest.mark.parametrize("robot", ["mounted_panda", "on_the_ground_panda"])
+def test_the_robot_axis_knows_the_benchmarks_postures(robot: str) -> None:
+    with zipfile.ZipFile(FOLDER / testset.WHEEL) as wheel:
+        source = wheel.read(f"liberoplus/liberoplus/envs/robots/{robot}.py").decode()
+    pattern = r"^class \w+?Panda(\d+)\([^#]*?return np\.array\(\[([^\]]*)\]"
+    found = {int(name): [float(angle) for angle in row.split(",")] for name, row in re.findall(pattern, source, re.M)}
+    assert sorted(found) == list(range(1, 501))
+    postures_rad = np.array([found[name] for name in sorted(found)])
+    assert np.abs(postures_rad - HOME_RAD - benchmark_offsets_rad()).max() < 1e-8
+
+
+def test_a_row_with_several_perturbations_counts_for_each_axis(test: TestSet) -> None:
+    language, noise = (next(iter(test.of(axis))) for axis in ("language", "noise"))
+    task = find_task(language.suite, language.base)
+    clean = row(task, [], "clean")
+    both = row(task, [repeated(noise), repeated(language)], "both")
+    findings = leakage.check([clean, both], test)
+    assert {axis: (f.rows, f.overlaps, f.closest) for axis, f in findings.items()} == {
+        "noise": (1, 1, "both"),
+        "language": (1, 1, "both"),
+    }
+
+
+def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -> None:
+    noise = next(iter(test.of("noise")))
+    task = find_task(noise.suite, noise.base)
+    other = next(tested for tested in test.of("noise") if tested.component != noise.component)
+    rows = [row(task, [repeated(noise)], "one")]
+    # The test set has tasks of the axis, but none to compare this with.
+    assert leakage.check(rows, TestSet((other,)))["noise"].verdict == "unknown"
+    assert leakage.check(rows, TestSet((other,)))["noise"].smallest is None
+    assert leakage.check(rows, TestSet(()))["noise"].verdict == "disjoint"
+    assert leakage.check([], test) == {}
+
+
+def run_stage(folder: Path, rows: list[Row]) -> subprocess.CompletedProcess[str]:
+    """The stage as DVC runs it, on a plan of these rows."""
+    (folder / "data").mkdir(exist_ok=True)
+    if not (folder / testset.FOLDER).exists():
+        (folder / testset.FOLDER).symlink_to(FOLDER)
+    plan.write(rows, folder / "data" / "tiny" / "plan.parquet")
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(folder)))
+    command = [sys.executable, str(REPOSITORY / "stages" / "leakage.py"), "tiny.yaml"]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path) -> None:
+    task = find_task("libero_goal", "turn_on_the_stove")
+    clear = [row(task, [NoiseAxis().sample(seeding.rng(n), task, n)], f"{n}") for n in range(9)]
+    done = run_stage(tmp_path, clear)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"noise +9 +1,601 +0 +0\.[45] +0\.25 +disjoint", done.stdout), done.stdout
+    assert "noise: steps between the benchmark's severities" in done.stdout
+    report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
+    assert (report["noise"]["overlaps"], report["noise"]["verdict"]) == (0, "disjoint")
+    assert report["noise"]["smallest"] >= report["noise"]["clearance"]
+
+    planted = row(task, [repeated(test.on(task, "language")[0])], "planted")
+    done = run_stage(tmp_path, [*clear, planted])
+    assert done.returncode == 1
+    assert "1 of 1 on the language axis (such as planted, distance 0, clearance 0.15)" in done.stderr
+    assert "noise axis" not in done.stderr
+    report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
+    assert (report["language"]["overlaps"], report["language"]["verdict"]) == (1, "overlap")
+    assert all(math.isfinite(finding["clearance"]) for finding in report.values())
+
+
+def test_no_overlap_is_no_error(test: TestSet) -> None:
+    leakage.refuse_overlap({})
+    tested = test.of("noise")[0]
+    findings = leakage.check([row(find_task(tested.suite, tested.base), [repeated(tested)], "planted")], test)
+    with pytest.raises(PipelineError, match="such as planted"):
+        leakage.refuse_overlap(findings)

@@ -1,0 +1,150 @@
+"""Light: every lamp of every arena, only what renders, and frames that stay legible at the strongest draws."""
+
+from __future__ import annotations
+
+from statistics import mean
+from typing import get_args
+
+import numpy as np
+import pytest
+from arenas import TASKS, change, changed, checksums, frames, renderer
+from conftest import MILK
+
+from pipeline.axes.base import Level
+from pipeline.axes.light import Component, LightAxis, LightPerturbation, exposure
+from pipeline.seeding import rng
+from pipeline.testset import TestSet
+
+COMPONENTS: tuple[Component, ...] = get_args(Component)
+NEUTRAL = LightPerturbation(component="combined", level=1)
+
+
+def drawn(component: Component, level: Level, key: str | int) -> LightPerturbation:
+    axis = LightAxis(components=(component,), levels=(level,))
+    return axis.sample(rng("light", component, level, key), MILK, 0)
+
+
+def test_draws_are_keyed_recorded_and_touch_their_property_alone() -> None:
+    properties = {
+        "diffuse": {"diffuse_scale_rgb"},
+        "direction": {"orbit_deg", "tilt_deg", "tilt_azimuth_deg"},
+        "specular": {"specular_scale"},
+        "shadows": {"shadows", "fill_scale", "orbit_deg"},
+    }
+    properties["combined"] = set().union(*properties.values())
+    for key in range(100):
+        one = LightAxis().sample(rng("key", key), MILK, 0)
+        assert one == LightAxis().sample(rng("key", key), MILK, 5)
+        assert LightPerturbation.model_validate_json(one.model_dump_json()) == one
+        different = {name for name, value in one if value != getattr(NEUTRAL, name)} - {"component", "level"}
+        assert different == properties[one.component]
+    assert {LightAxis().sample(rng("key", key), MILK, 0).component for key in range(100)} == set(COMPONENTS)
+
+
+def test_ranges_grow_with_the_level() -> None:
+    for component, name in (("direction", "tilt_deg"), ("specular", "specular_scale"), ("shadows", "orbit_deg")):
+        values = [abs(getattr(drawn(component, level, 0), name)) for level in (1, 2, 3, 4, 5)]  # type: ignore[arg-type]
+        assert values == sorted(set(values))
+    fills = [drawn("shadows", level, 0).fill_scale for level in (1, 2, 3, 4, 5)]
+    assert fills == sorted(set(fills), reverse=True)
+
+
+@pytest.mark.parametrize("arena", TASKS)
+def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
+    shown = renderer(arena)
+    try:
+        before, clean = checksums(shown), frames(shown)
+        directions, colours = shown.model.light_dir.copy(), shown.model.light_diffuse.copy()
+        with shown.perturbed([drawn("combined", 5, arena)]):
+            assert changed(before, checksums(shown)) <= set(LightPerturbation.fields)
+            assert shown.model.light_castshadow.all()
+            assert (shown.model.light_diffuse != colours).any(axis=1).all()
+            assert np.allclose(np.linalg.norm(shown.model.light_dir, axis=1), 1)
+            assert (shown.model.light_dir != directions).any(axis=1).all()
+            after = frames(shown)
+        assert all(change(clean[view], after[view]) > 3 for view in clean)
+        assert changed(before, checksums(shown)) == set()
+        restored = frames(shown)
+        assert all(np.array_equal(clean[view], restored[view]) for view in clean)
+
+        # The corners of the ranges: as little light as there can be, and as much.
+        assert [exposure(frame) for frame in clean.values()] == [None, None]
+        dimmest = {"diffuse_scale_rgb": (0.0, 0.0, 0.0), "tilt_deg": 32.0}
+        brightest = {"diffuse_scale_rgb": (2.0, 2.0, 2.0), "specular_scale": 30.0}
+        lit = {"shadows": True, "orbit_deg": 180.0, "fill_scale": 0.5}
+        for corner in (dimmest, brightest | lit):
+            with shown.perturbed([NEUTRAL.model_copy(update=corner)]):
+                assert [exposure(frame) for frame in frames(shown).values()] == [None, None], corner
+    finally:
+        shown.close()
+
+
+def test_stronger_levels_change_more() -> None:
+    weak: dict[str, list[float]] = {component: [] for component in COMPONENTS}
+    strong: dict[str, list[float]] = {component: [] for component in COMPONENTS}
+    shown = renderer("tabletop")
+    try:
+        clean = frames(shown, ["agentview"])["agentview"]
+        for component in COMPONENTS:
+            for level, changes in ((1, weak), (5, strong)):
+                for key in range(3):
+                    with shown.perturbed([drawn(component, level, key)]):  # type: ignore[arg-type]
+                        after = frames(shown, ["agentview"])["agentview"]
+                    changes[component].append(change(clean, after))
+    finally:
+        shown.close()
+    for component in COMPONENTS:
+        assert mean(strong[component]) > 1.2 * mean(weak[component]), component
+
+
+def test_light_comes_from_where_the_parameters_say() -> None:
+    shown = renderer("tabletop")
+    try:
+        lamp = shown.model.light("light1")
+        with shown.perturbed([NEUTRAL.model_copy(update={"orbit_deg": 90.0})]):
+            assert np.allclose(lamp.pos, [-1, 1, 4])
+        nominal = lamp.dir.copy()
+        for azimuth, towards in ((0.0, [1, 0]), (90.0, [0, 1])):
+            tilted = NEUTRAL.model_copy(update={"tilt_deg": 20.0, "tilt_azimuth_deg": azimuth})
+            with shown.perturbed([tilted]):
+                assert (lamp.dir[:2] - nominal[:2]) @ towards > 0.3
+    finally:
+        shown.close()
+
+
+def test_shadows_are_there_and_soften() -> None:
+    shown = renderer("floor")
+    darkest = []
+    try:
+        for fill in (0.0, 0.5):
+            light, dark = (
+                NEUTRAL.model_copy(update={"shadows": shadows, "fill_scale": fill, "orbit_deg": 180.0})
+                for shadows in (False, True)
+            )
+            with shown.perturbed([light]):
+                unshadowed = frames(shown, ["agentview"])["agentview"].astype(int)
+            with shown.perturbed([dark]):
+                shadowed = frames(shown, ["agentview"])["agentview"]
+            darkest.append(np.percentile((shadowed - unshadowed).mean(axis=2), 3))
+    finally:
+        shown.close()
+    hard, soft = darkest
+    assert hard < -40, f"3 % of the pixels should be darker by 40 grey levels, are by {-hard:.0f}"
+    assert hard < soft - 10
+
+
+def test_exposure_names_what_is_wrong() -> None:
+    rows = np.linspace(0, 255, 100)[:, None, None]
+    assert exposure(np.broadcast_to(rows, (100, 100, 3)).astype(np.uint8)) is None
+    assert exposure(np.full((64, 64, 3), 8, np.uint8)) == "too_dark"
+    assert exposure(np.full((64, 64, 3), 252, np.uint8)) == "blown_out"
+    blue = np.zeros((64, 64, 3), np.uint8)
+    blue[..., 2] = 255
+    assert exposure(blue) is None, "a pure colour is neither"
+
+
+def test_it_claims_no_proof_that_cannot_be_had() -> None:
+    nearest = drawn("diffuse", 1, 0).nearest(TestSet(()), MILK)
+    assert nearest.compared == 0
+    assert nearest.distance >= LightPerturbation.clearance
+    assert "unknown" in LightPerturbation.measure

@@ -1,0 +1,165 @@
+"""Pose: the right object moves, as far as its level says, and stays where the instruction says it is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from conftest import MILK, PLATE, STOVE, starter_demo
+from scipy.spatial.transform import Rotation
+
+from pipeline.axes.base import RefusedError
+from pipeline.axes.pose import PoseAxis, PosePerturbation
+from pipeline.config import ReplayConfig
+from pipeline.environment import Environment
+from pipeline.replay import open_loop
+from pipeline.scene import Compiled
+from pipeline.seeding import rng
+from pipeline.tasks import find_task, select_tasks
+from pipeline.testset import TestSet, TestTask
+from pipeline.types import Scene, Task
+
+COOKIES = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate")
+NEXT_TO = find_task("libero_spatial", "pick_up_the_black_bowl_next_to_the_plate_and_place_it_on_the_plate")
+BETWEEN = find_task(
+    "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
+)
+BOWL = "akita_black_bowl_1"
+
+Scenes = Callable[[Task], Scene]
+
+
+@pytest.fixture(scope="module")
+def plate_environment() -> Environment:
+    return Environment(PLATE)
+
+
+@pytest.fixture(scope="module")
+def scenes(plate_environment: Environment) -> Scenes:
+    @cache
+    def scene(task: Task) -> Scene:
+        environment = plate_environment if task == PLATE else Environment(task)
+        return Scene(environment.place_fixtures(4), starter_demo(task).init_state)
+
+    return scene
+
+
+def moved(target: str | None, dx_m: float = 0.0, dy_m: float = 0.0, dyaw_deg: float = 0.0) -> PosePerturbation:
+    return PosePerturbation(level=1, target=target, dx_m=dx_m, dy_m=dy_m, dyaw_deg=dyaw_deg)
+
+
+def draws(axis: PoseAxis, task: Task, count: int) -> list[PosePerturbation]:
+    return [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
+
+
+def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
+    drawn = draws(PoseAxis(), PLATE, 500)
+    assert drawn == draws(PoseAxis(), PLATE, 500)
+    assert {p.level for p in drawn} == {1, 2, 3, 4, 5}
+    for p in drawn:
+        assert 0.016 * (p.level - 1) - 1e-4 <= math.hypot(p.dx_m, p.dy_m) <= 0.016 * p.level + 1e-4
+        assert 4 * (p.level - 1) - 0.01 <= abs(p.dyaw_deg) <= 4 * p.level + 0.01
+        assert p.target == "plate_1"
+    assert {np.sign(p.dyaw_deg) for p in drawn} == {-1, 1}
+    assert PosePerturbation.model_validate_json(drawn[0].model_dump_json()) == drawn[0]
+
+
+def test_the_target_is_what_the_goal_moves() -> None:
+    targets = {
+        task: {p.target for p in draws(PoseAxis(), task, 12)}
+        for task in select_tasks(["libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*"])
+    }
+    assert {task.name for task, found in targets.items() if found == {None}} == {
+        "turn_on_the_stove",
+        "open_the_middle_drawer_of_the_cabinet",
+    }
+    assert targets[MILK] == {"milk_1"}
+    assert targets[COOKIES] == {BOWL}
+    assert targets[find_task("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove")] == {
+        "moka_pot_1",
+        "moka_pot_2",
+    }
+
+
+def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
+    scene = scenes(PLATE)
+    change = moved("plate_1", 0.02, -0.01, 15)
+    after = change.apply(scene, starter_demo(PLATE))
+    assert after.model_xml == scene.model_xml
+    address = 1 + Compiled(scene).model.joint("plate_1_joint0").qposadr[0]
+    before, now = scene.state.copy(), after.state.copy()
+    assert np.allclose(now[address : address + 3] - before[address : address + 3], [0.02, -0.01, 0], atol=1e-12)
+    turn = Rotation.from_quat(now[address + 3 : address + 7], scalar_first=True) * (
+        Rotation.from_quat(before[address + 3 : address + 7], scalar_first=True).inv()
+    )
+    assert np.allclose(turn.as_rotvec(degrees=True), [0, 0, 15], atol=1e-6)
+    now[address : address + 7] = before[address : address + 7]
+    assert np.array_equal(now, before)
+    assert after.resolved["pose"]["target"] == "plate_1"
+
+
+@pytest.mark.parametrize(
+    ("task", "change", "reason"),
+    [
+        (STOVE, moved(None, 0.01), "no_movable_target"),
+        # Off the table.
+        (PLATE, moved("plate_1", 1.0), "relation_broken"),
+        (BETWEEN, moved(BOWL, 0.06), "target_in_collision"),
+        (NEXT_TO, moved(BOWL, -0.03, 0.05), "relation_broken"),
+        (BETWEEN, moved(BOWL, 0.0, 0.08), "relation_broken"),
+        # Off the box, and let go in the air.
+        (COOKIES, moved(BOWL, -0.08), "target_in_collision"),
+    ],
+)
+def test_what_cannot_be_is_refused(task: Task, change: PosePerturbation, reason: str, scenes: Scenes) -> None:
+    with pytest.raises(RefusedError, match=reason):
+        change.apply(scenes(task), starter_demo(task))
+
+
+@pytest.mark.parametrize("task", [COOKIES, NEXT_TO, BETWEEN], ids=["on", "next to", "between"])
+def test_small_moves_keep_the_relation(task: Task, scenes: Scenes) -> None:
+    for change in (moved(BOWL, 0.01, -0.01, 4), moved(BOWL, -0.01, 0.01, -4)):
+        change.apply(scenes(task), starter_demo(task))
+
+
+def test_a_target_in_mid_air_is_still_moved(scenes: Scenes) -> None:
+    """LIBERO records some first states before everything has landed; this bottle hangs 2 cm above the floor."""
+    task = find_task("libero_object", "pick_up_the_salad_dressing_and_place_it_in_the_basket")
+    scene = scenes(task)
+    compiled = Compiled(scene)
+    assert not compiled.touching(compiled.part("salad_dressing_1_main"))
+    after = moved("salad_dressing_1", 0.02, 0.01, 10).apply(scene, starter_demo(task))
+    assert not np.array_equal(after.state, scene.state)
+
+
+def test_nearest_compares_moves_of_the_same_object() -> None:
+    def tested(task: Task, target: str, dx_m: float, dy_m: float) -> TestTask:
+        found: dict[str, str | int | float] = {"level": 1, "sample": 1, "target": target, "dx_m": dx_m, "dy_m": dy_m}
+        return TestTask(task.suite, task.name, "name", "pose", "pose", found)
+
+    test = TestSet(
+        (
+            tested(PLATE, "plate_1", 0.01, 0.02),
+            tested(PLATE, "plate_1", -0.03, 0.0),
+            tested(MILK, "milk_1", 0.02, 0.0),
+            TestTask(STOVE.suite, STOVE.name, "name", "pose", "pose", {"level": 1, "sample": 1}),
+        )
+    )
+    assert moved("plate_1", 0.01, 0.02).nearest(test, PLATE) == (0, 2)
+    assert moved("plate_1", 0.01, 0.024).nearest(test, PLATE).distance < PosePerturbation.clearance
+    assert moved("plate_1", 0.02, 0.0).nearest(test, PLATE).distance == pytest.approx(math.hypot(0.01, 0.02))
+    assert moved(BOWL, 0.01, 0.02).nearest(test, PLATE) == (math.inf, 0)
+    assert moved(None, 0.01).nearest(test, STOVE) == (math.inf, 0)
+
+
+def test_the_replay_starts_there(plate_environment: Environment) -> None:
+    demo = starter_demo(PLATE)
+    short = replace(demo, actions=demo.actions[:3])
+    change = moved("plate_1", 0.02, 0.0, 10)
+    trajectory = open_loop(plate_environment, short, "t", ReplayConfig(fixture_seed=4), (change,))
+    (position,) = np.flatnonzero(trajectory.states[0] == demo.init_state + 0.02)
+    assert trajectory.states[-1, position] == pytest.approx(trajectory.states[0, position], abs=1e-3), "it slides"

@@ -1,0 +1,214 @@
+"""Contact sheets of real scenes: every layer, both views, refusals, and the sheets of a run."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+
+import numpy as np
+import pytest
+from conftest import MILK, REPOSITORY, STOVE
+from PIL import Image
+
+from pipeline import __main__ as command_line
+from pipeline import preview, sheets
+from pipeline.axes import Axes, PhysicsPerturbation, RefusedError, RenderPerturbation
+from pipeline.axes.base import Axis
+from pipeline.axes.language import LanguageAxis
+from pipeline.compute import loop
+from pipeline.config import load
+from pipeline.environment import Environment
+from pipeline.episode_schema import SCHEMA
+from pipeline.frames import decode, streams_of
+from pipeline.render import render
+from pipeline.types import Demo, Frame, Scene, Task, Trajectory, Verdict
+
+if TYPE_CHECKING:
+    import mujoco
+
+STARTER = load(REPOSITORY / "configs" / "starter.yaml")
+VIEWS = tuple(SCHEMA.views)
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[preview.Stage]:
+    with preview.staged([STOVE], STARTER) as stage:
+        yield stage
+
+
+class Dimming(RenderPerturbation):
+    axis: Literal["dimming"] = "dimming"
+    component: Literal["lamp", "window"] = "lamp"
+    views: ClassVar[frozenset[str]] = frozenset(VIEWS)
+    fields: ClassVar[tuple[str, ...]] = ("light_diffuse",)
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        model.light_diffuse[:] *= 1 - self.level / 5
+
+
+class Lift(PhysicsPerturbation):
+    """Lifts the arm, in a scene of its own when it is the window's; too much is refused."""
+
+    axis: Literal["lift"] = "lift"
+    component: Literal["lamp", "window"] = "lamp"
+
+    def apply(self, scene: Scene, demo: Demo) -> Scene:
+        if self.level == 5:
+            raise RefusedError("too_high")
+        state = scene.state.copy()
+        state[2] += 0.1 * self.level
+        name = "other" if self.component == "window" else "model"
+        return replace(scene, state=state, model_xml=scene.model_xml.replace('model="', f'model="{name}', 1))
+
+
+class Drawn(Axis):
+    """An axis that draws one of the two kinds above."""
+
+    kind: type[Dimming] | type[Lift]
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> Any:
+        component = ("lamp", "window")[rng.integers(2)]
+        return self.kind.model_validate({"component": component, "level": self.draw_level(rng)})
+
+
+def tiles(sheet: Image.Image, views: int) -> list[Frame]:
+    """The pictures of a sheet with captions of one line, in order."""
+    side = preview.SIDE_PX[views]
+    width, height = views * side + sheets.GAP_PX, side + 2 * sheets.LINE_PX
+    return [
+        np.asarray(sheet.crop((left, top, left + views * side, top + side)))
+        for top in range(2 * sheets.LINE_PX, sheet.height, height)
+        for left in range(sheets.GAP_PX, sheet.width - sheets.GAP_PX, width)
+    ]
+
+
+def test_a_stage_shows_the_same_again(stage: preview.Stage) -> None:
+    first, again = stage.frames(VIEWS), stage.frames(VIEWS)
+    assert [frame.shape for frame in first] == [SCHEMA.frame.shape] * 2
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+
+
+@pytest.mark.parametrize("name", Axes.model_fields)
+def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_it_was(
+    stage: preview.Stage, name: str
+) -> None:
+    before = stage.frames(VIEWS)
+    for perturbation in reversed(preview.variants(name, preview.configured(name, STARTER), stage.demo, 1)):
+        try:
+            after = stage.frames(VIEWS, perturbation)
+            break
+        except RefusedError as refused:
+            reason = refused.reason
+    else:
+        pytest.skip(f"this scene refuses every draw: {reason}")
+    changed = {view for view, a, b in zip(VIEWS, before, after, strict=True) if not np.array_equal(a, b)}
+    # It may change less, as the wrist sees no walls.
+    assert changed <= perturbation.views
+    assert bool(changed) == bool(perturbation.views)
+    assert all(np.array_equal(a, b) for a, b in zip(before, stage.frames(VIEWS), strict=True))
+
+
+@pytest.mark.parametrize("name", ["camera", "noise", "language"])
+def test_variants_cover_components_and_levels(stage: preview.Stage, name: str) -> None:
+    axis = preview.configured(name, STARTER)
+    drawn = preview.variants(name, axis, stage.demo, 1)
+    assert drawn == preview.variants(name, axis, stage.demo, 1)
+    assert drawn != preview.variants(name, axis, stage.demo, 2) or name == "language"
+    assert len({p.model_dump_json() for p in drawn}) == preview.VARIANTS
+    counts = Counter(p.component for p in drawn)
+    kinds = get_args(type(drawn[0]).model_fields["component"].annotation)
+    assert set(counts) == set(kinds)
+    assert max(counts.values()) - min(counts.values()) <= 1
+    assert {p.level for p in drawn} == {1, 2, 3, 4, 5}
+
+
+def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Dimming))
+    original, *variants = tiles(preview.draw(stage, "dimming", STARTER), 2)
+    # Two components at five levels are all that there is.
+    brightness = [variant.mean() for variant in variants[:10]]
+    assert brightness[0] < original.mean()
+    for component in (brightness[:5], brightness[5:]):
+        assert component == sorted(component, reverse=True)
+    assert (variants[10] == 255).all()
+
+
+def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(1, 5)))
+    captions: list[str] = []
+
+    def tile(picture: Image.Image, caption: str) -> sheets.Tile:
+        captions.append(caption)
+        return sheets.Tile(picture, caption[:20])
+
+    monkeypatch.setattr(preview, "Tile", tile)
+    sheet = preview.draw(stage, "lift", STARTER)
+    assert captions[1:] == [
+        "lamp, level 1",
+        "refused, too_high: lamp, level 5",
+        "window, level 1",
+        "refused, too_high: window, level 5",
+    ]
+    original, *variants = tiles(sheet, 2)
+    assert [(variant == preview.REFUSED_GREY).all() for variant in variants[:4]] == [False, True, False, True]
+    # Both lifts are the same, whether the scene's model was compiled anew or not.
+    assert not np.array_equal(variants[0], original)
+    assert np.array_equal(variants[0], variants[2])
+
+
+def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
+    environment = Environment(STOVE)
+    environment.restore(stage.scene.model_xml, stage.scene.state)
+    begun = Trajectory(
+        trajectory_id="begun",
+        model_xml=stage.scene.model_xml,
+        states=np.stack([environment.state] * 2),
+        actions=np.zeros((1, 7)),
+        kept_mask=np.ones(1, bool),
+        site_alpha=np.stack([environment.site_alpha] * 2),
+        resolved="{}",
+        verdict=Verdict(True, "kept"),
+    )
+    environment.close()
+    shown = stage.frames(VIEWS)
+    stage.close()
+    streams = streams_of("[]")
+    rendered = render(begun, list(streams.values()), STARTER.render)
+    for view, frame in zip(VIEWS, shown, strict=True):
+        compressed = decode(rendered.streams[streams[view].stream_id][0])
+        assert np.abs(compressed.astype(int) - frame).mean() < 2
+
+
+def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "sheet"
+    monkeypatch.chdir(REPOSITORY)
+    monkeypatch.setattr("sys.argv", ["pipeline", "preview", "libero_goal/turn_on*", "language", "--out", str(out)])
+    assert command_line.main() == 0
+    assert "libero_goal/turn_on_the_stove" in capsys.readouterr().out
+    with Image.open(out) as sheet:
+        assert sheet.format == "PNG"
+        assert sheet.width == 4 * (preview.SIDE_PX[1] + sheets.GAP_PX) + sheets.GAP_PX
+
+
+def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(preview, "VARIANTS", 2)
+    tasks = tuple(f"{task.suite}/{task.name}" for task in (STOVE, MILK))
+    config = STARTER.model_copy(
+        update={
+            "demos": STARTER.demos.model_copy(update={"tasks": tasks}),
+            "plan": STARTER.plan.model_copy(update={"axes": Axes(language=LanguageAxis())}),
+        }
+    )
+    drawn = preview.for_run(config, tmp_path / "previews", loop)
+    assert drawn == {suite: tmp_path / "previews" / suite for suite in (STOVE.suite, MILK.suite)}
+    for folder in drawn.values():
+        with Image.open(folder / "language.png") as sheet:
+            assert np.asarray(sheet).std() > 20
+
+
+def test_a_value_is_not_parted_from_its_name() -> None:
+    lines = sheets._wrapped("level 3: azimuth_deg\N{NO-BREAK SPACE}12.5, elevation_deg\N{NO-BREAK SPACE}7", 120)
+    assert lines == ["level 3:", "azimuth_deg 12.5,", "elevation_deg 7"]

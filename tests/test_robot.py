@@ -1,0 +1,118 @@
+"""Robot: offsets of the stated size, clear of the benchmark's, that change the arm's start and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import MILK, PLATE, starter_demo
+
+from pipeline.axes.base import RefusedError
+from pipeline.axes.robot import HOME_RAD, RobotAxis, RobotPerturbation, benchmark_offsets_rad
+from pipeline.config import ReplayConfig
+from pipeline.environment import Environment
+from pipeline.replay import open_loop
+from pipeline.scene import Compiled
+from pipeline.seeding import rng
+from pipeline.testset import TestSet, TestTask
+from pipeline.types import Floats, Scene
+
+TEST = TestSet(
+    tuple(TestTask("libero_goal", "base", f"base_{n}", "robot", "initial_joints", {"id": n}) for n in (1, 101, 450))
+)
+PUBLISHED_RAD = {
+    1: (0.02097405, -0.16687568, 0.02734903, -2.38028663, -0.00988726, 2.21686563, 0.85208136),
+    500: (-0.11827633, -0.04802337, 0.42756544, -2.2644154, -0.01062499, 2.18628575, 0.7065925),
+}
+"""Arm postures of the benchmark's classes MountedPanda1 and MountedPanda500."""
+
+
+def turned(*offsets: float) -> RobotPerturbation:
+    return RobotPerturbation.model_validate({"level": 1, "joint_offsets_rad": offsets})
+
+
+def draws(axis: RobotAxis, count: int) -> list[RobotPerturbation]:
+    return [axis.sample(rng(1, "robot", "demo", variant), MILK, variant) for variant in range(count)]
+
+
+@pytest.fixture(scope="module")
+def environment() -> Environment:
+    return Environment(PLATE)
+
+
+@pytest.fixture(scope="module")
+def scene(environment: Environment) -> Scene:
+    return Scene(environment.place_fixtures(4), starter_demo(PLATE).init_state)
+
+
+def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
+    drawn = draws(RobotAxis(), 500)
+    assert drawn == draws(RobotAxis(), 500)
+    assert {p.level for p in drawn} == {1, 2, 3, 4, 5}
+    for p in drawn:
+        assert np.linalg.norm(p.joint_offsets_rad) == pytest.approx(0.1 * p.level, abs=3e-6)
+    assert RobotPerturbation.model_validate_json(drawn[0].model_dump_json()) == drawn[0]
+
+
+def test_no_direction_is_preferred() -> None:
+    directions = np.array([np.array(p.joint_offsets_rad) / (0.1 * p.level) for p in draws(RobotAxis(), 3000)])
+    assert np.abs(directions.mean(axis=0)).max() < 0.04
+    assert np.allclose(np.cov(directions.T), np.eye(7) / 7, atol=0.02)
+
+
+def test_the_benchmarks_offsets_are_reproduced() -> None:
+    for number, posture in PUBLISHED_RAD.items():
+        assert np.allclose(HOME_RAD + benchmark_offsets_rad()[number - 1], posture, rtol=0, atol=1e-8)
+
+
+def test_every_test_offset_is_found_and_draws_are_clear() -> None:
+    for offsets in benchmark_offsets_rad():
+        near = turned(*offsets).nearest(TEST, PLATE)
+        assert near.distance < 1e-12
+        assert near.compared == 3
+    clear = [p.nearest(TEST, PLATE).distance >= p.clearance for p in draws(RobotAxis(), 1000)]
+    assert np.mean(clear) > 0.99
+    assert turned(*[0.1] * 7).nearest(TestSet(()), PLATE) == (np.inf, 0)
+
+
+def test_only_the_arm_changes(scene: Scene) -> None:
+    drawn = RobotAxis(levels=(3,)).sample(rng("some"), PLATE, 0)
+    moved = drawn.apply(scene, starter_demo(PLATE))
+    assert moved.model_xml == scene.model_xml
+    compiled = Compiled(scene)
+    arm = [1 + compiled.model.joint(f"robot0_joint{n}").qposadr[0] for n in range(1, 8)]
+    speeds = [1 + compiled.model.nq + compiled.model.joint(f"robot0_joint{n}").dofadr[0] for n in range(1, 8)]
+    expected = scene.state.copy()
+    expected[arm] += drawn.joint_offsets_rad
+    expected[speeds] = 0.0
+    assert np.array_equal(moved.state, expected)
+    assert moved.resolved == {"robot": {"joints_rad": expected[arm].tolist()}}
+
+
+def recorded_rad(scene: Scene) -> Floats:
+    compiled = Compiled(scene)
+    return np.array([compiled.data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)])
+
+
+def test_what_cannot_be_is_refused(scene: Scene) -> None:
+    demo = starter_demo(PLATE)
+    start = recorded_rad(scene)
+    for reason, offsets in {
+        "joint_limit": (0, 0, 0, 0, 0, 0, 3.0),
+        "robot_in_collision": (0, 0.9, 0, 0, 0, 0, 0),
+        "test_posture": HOME_RAD + benchmark_offsets_rad()[99] - start,
+    }.items():
+        with pytest.raises(RefusedError, match=reason):
+            turned(*offsets).apply(scene, demo)
+
+
+def test_the_replay_starts_there(environment: Environment) -> None:
+    """The benchmark's own offsets are lost when it restores a state; these must not be."""
+    demo = starter_demo(PLATE)
+    short = replace(demo, actions=demo.actions[:3])
+    drawn = RobotAxis(levels=(5,)).sample(rng("another"), PLATE, 0)
+    clean, moved = (open_loop(environment, short, "t", ReplayConfig(), changes) for changes in ((), (drawn,)))
+    starts = [recorded_rad(Scene(t.model_xml, t.states[0])) for t in (clean, moved)]
+    assert np.allclose(starts[1] - starts[0], drawn.joint_offsets_rad, rtol=0, atol=1e-9)
+    assert len(moved.states) == len(clean.states)

@@ -1,0 +1,134 @@
+"""Textures: enough of them, distinct, with licence and hash, and none that the test set shows."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import zipfile
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from libero.libero import get_libero_path
+from numpy.typing import NDArray
+
+from pipeline import procedural, textures
+from pipeline.errors import PipelineError
+from pipeline.textures import Folder, Wheel, catalogue, find, pixels, refusal
+
+OFFLINE = catalogue(("libero", "robosuite", "procedural"))
+LIBERO = Path(get_libero_path("assets")) / "textures"
+
+
+def thumbnail(image: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return cv2.resize(image, (32, 32), interpolation=cv2.INTER_AREA).astype(np.float64)
+
+
+def test_there_are_four_hundred_without_a_download() -> None:
+    assert len(OFFLINE) >= 400
+    assert sum(texture.source == "procedural" for texture in OFFLINE.values()) >= 300
+    assert len({texture.sha256 for texture in OFFLINE.values()}) == len(OFFLINE)
+    for name, texture in OFFLINE.items():
+        assert texture.name == name
+        assert texture.licence
+        assert len(texture.sha256) == 64
+
+
+def test_none_looks_like_a_test_image_or_like_another() -> None:
+    # Two encodings of one image differ by up to 2.3 grey levels: light_grey_plaster and light-gray-plaster.
+    images = [texture for texture in OFFLINE.values() if texture.source != "procedural"]
+    made = [OFFLINE[f"procedural:{family}/{index:03d}"] for family in procedural.FAMILIES for index in range(0, 60, 5)]
+    shown = [thumbnail(textures._decode(file.read_bytes(), file)) for file in LIBERO.iterdir()
+             if file.stem in textures.IN_TEST_SET]  # fmt: skip
+    assert len(shown) == len(textures.IN_TEST_SET) == 25
+    seen = [(texture.name, thumbnail(texture.load())) for texture in (*images, *made)]
+    for name, thumb in seen:
+        assert min(np.abs(thumb - other).mean() for other in shown) > 2.5, name
+    for (name, thumb), (other_name, other) in combinations(seen, 2):
+        assert np.abs(thumb - other).mean() > 1.5, f"{name} and {other_name}"
+
+
+@pytest.mark.parametrize("family", procedural.FAMILIES)
+def test_procedural_textures_are_reproducible_and_seamless(family: str) -> None:
+    for index in range(4):
+        image = procedural.texture(family, index)
+        assert image.shape == (512, 512, 3)
+        assert image.dtype == np.uint8
+        assert np.array_equal(image, procedural.texture(family, index))
+        for axis in (0, 1):
+            steps = np.abs(np.diff(image.astype(int), axis=axis)).mean(axis=(1 - axis, 2))
+            seam = np.abs(np.take(image, 0, axis).astype(int) - np.take(image, -1, axis)).mean()
+            assert seam <= 1.2 * steps.max()
+    assert not np.array_equal(procedural.texture(family, 0), procedural.texture(family, 1))
+
+
+def test_test_images_are_refused_by_content_and_name_and_data_maps_by_name() -> None:
+    used = (LIBERO / "light-gray-plaster.png").read_bytes()
+    assert "bytes" in str(refusal("mine.png", hashlib.sha256(used).hexdigest()))
+    assert "name" in str(refusal("folder:somewhere/Gray-Plaster.JPG", "0" * 64))
+    for name in ("Bricks02_NRM_6K.png", "Wood_DISP.png", "metal-roughness.jpg", "CliffDesert006_AO_HIRES.png"):
+        assert "colour" in str(refusal(name, "0" * 64))
+    for name in ("Bricks02_COL_6K.png", "normandy_stone.png", "special-oak.png"):
+        assert refusal(name, "0" * 64) is None
+
+
+def test_a_folder_of_images(tmp_path: Path) -> None:
+    oak = tmp_path / "oak_COL.png"
+    cv2.imwrite(str(oak), np.full((8, 8, 3), (10, 20, 200), np.uint8))
+    offered = catalogue((Folder(folder=tmp_path, licence="CC-BY 4.0 Jane Doe"),))
+    (texture,) = offered.values()
+    assert texture.licence == "CC-BY 4.0 Jane Doe"
+    assert texture.load()[0, 0].tolist() == [200, 20, 10]
+    assert np.array_equal(pixels(texture.name, texture.sha256), texture.load())
+    with pytest.raises(PipelineError, match="has changed"):
+        find(texture.name, "0" * 64)
+    oak.unlink()
+    with pytest.raises(PipelineError, match="oak_COL"):
+        find(texture.name, texture.sha256)
+
+
+@pytest.mark.parametrize("fault", ["copy of a test image", "normal map", "not an image", "empty", "missing"])
+def test_a_folder_with_a_fault_is_an_error_that_names_it(tmp_path: Path, fault: str) -> None:
+    folder = tmp_path / fault
+    if fault != "missing":
+        folder.mkdir()
+    match fault:
+        case "copy of a test image":
+            shutil.copy(LIBERO / "stucco_wall.png", folder / "mine.png")
+        case "normal map":
+            cv2.imwrite(str(folder / "wood_NRM_2K.png"), np.zeros((8, 8, 3), np.uint8))
+        case "not an image":
+            (folder / "mine.png").write_bytes(b"no image")
+    with pytest.raises(PipelineError, match=fault):
+        catalogue((Folder(folder=folder, licence="CC0"),))
+
+
+def test_a_wheel_is_read_where_it_is_checked_and_named_where_it_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(textures, "WHEELS", tmp_path)
+    catalogue.cache_clear()
+    with pytest.raises(PipelineError, match=r"pip download --no-deps .* metaworld==3\.1\.1"):
+        catalogue(("metaworld",))
+    file = tmp_path / "metaworld-3.1.1-py3-none-any.whl"
+    encoded = cv2.imencode(".png", np.full((4, 4, 3), 100, np.uint8))[1].tobytes()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("metaworld/assets/textures/granite.png", encoded)
+        archive.writestr("metaworld/assets/textures/again.png", encoded)
+        archive.writestr("metaworld/assets/textures/tennis.png", b"another")
+    with pytest.raises(PipelineError, match="not the archive"):
+        catalogue(("metaworld",))
+    known = Wheel(file.name, hashlib.sha256(file.read_bytes()).hexdigest(), "MIT", "metaworld==3.1.1")
+    monkeypatch.setitem(textures._WHEELS, "metaworld", known)
+    (texture,) = catalogue(("metaworld",)).values()
+    assert (texture.name, texture.licence) == ("metaworld:textures/again.png", "MIT (metaworld)")
+    assert texture.load().mean() == 100
+    catalogue.cache_clear()
+
+
+def test_an_unknown_texture_is_an_error() -> None:
+    for name in ("procedural:wood/9999", "robosuite:ceramic.png", "elsewhere:x"):
+        with pytest.raises(PipelineError, match=name):
+            find(name, "0" * 64)
