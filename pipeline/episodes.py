@@ -68,8 +68,26 @@ def verdicts(rows: Sequence[plan.Row], trajectories: Path) -> dict[str, Verdict]
     return {trajectory_id: verdict for trajectory_id, verdict in known.items() if verdict is not None}
 
 
-def kept(rows: Sequence[plan.Row], trajectories: Path) -> list[str]:
+def rejected(rows: Sequence[plan.Row], frames: FrameStore) -> dict[str, str]:
+    """Episode id to the reason why one of its streams was not rendered, where that is so."""
+    streams = {trajectory_id: frames.rejected(trajectory_id) for trajectory_id in {row.trajectory_id for row in rows}}
+    reasons: dict[str, str] = {}
+    for row in rows:
+        if of_trajectory := streams[row.trajectory_id]:
+            for stream in streams_of(row.perturbations).values():
+                if stream.stream_id in of_trajectory:
+                    reasons[row.episode_id] = of_trajectory[stream.stream_id]
+    return reasons
+
+
+def outcome(rows: Sequence[plan.Row], data: Path, config: RenderConfig) -> dict[str, Verdict]:
+    """What became of every row of a run whose data lie in ``data``."""
+    frames = FrameStore(data / "frames", config)
+    return plan.select(rows, verdicts(rows, data / "trajectories"), rejected(rows, frames))
+
+
+def kept(rows: Sequence[plan.Row], data: Path, config: RenderConfig) -> list[str]:
     """Ids of the kept episodes, in the order they are written: shuffled, because readers walk shards in order."""
-    outcome = plan.select(rows, verdicts(rows, trajectories))
-    ids = [row.episode_id for row in rows if outcome[row.episode_id].kept]
+    known = outcome(rows, data, config)
+    ids = [row.episode_id for row in rows if known[row.episode_id].kept]
     return sorted(ids, key=lambda episode_id: digest("order", episode_id))

@@ -195,13 +195,23 @@ def pending(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> list[str]:
     return list(wanted)
 
 
-def select(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> dict[str, Verdict]:
-    """What became of every row: kept, dropped with its trajectory's reason, or a reserve that was not needed."""
+def select(
+    rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
+) -> dict[str, Verdict]:
+    """What became of every row: kept, dropped with a reason, or a reserve that was not needed.
+
+    Args:
+        rows: the plan.
+        verdicts: trajectory id to its verdict.
+        rejected: episode id to the reason why its frames were rejected.
+    """
     outcome: dict[str, Verdict] = {}
     for group in _groups(rows):
         need = sum(row.wanted for row in group)
         for row in group:
             verdict = verdicts.get(row.trajectory_id, Verdict(False, "not_replayed"))
+            if rejected and verdict.kept and row.episode_id in rejected:
+                verdict = Verdict(False, rejected[row.episode_id])
             if not need:
                 verdict = Verdict(False, "reserve_not_needed")
             need -= verdict.kept

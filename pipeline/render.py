@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from pipeline import gl
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
+from pipeline.axes.light import exposure
 from pipeline.compute import Run
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.episodes import verdicts
+from pipeline.episodes import rejected, verdicts
 from pipeline.frames import Stream, encode, streams_of, to_policy
 from pipeline.plan import Row, select
 from pipeline.store import FrameStore, Rendered, TrajectoryStore
@@ -118,12 +119,14 @@ class Renderer:
 def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
     """Render the streams of one trajectory: the frame before each executed action.
 
-    Streams that differ in pixel noise alone share the clean frames they are made from.
+    Streams that differ in pixel noise alone share the clean frames they are made from. A perturbed scene whose first
+    frame is black or blown out is not rendered any further.
     """
     variants: dict[str, list[Stream]] = {}
     for stream in streams:
         variants.setdefault(to_json(of_layer(stream.perturbations, RenderPerturbation)), []).append(stream)
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
+    refused: dict[str, str] = {}
     proprioception: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
     steps = len(trajectory.actions)
     renderer = Renderer(trajectory.model_xml)
@@ -136,6 +139,10 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
                 for step in range(steps):
                     renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                     clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
+                    faults = [fault for frame in clean.values() if (fault := exposure(frame))]
+                    if step == 0 and faults and perturbations != "[]":
+                        refused |= {stream.stream_id: faults[0] for stream in members}
+                        break
                     for stream in members:
                         frame = clean[stream.view]
                         for noise in of_layer(stream.perturbations, PixelPerturbation):
@@ -144,7 +151,8 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
     finally:
         renderer.close()
     state, joint_state = (np.stack(column) for column in zip(*proprioception, strict=True))
-    return Rendered(state, joint_state, trajectory.actions.astype(np.float32), encoded)
+    shown = {stream_id: frames for stream_id, frames in encoded.items() if stream_id not in refused}
+    return Rendered(state, joint_state, trajectory.actions.astype(np.float32), shown, refused)
 
 
 def _axis_angle(w: float, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -172,10 +180,14 @@ class RenderJob:
         there = store.streams(self.trajectory_id)
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
         rendered = render(trajectory, [s for s in self.streams if s.stream_id not in there], self.config)
-        earlier = [stream.stream_id for stream in self.streams if stream.stream_id in there]
-        if earlier:
+        refused = store.rejected(self.trajectory_id) if there else {}
+        earlier = [s.stream_id for s in self.streams if s.stream_id in there and s.stream_id not in refused]
+        if there:
+            known = store.load(self.trajectory_id, earlier)
             rendered = replace(
-                rendered, streams={**rendered.streams, **store.load(self.trajectory_id, earlier).streams}
+                rendered,
+                streams={**rendered.streams, **known.streams},
+                rejected={**rendered.rejected, **refused},
             )
         store.save(self.trajectory_id, rendered)
 
@@ -183,25 +195,29 @@ class RenderJob:
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, run: Run) -> set[str]:
     """Render the streams of every kept episode that ``folder`` does not hold yet.
 
+    Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing.
+
     Returns:
         The trajectories that have a file in ``folder`` now.
     """
-    outcome = select(rows, verdicts(rows, trajectories))
-    streams: dict[str, dict[str, Stream]] = {}
-    steps: dict[str, int] = {}
-    for row in rows:
-        if outcome[row.episode_id].kept:
-            shown = streams.setdefault(row.trajectory_id, {})
-            shown |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
-            steps[row.trajectory_id] = row.demo_steps
     store = FrameStore(folder, config.render, GL.device)
-    jobs = [
-        RenderJob(trajectory_id, tuple(shown.values()), trajectories, folder, config.render)
-        for trajectory_id, shown in streams.items()
-        if store.streams(trajectory_id) != set(shown)
-    ]
-    # The longest first, so that no worker is left alone with one at the end.
-    jobs.sort(key=lambda job: -steps[job.trajectory_id] * len(job.streams))
-    if jobs:
+    judged = verdicts(rows, trajectories)
+    steps = {row.trajectory_id: row.demo_steps for row in rows}
+    while True:
+        refused = rejected(rows, store)
+        outcome = select(rows, judged, refused)
+        streams: dict[str, dict[str, Stream]] = {}
+        for row in rows:
+            if outcome[row.episode_id].kept or row.episode_id in refused:
+                shown = streams.setdefault(row.trajectory_id, {})
+                shown |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+        jobs = [
+            RenderJob(trajectory_id, tuple(shown.values()), trajectories, folder, config.render)
+            for trajectory_id, shown in streams.items()
+            if store.streams(trajectory_id) != set(shown)
+        ]
+        if not jobs:
+            return set(streams)
+        # The longest first, so that no worker is left alone with one at the end.
+        jobs.sort(key=lambda job: -steps[job.trajectory_id] * len(job.streams))
         run(RenderJob.__call__, jobs, "render")
-    return set(streams)

@@ -7,6 +7,7 @@ every file that it shares with the plan before it.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -84,12 +85,14 @@ class Rendered:
     Attributes:
         state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
         streams: stream id to K encoded frames.
+        rejected: stream id to the reason why it was not rendered.
     """
 
     state: NDArray[np.float32]
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]
     streams: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
+    rejected: Mapping[str, str] = field(default_factory=dict)
 
 
 class FrameStore:
@@ -118,15 +121,24 @@ class FrameStore:
             for stream, frames in sorted(rendered.streams.items()):
                 file[f"streams/{stream}/bytes"] = np.frombuffer(b"".join(frames), np.uint8)
                 file[f"streams/{stream}/ends"] = np.cumsum([len(frame) for frame in frames])
+            file.attrs["rejected"] = json.dumps(rendered.rejected, sort_keys=True)
 
     def streams(self, trajectory_id: str) -> set[str]:
-        """The streams that are already there; none when the file is missing, damaged or of other versions."""
+        """The streams that are there or were rejected; none when the file is missing, damaged or of other versions."""
         try:
             with _opened(self.path(trajectory_id), self._made_by, "render") as file:
                 same_device = self._device in (None, file.attrs["device"])
-                return set(file["streams"]) if same_device else set()
+                return set(file["streams"]) | set(json.loads(file.attrs["rejected"])) if same_device else set()
         except PipelineError:
             return set()
+
+    def rejected(self, trajectory_id: str) -> dict[str, str]:
+        """Stream id to the reason why it was not rendered; empty when nothing of the trajectory was."""
+        try:
+            with _opened(self.path(trajectory_id), self._made_by, "render") as file:
+                return dict(json.loads(file.attrs["rejected"]))
+        except PipelineError:
+            return {}
 
     def device(self, trajectory_id: str) -> str:
         """What rendered a trajectory, as OpenGL names it."""

@@ -12,7 +12,7 @@ from pipeline.writers import lerobot
 
 def run(config: Config) -> None:
     plan_file = config.data / "plan.parquet"
-    ids = kept(plan.read(plan_file), config.data / "trajectories")
+    ids = kept(plan.read(plan_file), config.data, config.render)
     load = EpisodeLoader(plan_file, config.data / "frames", config.render)
     target = config.export.lerobot
     out = config.data / "lerobot" / target.name

@@ -4,7 +4,7 @@ import json
 
 from pipeline import manifest, plan, stats
 from pipeline.config import Config
-from pipeline.episodes import EpisodeLoader, kept, verdicts
+from pipeline.episodes import EpisodeLoader, kept, outcome, verdicts
 from pipeline.stage import main
 from pipeline.store import FrameStore, TrajectoryStore
 
@@ -14,12 +14,12 @@ def run(config: Config) -> None:
     plan_file, trajectories = data / "plan.parquet", data / "trajectories"
     rows = plan.read(plan_file)
     known = verdicts(rows, trajectories)
-    outcome = plan.select(rows, known)
+    became = outcome(rows, data, config.render)
     store, frames = TrajectoryStore(trajectories), FrameStore(data / "frames", config.render)
-    rendered = {row.trajectory_id for row in rows if outcome[row.episode_id].kept}
+    rendered = {row.trajectory_id for row in rows if became[row.episode_id].kept}
     table = manifest.build(
         rows,
-        outcome=outcome,
+        outcome=became,
         replayed={trajectory_id: store.outcome(trajectory_id) for trajectory_id in known},
         devices={trajectory_id: frames.device(trajectory_id) for trajectory_id in rendered},
         rlds={
@@ -30,7 +30,7 @@ def run(config: Config) -> None:
     manifest.write(table, data / "manifest.parquet")
 
     load = EpisodeLoader(plan_file, data / "frames", config.render)
-    ids = kept(rows, trajectories)
+    ids = kept(rows, data, config.render)
     figures = stats.openvla([load.motion(episode_id) for episode_id in ids])
     (data / "dataset_statistics.json").write_text(json.dumps({config.export.rlds.name: figures}, indent=1) + "\n")
     (data / "counts.json").write_text(json.dumps(manifest.counts(table.to_pylist()), indent=1) + "\n")

@@ -119,6 +119,17 @@ def test_replacements_in_plan_order_until_full_or_exhausted(succeeds: list[bool]
                     assert verdict.reason == expected
 
 
+def test_rejected_frames_are_replaced_from_the_reserve() -> None:
+    rows = plan.make(entries(), config(), REPLAY, NO_TESTS)
+    verdicts = {row.trajectory_id: Verdict(True, "kept") for row in rows}
+    group = sorted((r for r in rows if (r.axis, r.task) == ("camera", TASKS[0].name)), key=lambda row: row.rank)
+    first, reserve = group[0], next(row for row in group if not row.wanted)
+    assert plan.select(rows, verdicts)[reserve.episode_id].reason == "reserve_not_needed"
+    outcome = plan.select(rows, verdicts, {first.episode_id: "too_dark"})
+    assert outcome[first.episode_id] == Verdict(False, "too_dark")
+    assert outcome[reserve.episode_id].kept
+
+
 def test_an_exhausted_axis_is_said_and_planned_as_far_as_it_goes() -> None:
     wanted = config(axes=Axes(language=LanguageAxis()), episodes={"language": 300})
     rows = plan.make(entries(1), wanted, REPLAY, NO_TESTS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -13,12 +14,14 @@ from conftest import MILK, STOVE
 from libero.libero.envs import OffScreenRenderEnv
 
 from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import Stream, decode, encode, streams_of, to_policy
 from pipeline.render import Renderer, render
 from pipeline.seeding import rng
+from pipeline.store import FrameStore
 from pipeline.types import Frame, Task, Trajectory
 
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
@@ -156,3 +159,22 @@ def test_turned_by_half_a_turn() -> None:
     frame = rng("turn").integers(0, 256, (256, 256, 3), np.uint8)
     assert SCHEMA.image_rotation_deg == 180
     assert np.array_equal(to_policy(frame), np.rot90(frame, 2))
+
+
+def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
+    whole: dict[Task, Trajectory], tmp_path: Path
+) -> None:
+    source = whole[MILK]
+    trajectory = replace(source, states=source.states[:9], actions=source.actions[:8])
+    night = LightPerturbation(component="diffuse", level=5, diffuse_scale_rgb=(0.0, 0.0, 0.0))
+    streams = [Stream("image", ()), Stream("image", (night,)), Stream("image", (MOVED,))]
+    # LIBERO's head light keeps frames from being black, so put it out as no draw can.
+    dark = '<visual><headlight diffuse="0 0 0" ambient="0 0 0" specular="0 0 0"/></visual>'
+    unlit = trajectory.model_xml.replace("<worldbody>", f"{dark}<worldbody>", 1)
+    rendered = render(replace(trajectory, model_xml=unlit), streams, RenderConfig())
+    assert rendered.rejected == {streams[1].stream_id: "too_dark"}
+    assert set(rendered.streams) == {streams[0].stream_id, streams[2].stream_id}
+    store = FrameStore(tmp_path, RenderConfig())
+    store.save("t", rendered)
+    assert store.streams("t") == {stream.stream_id for stream in streams}
+    assert store.rejected("t") == rendered.rejected
