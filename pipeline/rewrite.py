@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from bddl.parsing import scan_tokens  # type: ignore[import-untyped]
+from bddl.parsing import scan_tokens
 from pydantic import TypeAdapter, ValidationError
 
 from pipeline.axes.language import CLASSES, MAX_WORDS, MIN_WORDS, Bank, Component, lint, load_bank, normalise

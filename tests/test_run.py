@@ -214,7 +214,7 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path) 
         (("export", "lerobot", "parts"), 3, {"export_lerobot"}),
         (("render", "jpeg_quality"), 90, {"render"}),
         (("compute", "workers"), 5, set()),
-        (("plan", "seed"), 8, {"plan"}),
+        (("plan", "seed"), 8, {"plan", "summary"}),
     ]
     try:
         for keys, value, expected in cases:

@@ -19,6 +19,7 @@ from pipeline.axes.base import (
 )
 from pipeline.axes.camera import CameraAxis, CameraPerturbation
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation
+from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.axes.light import LightAxis, LightPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.axes.pose import PoseAxis, PosePerturbation
@@ -30,11 +31,12 @@ AnyPerturbation = Annotated[
     | BackgroundPerturbation
     | NoisePerturbation
     | LanguagePerturbation
+    | LayoutPerturbation
     | PosePerturbation
     | RobotPerturbation,
     Field(discriminator="axis"),
 ]
-AnyAxis = CameraAxis | LightAxis | BackgroundAxis | NoiseAxis | LanguageAxis | PoseAxis | RobotAxis
+AnyAxis = CameraAxis | LightAxis | BackgroundAxis | NoiseAxis | LanguageAxis | LayoutAxis | PoseAxis | RobotAxis
 
 Layered = TypeVar("Layered", bound=Perturbation)
 
@@ -49,6 +51,7 @@ class Axes(Frozen):
     background: BackgroundAxis | None = None
     noise: NoiseAxis | None = None
     language: LanguageAxis | None = None
+    layout: LayoutAxis | None = None
     pose: PoseAxis | None = None
     robot: RobotAxis | None = None
 

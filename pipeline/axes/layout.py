@@ -1,0 +1,98 @@
+"""Layout, confounding objects: things that the task is not about stand on the working surface. Physics layer."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.axes.base import Axis, Frozen, Nearest, PhysicsPerturbation
+from pipeline.errors import PipelineError
+from pipeline.objects import Source, find, goes_with, models, taken
+from pipeline.types import Demo, Scene, Task
+
+if TYPE_CHECKING:
+    from pipeline.testset import TestSet
+
+
+class AddedObject(Frozen):
+    """An object of ``pipeline.objects``, by name and content."""
+
+    name: str
+    category: str
+    sha256: str
+
+
+class LayoutPerturbation(PhysicsPerturbation):
+    """Objects added to the scene.
+
+    Attributes:
+        objects: which; as many as the level.
+        seed: keys the places that are tried for them. Where they end is in the trajectory's ``resolved``.
+    """
+
+    axis: Literal["layout"] = "layout"
+    component: Literal["objects"] = "objects"
+    objects: Annotated[tuple[AddedObject, ...], Field(min_length=1)]
+    seed: int
+
+    clearance: ClassVar[float] = 1.0
+    measure: ClassVar[str] = "1 where no category is shared with a test task of the same LIBERO task, else 0"
+
+    def apply(self, scene: Scene, demo: Demo) -> Scene:
+        # Drawing a plan must not load the simulator.
+        from pipeline.placement import place
+
+        return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed)
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """By category: infinite where the test tasks on this LIBERO task add nothing of the same category.
+
+        The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
+        """
+        own = {added.category for added in self.objects}
+        tasks = test.on(task, "layout")
+        shared = any(own & set(_plain(other.parameters["category"])) for other in tasks)
+        return Nearest(0.0 if shared else math.inf, len(tasks))
+
+
+class LayoutAxis(Axis):
+    """How many objects, and where from.
+
+    The level is the number of objects, 1 to 5 as in LIBERO-Plus. An object is never of a category that is in the scene
+    already or that the instruction names, nor of one that the test set adds, and no two are of the same category.
+
+    Attributes:
+        sources: ``libero`` and ``robosuite`` are always there; ``sweethome3d`` and ``own`` must be prepared first.
+        area_m2: the most that the objects take up together, each of them at most its share: the more objects, the
+            smaller (0.12 m2 is what the broadest object of all takes up).
+    """
+
+    sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
+    area_m2: float = Field(default=0.12, gt=0.0)
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LayoutPerturbation:
+        level = self.draw_level(rng)
+        there = taken(task)
+        fitting = [model for model in models(self.sources).values() if goes_with(model, there)]
+        chosen: dict[str, AddedObject] = {}
+        for index in rng.permutation(len(fitting)):
+            model = fitting[index]
+            if len(chosen) == level:
+                break
+            if model.category not in chosen and model.shape.footprint_m2 <= self.area_m2 / level:
+                chosen[model.category] = AddedObject(name=model.name, category=model.category, sha256=model.sha256)
+        if len(chosen) < level:
+            raise PipelineError(
+                f"{len(chosen)} categories of objects go with {task.suite}/{task.name}, {level} are wanted",
+                where="plan.axes.layout",
+                remedy="add sources, widen area_m2 or leave out the higher levels",
+            )
+        return LayoutPerturbation(level=level, objects=tuple(chosen.values()), seed=int(rng.integers(2**31)))
+
+
+def _plain(categories: object) -> list[str]:
+    """Category names without the number that some of LIBERO-Plus's end in."""
+    return [name.rpartition("__")[0] or name for name in str(categories).split(",")]

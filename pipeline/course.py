@@ -1,0 +1,77 @@
+"""What a demonstration passes on its way, and what added objects may stand on."""
+
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import PipelineError
+from pipeline.types import Floats
+
+SURFACES = ("table", "study_table", "living_room_table", "floor")
+"""Bodies of LIBERO's arenas that objects stand on; the first that an arena has is its working surface."""
+_RAY_GROUP = 5
+
+
+class Course:
+    """A copy of a model in which the only contacts are those that must not be: an object with anything but a surface.
+
+    Args:
+        model: the scene with the objects; their joints are its last.
+        added: (ngeom,) which geoms are the objects'.
+        path: (K+1, nq) positions of all other joints along the demonstration.
+
+    Raises:
+        PipelineError: when the arena has no surface that is known.
+    """
+
+    def __init__(self, model: mujoco.MjModel, added: NDArray[np.bool_], path: Floats):
+        self._model, self._added, self._path = copy.copy(model), added, path
+        model = self._model
+        there = [
+            number for name in SURFACES if (number := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)) >= 0
+        ]
+        if not there:
+            raise PipelineError(
+                "the scene has no working surface to put objects on", expected=f"a body named {' or '.join(SURFACES)}"
+            )
+        roots = model.body_rootid[model.geom_bodyid]
+        touches = (model.geom_contype | model.geom_conaffinity) != 0
+        stands_on = touches & np.isin(roots, [*there, 0])
+        model.geom_contype[:] = np.where(added, 2, 1) * (touches & ~stands_on)
+        model.geom_conaffinity[:] = np.where(added, 3, 0) * touches
+        for body in range(model.nbody):
+            own = model.geom_bodyid == body
+            model.body_contype[body] = np.bitwise_or.reduce(model.geom_contype[own], initial=0)
+            model.body_conaffinity[body] = np.bitwise_or.reduce(model.geom_conaffinity[own], initial=0)
+        model.geom_group[:] = np.where(touches & (roots == there[0]), _RAY_GROUP, 0)
+        self._data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, self._data)
+
+    def clear(self, poses: Floats, clearance_m: float) -> bool:
+        """Whether nothing comes closer than that to an object, or an object to another, all along the demonstration.
+
+        Args:
+            poses: (N, 7) of the objects.
+        """
+        model, data = self._model, self._data
+        model.geom_margin[self._added] = clearance_m
+        model.body_margin[model.geom_bodyid[self._added]] = clearance_m
+        data.qpos[-poses.size :] = poses.ravel()
+        for positions in self._path:
+            data.qpos[: -poses.size] = positions
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_collision(model, data)
+            if data.ncon:
+                return False
+        return True
+
+    def height(self, at_m: Floats) -> float:
+        """Height (m) of the working surface at (x, y); minus infinity beside it."""
+        above, down = np.array([*at_m, 3.0]), np.array([0.0, 0.0, -1.0])
+        only, hit = np.arange(6) == _RAY_GROUP, np.array([-1], np.int32)
+        distance = mujoco.mj_ray(self._model, self._data, above, down, only.astype(np.uint8), 1, -1, hit)
+        return float(above[2] - distance) if hit[0] >= 0 else -np.inf

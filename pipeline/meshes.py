@@ -1,0 +1,169 @@
+"""A Wavefront OBJ with its materials to a MuJoCo model of one object: what is seen, and a convex hull to touch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import fast_simplification
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.errors import PipelineError
+
+FACES = 6000
+"""Faces that a model may have; LIBERO's own have up to 20,000."""
+_SMALL_PART = 300
+_HULL_VERTICES = 48
+_THINNEST_M = 1e-3
+_TEXTURE_PX = 512
+_SHEET_M = 5e-4
+_OPAQUE = 0.25
+"""Least opacity: glass that lets more through than this is all but invisible in a frame of 256 x 256."""
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The faces of one material.
+
+    Attributes:
+        vertices: (V, 3) metres, z up.
+        faces: (F, 3) indices.
+        uv: (V, 2) where a texture goes with it.
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    uv: NDArray[np.float64] | None
+    rgba: NDArray[np.float64]
+    image: Image.Image | None
+
+
+def convert(
+    obj: Path, out: Path, size_m: tuple[float, float, float] | None = None, turn: NDArray[np.float64] | None = None
+) -> None:
+    """Write ``model.xml``, meshes and textures of an OBJ (y up) into the folder ``out``.
+
+    The model stands on the origin with z up. One convex hull is what it collides with: things that are only stood
+    somewhere and walked around need no more, and a hull is the same on every machine.
+
+    Args:
+        obj: the model; its materials and textures are found beside it.
+        out: an existing folder.
+        size_m: extent along x, depth and height that the model is scaled to; as it is, in metres, when left out.
+        turn: (3, 3) rotation of the model before it is scaled.
+
+    Raises:
+        PipelineError: when it is not a readable OBJ, or too flat or broken for a hull.
+    """
+    try:
+        parts = _parts(obj, size_m, np.eye(3) if turn is None else turn)
+        points = np.concatenate([part.vertices for part in parts])
+        if np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] < _THINNEST_M:
+            raise ValueError("it is flat")
+        hull = trimesh.convex.convex_hull(points)
+    except (ValueError, IndexError, KeyError, OSError, RuntimeError) as error:
+        raise PipelineError(f"cannot be made into an object ({error})", where=obj, expected="a closed OBJ") from error
+    assets, geoms = [], []
+    for number, part in enumerate(parts):
+        name = f"part{number}"
+        _write_obj(out / f"{name}.obj", part.vertices, part.faces, part.uv)
+        colour = quoteattr(" ".join(f"{value:.4g}" for value in part.rgba))
+        texture = ""
+        if part.image is not None and part.uv is not None:
+            _texture(part.image).save(out / f"{name}.png")
+            assets.append(f'<texture name="{name}" type="2d" file="{name}.png"/>')
+            texture = f' texture="{name}"'
+        assets.append(f'<material name="{name}"{texture} rgba={colour} specular="0.3" shininess="0.3"/>')
+        assets.append(f'<mesh name="{name}" file="{name}.obj"/>')
+        geoms.append(
+            f'<geom type="mesh" mesh="{name}" material="{name}" group="1" contype="0" conaffinity="0" mass="0"/>'
+        )
+    _write_obj(out / "hull.obj", np.asarray(hull.vertices), np.asarray(hull.faces), None)
+    assets.append(f'<mesh name="hull" file="hull.obj" maxhullvert="{_HULL_VERTICES}"/>')
+    geoms.append('<geom type="mesh" mesh="hull" group="0"/>')
+    lines = "\n    ".join
+    (out / "model.xml").write_text(
+        f'<mujoco model="object">\n  <asset>\n    {lines(assets)}\n  </asset>\n'
+        f'  <worldbody>\n    <body name="object">\n    {lines(geoms)}\n    </body>\n  </worldbody>\n</mujoco>\n'
+    )
+
+
+def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: NDArray[np.float64]) -> list[_Part]:
+    scene = trimesh.load_scene(obj, process=False)
+    meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    every = np.concatenate([mesh.vertices @ turn.T for mesh in meshes])
+    low, high = every.min(axis=0), every.max(axis=0)
+    scale = np.ones(3)
+    if size_m is not None:
+        width, depth, height = size_m
+        scale = np.array([width, height, depth]) / np.maximum(high - low, 1e-9)
+    foot = np.array([(low[0] + high[0]) / 2, low[1], (low[2] + high[2]) / 2])
+    stand = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    share = min(1.0, FACES / sum(len(mesh.faces) for mesh in meshes))
+    parts = []
+    for mesh in meshes:
+        vertices = (mesh.vertices @ turn.T - foot) * scale @ stand.T
+        faces, material = np.asarray(mesh.faces), getattr(mesh.visual, "material", None)
+        uv = None if (found := getattr(mesh.visual, "uv", None)) is None else np.asarray(found)
+        image = getattr(material, "image", None) if uv is not None else None
+        if share < 1.0:
+            vertices, faces, uv = _simplified(vertices, faces, uv if image is not None else None, share)
+        rgba = np.array([0.7, 0.7, 0.7, 1.0] if material is None else material.main_color / 255.0)
+        if image is not None:
+            rgba[:3] = 1.0
+        rgba[3] = max(rgba[3], _OPAQUE)
+        if len(faces):
+            parts.append(_Part(*_thickened(vertices, faces, uv if image is not None else None), rgba, image))
+    return parts
+
+
+def _simplified(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None, share: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+    """Fewer faces; a small part keeps its own, and so does a textured one, as collapsing edges would smear it."""
+    if uv is not None or len(faces) < _SMALL_PART:
+        return vertices, faces, uv
+    # Faces that share places but not vertices (for normals of their own) would drift apart.
+    merged = trimesh.Trimesh(vertices, faces, process=False)
+    merged.merge_vertices(merge_norm=True, merge_tex=True)
+    fewer, faces_left = fast_simplification.simplify(
+        np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32), target_reduction=1.0 - share
+    )
+    return fewer.astype(np.float64), faces_left.astype(np.int64), None
+
+
+def _thickened(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+    """A flat part with a back; MuJoCo finds no frame for a mesh without volume."""
+    used = vertices[np.unique(faces)]
+    _, extents, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
+    if len(used) > 3 and extents[2] > 1e-3 * extents[1]:
+        return vertices, faces, uv
+    normal = np.cross(*(vertices[faces[0, 1:]] - vertices[faces[0, 0]]))
+    normal = (
+        axes[2] if len(axes) > 2 and np.linalg.norm(normal) < 1e-12 else normal / max(np.linalg.norm(normal), 1e-12)
+    )
+    both = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
+    return np.concatenate([vertices, vertices - _SHEET_M * normal]), both, None if uv is None else np.tile(uv, (2, 1))
+
+
+def _texture(image: Image.Image) -> Image.Image:
+    small = image.convert("RGB")
+    small.thumbnail((_TEXTURE_PX, _TEXTURE_PX))
+    return small
+
+
+def _write_obj(
+    path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None
+) -> None:
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]
+    corner = "{0}" if uv is None else "{0}/{0}"
+    if uv is not None:
+        lines += [f"vt {u:.5f} {v:.5f}" for u, v in uv]
+    lines += ["f " + " ".join(corner.format(index + 1) for index in face) for face in faces]
+    path.write_text("\n".join(lines) + "\n")

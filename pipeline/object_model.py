@@ -1,0 +1,208 @@
+"""One object: a small MJCF model, measured, stood upright and made ready to be put into a scene."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline.errors import PipelineError
+from pipeline.types import Floats
+
+_UPRIGHT = {"z": np.array([1.0, 0.0, 0.0, 0.0]), "y": np.array([1.0, 1.0, 0.0, 0.0]) / np.sqrt(2.0)}
+"""Rotations (w x y z) that bring a model's upward axis to the world's z."""
+_DENSITY = 400.0
+_MASS_KG = (0.05, 0.5)
+# As LIBERO's objects touch the table, and with friction against rolling: a ball comes to rest.
+_CONTACT = {
+    "priority": "1",
+    "friction": "0.95 0.3 0.1",
+    "solref": "0.001 1",
+    "solimp": "0.998 0.998 0.001",
+    "condim": "6",
+}
+
+
+class Shape(NamedTuple):
+    """What a model measures when it stands.
+
+    Attributes:
+        low_m, high_m: (3,) bounds of its collision geometry in its own frame turned upright.
+        volume_m3: of its collision geometry.
+    """
+
+    low_m: tuple[float, ...]
+    high_m: tuple[float, ...]
+    volume_m3: float
+
+    @property
+    def footprint_m2(self) -> float:
+        """Area that it takes up where it stands."""
+        return (self.high_m[0] - self.low_m[0]) * (self.high_m[1] - self.low_m[1])
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """One object.
+
+    Attributes:
+        name: ``<source>/<name>``, unique.
+        category: what an instruction would call it.
+        licence, attribution: for the dataset's card.
+        mjcf: its model, whose files lie in the same folder or below.
+        up: the axis of the model that points up when it stands.
+    """
+
+    name: str
+    source: str
+    category: str
+    licence: str
+    attribution: str
+    mjcf: Path
+    up: str = "z"
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the model and of every file that it uses."""
+        content = hashlib.sha256(self.mjcf.read_bytes())
+        for file in self.files:
+            content.update(file.read_bytes())
+        return content.hexdigest()
+
+    @cached_property
+    def files(self) -> tuple[Path, ...]:
+        """Its meshes and textures."""
+        return tuple(sorted({Path(asset.get("file", "")) for asset in self._assets if asset.get("file")}))
+
+    @cached_property
+    def shape(self) -> Shape:
+        """Measured by compiling its collision geometry alone."""
+        import mujoco
+
+        assets = "".join(ET.tostring(asset, "unicode") for asset in self._assets if asset.tag == "mesh")
+        geoms = "".join(
+            ET.tostring(geom, "unicode") for geom in self._geoms("", (0, 0, 0), 1.0) if not _is_visual(geom)
+        )
+        model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><asset>{assets}</asset><worldbody><body name="object">{geoms}</body></worldbody></mujoco>'
+        )
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        points = np.concatenate([_points(model, data, geom) for geom in range(model.ngeom)])
+        volume = float(model.body("object").mass[0])
+        return Shape(tuple(points.min(axis=0).tolist()), tuple(points.max(axis=0).tolist()), volume)
+
+    def mjcf_of(self, prefix: str) -> tuple[str, str]:
+        """Its assets and its body as MJCF, every name beginning with ``prefix``, every path absolute.
+
+        The body ``prefix`` is free; its frame has z up and its origin in the middle of the underside.
+        """
+        low, high, volume = self.shape
+        density = float(np.clip(_DENSITY * volume, *_MASS_KG)) / volume
+        body = ET.Element("body", name=prefix)
+        ET.SubElement(body, "joint", name=f"{prefix}_joint0", type="free", damping="0.0005")
+        body.extend(self._geoms(prefix, (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]), density))
+        assets = [_renamed(asset, prefix) for asset in self._assets]
+        return "".join(ET.tostring(asset, "unicode") for asset in assets), ET.tostring(body, "unicode")
+
+    @cached_property
+    def _root(self) -> ET.Element:
+        try:
+            root = ET.parse(self.mjcf).getroot()
+        except (OSError, ET.ParseError) as error:
+            raise PipelineError(f"not a readable model ({error})", where=self.mjcf) from error
+        # What would change the meaning of the geoms when they are moved to another model.
+        redirected = any({"meshdir", "texturedir", "assetdir"} & set(found.attrib) for found in root.iter("compiler"))
+        turned = any(found.get("euler", "0 0 0") != "0 0 0" for found in root.iter())
+        if redirected or turned or any(root.find(tag) is not None for tag in ("default", "include", "deformable")):
+            raise PipelineError(
+                "the model uses defaults, includes, asset folders or euler angles",
+                where=self.mjcf,
+                expected="paths relative to the model, quat for rotations, every attribute on its element",
+                remedy="compile it and save it again with mujoco.mj_saveLastXML",
+            )
+        return root
+
+    @cached_property
+    def _assets(self) -> tuple[ET.Element, ...]:
+        """The meshes, materials and textures that its geoms use, with absolute paths."""
+        used = {geom.get(kind) for geom in self._root.iter("geom") for kind in ("mesh", "material")}
+        used |= {found.get("texture") for found in self._root.iter("material") if found.get("name") in used}
+        assets = []
+        for asset in self._root.findall("asset/*"):
+            if asset.get("name") in used:
+                asset = copy.copy(asset)
+                if file := asset.get("file"):
+                    asset.set("file", str((self.mjcf.parent / file).resolve()))
+                assets.append(asset)
+        return tuple(assets)
+
+    def _geoms(self, prefix: str, shift_m: Sequence[float], density: float) -> Iterator[ET.Element]:
+        """Its geoms as those of one body that stands upright, moved by ``shift_m``; what is only seen has no mass."""
+        found = list(_placed(self._root.findall("worldbody/body"), np.array(shift_m, float), _UPRIGHT[self.up]))
+        drawn = any(_is_visual(geom) for geom, _, _ in found)
+        for geom, pos, quat in found:
+            shape = {key: value for key, value in geom.attrib.items() if key in ("type", "mesh", "size")}
+            shape |= {"pos": _numbers(pos), "quat": _numbers(quat)}
+            if not _is_visual(geom):
+                touch = {**shape, **_CONTACT, "density": f"{density:.4f}", "group": "0", "rgba": "0 0 0 0"}
+                yield _renamed(ET.Element("geom", touch), prefix)
+            if _is_visual(geom) or not drawn:
+                look = {key: value for key, value in geom.attrib.items() if key in ("material", "rgba")}
+                seen = {**shape, **look, "contype": "0", "conaffinity": "0", "mass": "0", "group": "1"}
+                yield _renamed(ET.Element("geom", seen), prefix)
+
+
+def _placed(bodies: Iterable[ET.Element], pos: Floats, quat: Floats) -> Iterator[tuple[ET.Element, Floats, Floats]]:
+    """Every geom of the bodies with its pose (position in m, quaternion w x y z) where their parent has the given one.
+
+    Joints are left out, so that everything stands as it is modelled.
+    """
+    import mujoco
+
+    for body in bodies:
+        for child in body.findall("geom") + body.findall("body"):
+            at, turn = pos, quat
+            for element in (body, child) if child.tag == "geom" else (body,):
+                moved, turned = np.zeros(3), np.zeros(4)
+                mujoco.mju_rotVecQuat(moved, np.array(element.get("pos", "0 0 0").split(), float), turn)
+                mujoco.mju_mulQuat(turned, turn, np.array(element.get("quat", "1 0 0 0").split(), float))
+                at, turn = at + moved, turned / np.linalg.norm(turned)
+            if child.tag == "geom":
+                yield child, at, turn
+            else:
+                yield from _placed([child], at, turn)
+
+
+def _numbers(values: Floats) -> str:
+    return " ".join(f"{value:.7g}" for value in values)
+
+
+def _is_visual(geom: ET.Element) -> bool:
+    return geom.get("contype") == "0" and geom.get("conaffinity") == "0"
+
+
+def _renamed(element: ET.Element, prefix: str) -> ET.Element:
+    renamed = ET.Element(element.tag, dict(element.attrib))
+    for key in ("name", "mesh", "material", "texture"):
+        if prefix and key in renamed.attrib:
+            renamed.set(key, f"{prefix}_{renamed.attrib[key]}")
+    return renamed
+
+
+def _points(model: Any, data: Any, geom: int) -> Any:
+    """(N, 3) world points whose bounds are the geom's: a mesh's vertices, else the corners of its own box."""
+    if (mesh := model.geom_dataid[geom]) >= 0:
+        start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+        local = model.mesh_vert[start : start + count]
+    else:
+        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        local = centre + half * np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, 8).T
+    return local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]

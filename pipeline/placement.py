@@ -1,0 +1,275 @@
+"""Where objects can be put into a demonstration's scene without being in its way."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from functools import lru_cache
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import seeding
+from pipeline.axes.base import RefusedError
+from pipeline.course import Course
+from pipeline.environment import Environment
+from pipeline.object_model import ObjectModel
+from pipeline.replay import kept_actions
+from pipeline.types import Demo, Floats, Scene, Task
+
+SCENES, DRAWS = 12, 80
+"""How often a whole scene is begun, and how often one object's place is drawn in it, before giving up."""
+DRAW_CLEARANCE_M, CLEARANCE_M = 0.02, 0.015
+"""What the demonstration's path keeps away from an object: where it is drawn, and where it has come to rest."""
+REACH_M = (0.15, 0.95)
+"""How far in front of the robot's base objects are put, and to its sides as far as the agent view shows."""
+SIDE_M = 0.45
+FRAME = 0.8
+"""Share of the agent view's half width that an object's middle stays within."""
+HIDDEN = 0.05
+"""Most of what is seen of a task's objects that may be hidden."""
+_SETTLE_S, _REST_S = 1.0, 0.25
+_STILL_M, _TILT_DEG, _SLID_M = 2e-4, 15.0, 0.03
+_DISTURBED_M = 1e-3
+_VIEWED_STATES, _VIEWED_POINTS = 6, 60
+
+
+def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int) -> Scene:
+    """Add objects to a scene: at rest on its working surface, in view, clear of the demonstration's path.
+
+    Everything that was in the scene keeps its recorded state exactly. The objects' joints come last: the state is
+    time, the old qpos, the new qpos (7 each), the old qvel, the new qvel (6 each).
+
+    Args:
+        seed: keys the places that are tried.
+
+    Raises:
+        RefusedError: when no place was found; the reason is the one that most places were refused for.
+    """
+    names = [f"layout{number}" for number in range(len(objects))]
+    model_xml = _with(scene.model_xml, objects, names)
+    room = _Room(model_xml, scene.state, path(demo, scene), objects, names, _of_interest(demo.task))
+    rejected: Counter[str] = Counter()
+    for attempt in range(SCENES):
+        poses = room.drawn(seeding.rng(seed, "layout", attempt), rejected)
+        if poses is None:
+            continue
+        settled, fault = room.settled(poses)
+        if fault:
+            rejected[fault] += 1
+            continue
+        nq = room.old_nq
+        state = np.concatenate(
+            [scene.state[: 1 + nq], settled.ravel(), scene.state[1 + nq :], np.zeros(6 * len(names))]
+        )
+        placed = [
+            {"name": model.name, "position_m": pose[:3].tolist(), "quaternion_wxyz": pose[3:].tolist()}
+            for model, pose in zip(objects, settled, strict=True)
+        ]
+        resolved = {"objects": placed, "scenes": attempt + 1, "rejected": dict(sorted(rejected.items()))}
+        return Scene(model_xml, state, {**scene.resolved, "layout": resolved})
+    raise RefusedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
+
+
+def path(demo: Demo, scene: Scene) -> Floats:
+    """(K+1, S) states that the demonstration's actions lead through when nothing is added to the scene."""
+    return _path(demo.task, scene.model_xml, scene.state.tobytes(), demo.actions.tobytes())
+
+
+@lru_cache(maxsize=4)
+def _path(task: Task, model_xml: str, state: bytes, actions: bytes) -> Floats:
+    environment = _environment(task)
+    environment.restore(model_xml, np.frombuffer(state))
+    recorded = np.frombuffer(actions).reshape(-1, 7)
+    states = [environment.state]
+    for action in recorded[kept_actions(recorded, "drop")]:
+        environment.step(action)
+        states.append(environment.state)
+    return np.stack(states)
+
+
+@lru_cache(maxsize=1)
+def _environment(task: Task) -> Environment:
+    return Environment(task)
+
+
+def _with(model_xml: str, objects: Sequence[ObjectModel], names: Sequence[str]) -> str:
+    """The scene's MJCF with the objects' text put in at the ends of its assets and of its bodies."""
+    assets, bodies = zip(*(model.mjcf_of(name) for model, name in zip(objects, names, strict=True)), strict=True)
+    for end, added in (("</asset>", assets), ("</worldbody>", bodies)):
+        before, _, after = model_xml.rpartition(end)
+        model_xml = f"{before}{''.join(added)}{end}{after}"
+    return model_xml
+
+
+def _of_interest(task: Task) -> tuple[str, ...]:
+    """The objects that the task is about, as its BDDL file names them."""
+    found = re.search(r"\(:obj_of_interest([^()]*)\)", task.bddl_file.read_text())
+    return tuple(found[1].split()) if found else ()
+
+
+class _Room:
+    """A scene with objects in it whose places are still open.
+
+    Args:
+        model_xml: the scene with the objects.
+        state: (S,) of the scene without them.
+        states: (K+1, S) that the demonstration leads through.
+        names: the objects' bodies.
+        targets: names of the objects that must stay in sight.
+    """
+
+    def __init__(
+        self,
+        model_xml: str,
+        state: Floats,
+        states: Floats,
+        objects: Sequence[ObjectModel],
+        names: Sequence[str],
+        targets: Sequence[str],
+    ):
+        self._model = mujoco.MjModel.from_xml_string(model_xml)
+        self._data = mujoco.MjData(self._model)
+        self.old_nq = self._model.nq - 7 * len(names)
+        self._old_nv = self._model.nv - 6 * len(names)
+        self._state, self._states, self._objects = state, states, objects
+        self._added = np.isin(self._model.geom_bodyid, [self._model.body(name).id for name in names])
+        self._course = Course(self._model, self._added, states[:, 1 : 1 + self.old_nq])
+        self._parked = np.array([[50.0 + 5 * number, 0.0, 50.0, 1.0, 0.0, 0.0, 0.0] for number in range(len(names))])
+        self._targets = np.array(
+            [
+                any(f"{self._model.body(body).name}_".startswith(f"{target}_") for target in targets)
+                for body in self._model.body_rootid
+            ]
+        )
+        self._base_m = self._model.body("robot0_base").pos.copy()
+        self._put(self._states[0], self._parked)
+        self._eye_m = self._data.cam("agentview").xpos.copy()
+        self._eye_axes = self._data.cam("agentview").xmat.reshape(3, 3).copy()
+        self._eye_slope = np.tan(np.deg2rad(self._model.camera("agentview").fovy[0]) / 2)
+
+    def drawn(self, rng: np.random.Generator, rejected: Counter[str]) -> Floats | None:
+        """(N, 7) a place for each object, the broadest first; None when one finds none."""
+        poses = self._parked.copy()
+        for number in sorted(range(len(poses)), key=lambda number: -self._objects[number].shape.footprint_m2):
+            model = self._objects[number]
+            for _ in range(DRAWS):
+                at = self._base_m[:2] + np.array([rng.uniform(*REACH_M), rng.uniform(-SIDE_M, SIDE_M)])
+                yaw = rng.uniform(-np.pi, np.pi)
+                fault = self._fault_at(poses, number, model, at, yaw)
+                if fault is None:
+                    break
+                rejected[fault] += 1
+            else:
+                return None
+        return poses
+
+    def _fault_at(self, poses: Floats, number: int, model: ObjectModel, at_m: Floats, yaw: float) -> str | None:
+        """Put one object into ``poses`` and say what is wrong with that place."""
+        low, high, _ = model.shape
+        half = (np.array(high) - np.array(low)) / 2
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        corners = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * half[:2] @ turn.T + at_m
+        heights = [self._course.height(corner) for corner in corners]
+        if min(heights) == -np.inf or max(heights) - min(heights) > 1e-3:
+            return "off_the_surface"
+        poses[number] = [*at_m, heights[0] + 0.001, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+        if not self._in_view(poses[number, :3] + [0, 0, half[2]]):
+            fault = "out_of_view"
+        elif not self._course.clear(poses, DRAW_CLEARANCE_M):
+            fault = "in_the_way"
+        elif self._hidden(poses) > HIDDEN:
+            fault = "hides_target"
+        else:
+            return None
+        poses[number] = self._parked[number]
+        return fault
+
+    def settled(self, poses: Floats) -> tuple[Floats, str | None]:
+        """(N, 7) where the objects come to rest while the robot is held, and what is wrong with that."""
+        at_rest, moved = self._simulated(poses, held=False)
+        _, moved_without = self._simulated(self._parked, held=True)
+        # Some demonstrations begin while an object is still falling over: only the difference is the objects' doing.
+        if np.linalg.norm(moved - moved_without, axis=1).max() > _DISTURBED_M:
+            return poses, "moved_another_object"
+        rest, before = at_rest
+        if np.linalg.norm((rest - before)[:, :3], axis=1).max() > _STILL_M:
+            return poses, "not_at_rest"
+        upright = 1 - 2 * (rest[:, 4] ** 2 + rest[:, 5] ** 2)
+        slid = np.linalg.norm((rest - poses)[:, :3], axis=1)
+        if upright.min() < np.cos(np.deg2rad(_TILT_DEG)) or slid.max() > _SLID_M:
+            return poses, "fell_over"
+        rest = np.round(rest, 6) + 0.0  # no -0.0
+        if not self._course.clear(rest, CLEARANCE_M):
+            return poses, "in_the_way"
+        if self._hidden(rest) > HIDDEN:
+            return poses, "hides_target"
+        return rest, None
+
+    def _simulated(self, poses: Floats, held: bool) -> tuple[tuple[Floats, Floats], Floats]:
+        """The objects' poses (N, 7) at the end and ``_REST_S`` before, and where all other bodies are (B, 3)."""
+        self._put(self._state, poses)
+        model, data = self._model, self._data
+        still = [
+            joint
+            for joint in range(model.njnt)
+            if model.joint(joint).name.startswith(("robot0_", "gripper0_"))
+            or (held and model.jnt_qposadr[joint] >= self.old_nq)
+        ]
+        width = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
+        qpos: list[int] = []
+        qvel: list[int] = []
+        for joint in still:
+            positions, velocities = width.get(model.jnt_type[joint], (1, 1))
+            qpos += range(model.jnt_qposadr[joint], model.jnt_qposadr[joint] + positions)
+            qvel += range(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + velocities)
+        start, seen = data.qpos[qpos].copy(), []
+        for seconds in (_SETTLE_S, _REST_S):
+            for _ in range(round(seconds / model.opt.timestep)):
+                mujoco.mj_step(model, data)
+                data.qpos[qpos], data.qvel[qvel] = start, 0.0
+            seen.append(data.qpos[self.old_nq :].reshape(-1, 7).copy())
+        mujoco.mj_kinematics(model, data)
+        others = data.xpos[: model.nbody - len(poses)].copy()
+        return (seen[1], seen[0]), others
+
+    def _put(self, state: Floats, poses: Floats) -> None:
+        mujoco.mj_resetData(self._model, self._data)
+        nq = self.old_nq
+        self._data.qpos[:] = np.concatenate([state[1 : 1 + nq], poses.ravel()])
+        self._data.qvel[: self._old_nv] = state[1 + nq :]
+        mujoco.mj_forward(self._model, self._data)
+
+    def _in_view(self, point_m: Floats) -> bool:
+        x, y, z = (point_m - self._eye_m) @ self._eye_axes
+        return bool(z < 0 and max(abs(x), abs(y)) < -z * self._eye_slope * FRAME)
+
+    def _hidden(self, poses: Floats) -> float:
+        """Largest share of what the agent view shows of the targets that the objects cover, along the demonstration."""
+        worst = 0.0
+        for step in np.linspace(0, len(self._states) - 1, _VIEWED_STATES).round().astype(int):
+            self._put(self._states[step], poses)
+            rays = self._target_points() - self._eye_m
+            hit, distance = np.full(len(rays), -1, np.int32), np.zeros(len(rays))
+            drawn = np.array([0, 1, 0, 0, 0, 0], np.uint8)
+            mujoco.mj_multiRay(
+                self._model, self._data, self._eye_m, rays.ravel(), drawn, 1, -1, hit, distance, len(rays), 1e3
+            )
+            shown = self._targets[self._model.geom_bodyid[hit]] & (hit >= 0)
+            # A distance of 1 is the point itself.
+            covered = self._added[hit] & (hit >= 0) & (distance < 1.0)
+            if covered.any():
+                worst = max(worst, float(covered.sum() / (covered.sum() + shown.sum())))
+        return worst
+
+    def _target_points(self) -> NDArray[np.float64]:
+        """(P, 3) points all over the meshes of the targets."""
+        model, points = self._model, [np.zeros((0, 3))]
+        for geom in np.flatnonzero(self._targets[model.geom_bodyid] & (model.geom_group == 1)):
+            if (mesh := model.geom_dataid[geom]) >= 0:
+                first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+                some = model.mesh_vert[first : first + count : max(1, count // _VIEWED_POINTS)]
+                points.append(some @ self._data.geom_xmat[geom].reshape(3, 3).T + self._data.geom_xpos[geom])
+        return np.concatenate(points)

@@ -1,0 +1,191 @@
+"""Confounding objects: at rest, out of the way, of other categories, and nothing of the scene itself changed."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from conftest import PLATE, STOVE, starter_demo
+
+from pipeline import seeding
+from pipeline.axes.base import RefusedError
+from pipeline.axes.layout import AddedObject, LayoutAxis, LayoutPerturbation
+from pipeline.config import ReplayConfig
+from pipeline.environment import Environment
+from pipeline.errors import PipelineError
+from pipeline.object_model import ObjectModel
+from pipeline.objects import TEST_CATEGORIES, goes_with, models, taken
+from pipeline.placement import CLEARANCE_M, path, place
+from pipeline.replay import open_loop
+from pipeline.tasks import tasks
+from pipeline.testset import TestSet, TestTask
+from pipeline.types import Demo, Scene
+
+SEED = 4
+"""LIBERO's reset under this seed lets the whole demonstration succeed."""
+ROBOT = ("robot0_", "gripper0_")
+
+
+@pytest.fixture(scope="module")
+def environment() -> Environment:
+    return Environment(PLATE)
+
+
+@pytest.fixture(scope="module")
+def demo(environment: Environment) -> Demo:
+    return replace(starter_demo(PLATE), model_xml=environment.place_fixtures(SEED))
+
+
+@pytest.fixture(scope="module")
+def base(demo: Demo) -> Scene:
+    assert demo.model_xml is not None
+    return Scene(demo.model_xml, demo.init_state)
+
+
+@pytest.fixture(scope="module")
+def three() -> LayoutPerturbation:
+    return LayoutAxis(levels=(3,)).sample(seeding.rng(4, "layout"), PLATE, 0)
+
+
+@pytest.fixture(scope="module")
+def changed(three: LayoutPerturbation, base: Scene, demo: Demo) -> Scene:
+    return three.apply(base, demo)
+
+
+def restored(scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = mujoco.MjModel.from_xml_string(scene.model_xml)
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = scene.state[1 : 1 + model.nq], scene.state[1 + model.nq :]
+    mujoco.mj_forward(model, data)
+    return model, data
+
+
+def test_the_same_draw_gives_the_same_scene(three: LayoutPerturbation, base: Scene, demo: Demo, changed: Scene) -> None:
+    again = LayoutPerturbation.model_validate_json(three.model_dump_json()).apply(base, demo)
+    assert again.model_xml == changed.model_xml
+    assert again.state.tobytes() == changed.state.tobytes()
+    assert again.resolved == changed.resolved
+
+
+def test_the_level_is_the_number_of_objects() -> None:
+    for level in (1, 2, 3, 4, 5):
+        drawn = LayoutAxis(levels=(level,)).sample(seeding.rng(level), PLATE, 0)
+        assert (drawn.level, len(drawn.objects), len({added.category for added in drawn.objects})) == (level,) * 3
+
+
+def test_objects_are_of_no_category_of_the_test_set_the_scene_or_the_instruction() -> None:
+    counts: Counter[str] = Counter()
+    for task in (task for suite in ("libero_spatial", "libero_goal", "libero_10") for task in tasks(suite)):
+        for variant in range(3):
+            for added in LayoutAxis().sample(seeding.rng(task.name, variant), task, variant).objects:
+                counts[added.category] += 1
+                assert added.category not in TEST_CATEGORIES | taken(task)
+                assert goes_with(models(("libero", "robosuite"))[added.name], taken(task))
+    assert len(counts) >= 15
+
+
+def test_what_was_there_keeps_its_state_and_its_text_exactly(base: Scene, changed: Scene) -> None:
+    model, _ = restored(changed)
+    nq, nv = model.nq - 21, model.nv - 18
+    np.testing.assert_array_equal(changed.state[: 1 + nq], base.state[: 1 + nq])
+    np.testing.assert_array_equal(changed.state[1 + model.nq : 1 + model.nq + nv], base.state[1 + nq :])
+    np.testing.assert_array_equal(changed.state[1 + model.nq + nv :], 0.0)
+    head, _, tail = base.model_xml.rpartition("</worldbody>")
+    assets, _, bodies = head.rpartition("</asset>")
+    assert changed.model_xml.startswith(assets)
+    assert bodies in changed.model_xml
+    assert changed.model_xml.endswith(tail)
+
+
+def test_nothing_of_the_scene_s_physics_changed(base: Scene, changed: Scene) -> None:
+    before, after = restored(base)[0], restored(changed)[0]
+    for kind, prefix in (("body", "body_"), ("jnt", "jnt_"), ("geom", "geom_"), ("actuator", "actuator_")):
+        for name in dir(before):
+            was = getattr(before, name)
+            if not name.startswith(prefix) or not isinstance(was, np.ndarray) or was.size == 0:
+                continue
+            if "adr" in name or name.endswith(("id", "num")) or (kind == "body" and "subtree" in name):
+                continue  # places in other arrays
+            now = getattr(after, name)
+            if kind == "geom":
+                # By name: the world's own geoms come first in both, then the bodies in the order of the text.
+                now = now[after.geom_bodyid < before.nbody]
+            np.testing.assert_array_equal(now[: len(was)], was, err_msg=name)
+    for name in ("gravity", "timestep", "impratio", "density", "viscosity", "cone", "integrator", "solver"):
+        np.testing.assert_array_equal(getattr(after.opt, name), getattr(before.opt, name), err_msg=name)
+    assert [before.joint(j).name for j in range(before.njnt)] == [after.joint(j).name for j in range(before.njnt)]
+
+
+def test_objects_are_at_rest_on_the_table(changed: Scene) -> None:
+    model, data = restored(changed)
+    start = data.qpos[-21:].reshape(3, 7).copy()
+    held = [joint for joint in range(model.njnt) if model.joint(joint).name.startswith(ROBOT)]
+    robot = data.qpos[model.jnt_qposadr[held]].copy()
+    speeds = []
+    for _ in range(100):
+        mujoco.mj_step(model, data)
+        data.qpos[model.jnt_qposadr[held]], data.qvel[model.jnt_dofadr[held]] = robot, 0.0
+        speeds.append(np.abs(data.qvel[-18:].reshape(3, 6)[:, :3]).max())
+    assert np.median(speeds) < 1e-3
+    assert np.abs(data.qpos[-21:].reshape(3, 7) - start)[:, :3].max() < 2e-4
+    np.testing.assert_allclose(start[:, 2], 0.9, atol=0.003)
+    for place_, recorded in zip(start, changed.resolved["layout"]["objects"], strict=True):
+        assert place_.tolist() == [*recorded["position_m"], *recorded["quaternion_wxyz"]]
+
+
+def test_objects_touch_the_table_only_and_the_demonstration_passes_them_by(
+    base: Scene, demo: Demo, changed: Scene
+) -> None:
+    model, data = restored(changed)
+    added = np.isin(model.geom_bodyid, [model.body(f"layout{number}").id for number in range(3)])
+    table = model.body("table").id
+    model.geom_margin[added] = CLEARANCE_M
+    model.body_margin[model.geom_bodyid[added]] = CLEARANCE_M
+    states, nq = path(demo, base), model.nq - 21
+    assert len(states) > 50
+    for state in states:
+        data.qpos[:nq] = state[1 : 1 + nq]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_collision(model, data)
+        for contact in data.contact:
+            one, other = contact.geom
+            if added[one] != added[other]:
+                assert model.geom_bodyid[other if added[one] else one] == table
+
+
+def test_the_demonstration_still_succeeds_among_the_objects(
+    environment: Environment, demo: Demo, three: LayoutPerturbation
+) -> None:
+    trajectory = open_loop(environment, demo, "layout", ReplayConfig(), (three,))
+    assert trajectory.verdict.kept, trajectory.verdict.reason
+    assert np.abs(trajectory.states[-1, -18:]).max() < 0.05, "nothing was knocked over"
+
+
+def test_impossible_wishes_are_refused_with_their_reason(tmp_path: Path, base: Scene, demo: Demo) -> None:
+    file = tmp_path / "crate.xml"
+    file.write_text('<mujoco><worldbody><body><geom type="box" size=".25 .25 .25"/></body></worldbody></mujoco>')
+    crate = ObjectModel("own/crate", "own", "crate", "", "", file)
+    with pytest.raises(RefusedError) as refused:
+        place(base, demo, [crate] * 5, seed=0)
+    assert refused.value.reason in ("layout_in_the_way", "layout_out_of_view", "layout_off_the_surface")
+
+
+def test_an_object_that_is_another_now_is_refused(three: LayoutPerturbation, base: Scene, demo: Demo) -> None:
+    stale = AddedObject(name=three.objects[0].name, category="x", sha256="0" * 64)
+    with pytest.raises(PipelineError, match="not the one that was planned with"):
+        LayoutPerturbation(level=1, objects=(stale,), seed=0).apply(base, demo)
+
+
+def test_distance_to_the_test_set_is_by_category_on_the_same_task(three: LayoutPerturbation) -> None:
+    def test_task(base: str, category: str) -> TestTask:
+        return TestTask("libero_goal", base, f"{base}_add_1", "layout", "objects", {"category": category})
+
+    test = TestSet((test_task(PLATE.name, "canned_food__1,can_of_sardines"), test_task(STOVE.name, "bag_of_yeast")))
+    assert three.nearest(test, PLATE) == (float("inf"), 1)
+    same = AddedObject(name="own/x", category="canned_food", sha256="")
+    nearest = three.model_copy(update={"objects": (*three.objects, same)}).nearest(test, PLATE)
+    assert nearest.distance < LayoutPerturbation.clearance
