@@ -15,6 +15,7 @@ from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.fetch import fetch
 from pipeline.files import replaced
+from pipeline.object_sources import prepare_objects
 from pipeline.rewrite import extend
 from pipeline.tasks import SUITES, select_tasks
 
@@ -52,6 +53,11 @@ def _preview(arguments: argparse.Namespace) -> int:
 def _rewrite(arguments: argparse.Namespace) -> int:
     extend(arguments.bddl_file, arguments.out, arguments.per_class, Chat(arguments.endpoint, arguments.model))
     print(f"{arguments.out} holds {arguments.per_class} rewrites of each class for {arguments.bddl_file.stem}")
+    return 0
+
+
+def _objects(arguments: argparse.Namespace) -> int:
+    print(f"{prepare_objects(own=arguments.own)} models are ready")
     return 0
 
 
@@ -131,6 +137,13 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--model", required=True, metavar="NAME", help="name of the model at the endpoint")
     command.set_defaults(run=_rewrite)
+
+    command = commands.add_parser(
+        "objects",
+        help="fetch and convert further object models for the layout axis (Debian's sweethome3d-furniture, 120 MB)",
+    )
+    command.add_argument("--own", type=Path, metavar="FOLDER", help="models of your own: <category>/<name>.obj or .xml")
+    command.set_defaults(run=_objects)
 
     command = commands.add_parser("schema", help="write schemas/config.schema.json from the code")
     command.set_defaults(run=_schema)
