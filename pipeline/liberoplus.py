@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline import bddl
+from pipeline.bddl import Bddl
 from pipeline.errors import PipelineError
 from pipeline.tasks import tasks
 
@@ -25,7 +27,7 @@ _NAME = re.compile(
     r"|_table_(?P<surface>\d+)|_tb_(?P<theme>\d+)|_light_(?P<light>\d+)|_add_(?P<layout>\d+)"
     r"|(?:_moved)?_level(?P<level>\d)_sample(?P<sample>\d))"
 )
-_LIGHT = re.compile(r".*_([a-z]+)_light_sync_modified_(\d+)", re.IGNORECASE)
+_LIGHT = re.compile(r".*_([a-z]+)_light_sync_modified_(\d+)")
 _SCENE_FILE = re.compile(r".*_table_(?P<surface>.+?)(?:_bg_(?P<wall>.+))?\.xml")
 _NOISE = {
     "motion": ("motion_blur", ("radius_px", "sigma_px")),
@@ -96,39 +98,40 @@ class Reader:
             parameters = {"severity": severity + 1, **self._severities[component][severity]}
             return Change(base.name, "noise", component, parameters)
         if number := match["language"]:
-            text = self._bddl(suite, f"{base.name}_language_{number}").language
+            text = self._scene(suite, f"{base.name}_language_{number}").language
             return Change(base.name, "language", "rewrite", {"text": text})
         if (number := match["robot"]) and int(number):
             return Change(base.name, "robot", "initial_joints", {"id": int(number)})
         if view := match["view"]:
             return Change(base.name, "camera", *_camera(*map(int, view.split("_"))))
-        bddl = self._bddl(suite, name)
-        if light := _LIGHT.fullmatch(bddl.problem):
-            return Change(base.name, "light", "unknown", {"prefix": light[1].lower(), "number": int(light[2])})
+        scene = self._scene(suite, name)
+        if light := _LIGHT.fullmatch(scene.problem):
+            return Change(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
         if match["layout"]:
-            return Change(base.name, "layout", "objects", bddl.added())
+            return Change(base.name, "layout", "objects", _added(scene))
         if match["level"]:
-            moved = bddl.target_displacement(_Bddl(base.bddl_file.read_text()))
+            moved = _displacement(scene, bddl.read(base.bddl_file))
             drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
             return Change(base.name, "pose", "pose", {**drawn, **moved})
         component = "theme" if match["theme"] else "surface"
-        return Change(base.name, "background", component, self._textures(bddl, component == "theme"))
+        return Change(base.name, "background", component, self._textures(scene, component == "theme"))
 
-    def _bddl(self, suite: str, name: str) -> _Bddl:
-        return _Bddl(self._text(f"bddl_files/{suite}/{name}.bddl"))
+    def _scene(self, suite: str, name: str) -> Bddl:
+        file = f"bddl_files/{suite}/{name}.bddl"
+        return bddl.parse(self._text(file), file)
 
-    def _textures(self, bddl: _Bddl, theme: bool) -> dict[str, Value]:
+    def _textures(self, scene: Bddl, theme: bool) -> dict[str, Value]:
         """Image files by what they cover: the working surface, and in a theme the wall too.
 
         Tables get their image from a scene file that is named after it. In the floor arena the working surface is
         the floor itself. What ``wall`` covers in the kitchen and the living room only their scene files could tell.
         """
-        settings = self._classes[bddl.problem.lower()]
-        if scene := _SCENE_FILE.fullmatch(settings.get("scene_xml", "")):
-            surface, wall = f"{scene['surface']}.png", scene["wall"] and f"{scene['wall']}.png"
+        settings = self._classes[scene.problem]
+        if file := _SCENE_FILE.fullmatch(settings.get("scene_xml", "")):
+            surface, wall = f"{file['surface']}.png", file["wall"] and f"{file['wall']}.png"
         else:
             surface, wall = self._floors[settings["floor_style"]], None
-        files: dict[str, Value] = {"arena": bddl.arena, "surface": surface}
+        files: dict[str, Value] = {"arena": _arena(scene.problem), "surface": surface}
         return files | {"wall": wall or self._walls[settings["wall_style"]]} if theme else files
 
 
@@ -159,74 +162,47 @@ def _row(element: ast.expr) -> tuple[float, ...]:
     return row if isinstance(row, tuple) else (row,)
 
 
-class _Bddl:
-    """What a BDDL file says of the instruction, of the scene and of where things start.
-
-    Attributes:
-        problem: name of the class that builds the scene.
-        language: the instruction, in lower case as the benchmark reads it.
-        regions: ``<target>_<region>`` to its centre (x, y) in metres, in the frame of the working surface.
-        objects: movable object to category.
-        places: object or fixture to the region or thing that it starts on or in.
-        targets: the movable objects that the goal says where to put.
-    """
-
-    def __init__(self, text: str):
-        self.problem = _first(r"\(define \(problem (\w+)\)", text)
-        self.language = " ".join(_first(r"\(:language ([^()]*)\)", text).lower().split())
-        ranges = re.findall(r"\((\w+)\s*\(:target (\w+)\)\s*\(:ranges \(\s*\(([^()]*)\)", text)
-        corners = {f"{target}_{name}": [float(n) for n in numbers.split()] for name, target, numbers in ranges}
-        self.regions = {name: ((x0 + x1) / 2, (y0 + y1) / 2) for name, (x0, y0, x1, y1) in corners.items()}
-        listed = re.findall(r"([\w \t]+?) - (\w+)", _first(r"\(:objects([^()]*)\)", text))
-        self.objects: dict[str, str] = {name: category for names, category in listed for name in names.split()}
-        start = text[text.index("(:init") : text.index("(:goal")]
-        self.places = dict(re.findall(r"\((?:On|In) (\w+) (\w+)\)", start, flags=re.IGNORECASE))
-        wanted = re.findall(r"\((?:On|In) (\w+) \w+\)", text[text.index("(:goal") :], flags=re.IGNORECASE)
-        self.targets = [name for name in dict.fromkeys(wanted) if name in self.objects]
-
-    @property
-    def arena(self) -> str:
-        """``tabletop``, ``kitchen``, ``living_room``, ``study`` or ``floor``."""
-        name = _first(r"libero_(\w+?)_manipulation", self.problem.lower())
-        return name if name in ("tabletop", "floor") else name.removesuffix("_tabletop")
-
-    def added(self) -> dict[str, Value]:
-        """The objects that were added to a scene: categories, and positions (x, y) in metres in the same order."""
-        added = {name: place for name, place in self.places.items() if "_add_object_region_" in place}
-        positions = [self.regions[place] for place in added.values()]
-        return {
-            "arena": self.arena,
-            "count": len(added),
-            "category": ",".join(self.objects[name] for name in added),
-            "positions": ";".join(f"{x:.4g},{y:.4g}" for x, y in positions),
-        }
-
-    def target_displacement(self, original: _Bddl) -> dict[str, Value]:
-        """How far the objects that are to be moved start off their original places; empty without any.
-
-        The first is the ``target``; ``others`` lists the rest as ``name:dx,dy`` in metres.
-        """
-        moved = []
-        for name in self.targets:
-            here, there = self._centre(name), original._centre(name)
-            if here and there:
-                moved.append((name, round(here[0] - there[0], 6), round(here[1] - there[1], 6)))
-        if not moved:
-            return {}
-        (target, dx_m, dy_m), *rest = moved
-        others = ";".join(f"{name}:{dx:.6g},{dy:.6g}" for name, dx, dy in rest)
-        return {"target": target, "dx_m": dx_m, "dy_m": dy_m, **({"others": others} if others else {})}
-
-    def _centre(self, thing: str) -> tuple[float, float] | None:
-        """Centre of the region that something starts in, or else of that of what it starts on."""
-        place = self.places.get(thing)
-        if place is None or place in self.regions:
-            return self.regions.get(place or "")
-        return next((self._centre(host) for host in self.places if host != thing and place.startswith(host)), None)
-
-
-def _first(pattern: str, text: str) -> str:
-    found = re.search(pattern, text)
+def _arena(problem: str) -> str:
+    """``tabletop``, ``kitchen``, ``living_room``, ``study`` or ``floor``, from the name of a scene's class."""
+    found = re.search(r"libero_(\w+?)_manipulation", problem)
     if found is None:
-        raise PipelineError(f"a BDDL file has nothing of the form {pattern}")
-    return found[1]
+        raise PipelineError(f"the scene class {problem!r} names no arena", expected="libero_<arena>_manipulation")
+    return found[1] if found[1] in ("tabletop", "floor") else found[1].removesuffix("_tabletop")
+
+
+def _added(scene: Bddl) -> dict[str, Value]:
+    """The objects that were added to a scene: categories, and positions (x, y) in metres in the same order."""
+    added = {name: place for name, place in scene.places.items() if "_add_object_region_" in place}
+    positions = [scene.regions[place] for place in added.values()]
+    return {
+        "arena": _arena(scene.problem),
+        "count": len(added),
+        "category": ",".join(scene.objects[name] for name in added),
+        "positions": ";".join(f"{x:.4g},{y:.4g}" for x, y in positions),
+    }
+
+
+def _displacement(scene: Bddl, original: Bddl) -> dict[str, Value]:
+    """How far the objects that are to be moved start off their original places; empty without any.
+
+    The first is the ``target``; ``others`` lists the rest as ``name:dx,dy`` in metres.
+    """
+    moved = []
+    for name in scene.targets:
+        here, there = _centre(name, scene), _centre(name, original)
+        if here and there:
+            moved.append((name, round(here[0] - there[0], 6), round(here[1] - there[1], 6)))
+    if not moved:
+        return {}
+    (target, dx_m, dy_m), *rest = moved
+    others = ";".join(f"{name}:{dx:.6g},{dy:.6g}" for name, dx, dy in rest)
+    return {"target": target, "dx_m": dx_m, "dy_m": dy_m, **({"others": others} if others else {})}
+
+
+def _centre(thing: str, scene: Bddl) -> tuple[float, float] | None:
+    """Centre of the region that something starts in, or else of that of what it starts on."""
+    places = scene.places
+    place = places.get(thing)
+    if place is None or place in scene.regions:
+        return scene.regions.get(place or "")
+    return next((_centre(host, scene) for host in places if host != thing and place.startswith(host)), None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
@@ -11,10 +10,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import seeding
+from pipeline import bddl, seeding
 from pipeline.axes.base import RefusedError
 from pipeline.course import Course
-from pipeline.environment import Environment
+from pipeline.environment import shared
 from pipeline.object_model import ObjectModel
 from pipeline.replay import kept_actions
 from pipeline.types import Demo, Floats, Scene, Task
@@ -50,7 +49,7 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int) -
     """
     names = [f"layout{number}" for number in range(len(objects))]
     model_xml = _with(scene.model_xml, objects, names)
-    room = _Room(model_xml, scene.state, path(demo, scene), objects, names, _of_interest(demo.task))
+    room = _Room(model_xml, scene.state, path(demo, scene), objects, names, bddl.read(demo.task.bddl_file).of_interest)
     rejected: Counter[str] = Counter()
     for attempt in range(SCENES):
         poses = room.drawn(seeding.rng(seed, "layout", attempt), rejected)
@@ -80,7 +79,7 @@ def path(demo: Demo, scene: Scene) -> Floats:
 
 @lru_cache(maxsize=4)
 def _path(task: Task, model_xml: str, state: bytes, actions: bytes) -> Floats:
-    environment = _environment(task)
+    environment = shared(task)
     environment.restore(model_xml, np.frombuffer(state))
     recorded = np.frombuffer(actions).reshape(-1, 7)
     states = [environment.state]
@@ -90,11 +89,6 @@ def _path(task: Task, model_xml: str, state: bytes, actions: bytes) -> Floats:
     return np.stack(states)
 
 
-@lru_cache(maxsize=1)
-def _environment(task: Task) -> Environment:
-    return Environment(task)
-
-
 def _with(model_xml: str, objects: Sequence[ObjectModel], names: Sequence[str]) -> str:
     """The scene's MJCF with the objects' text put in at the ends of its assets and of its bodies."""
     assets, bodies = zip(*(model.mjcf_of(name) for model, name in zip(objects, names, strict=True)), strict=True)
@@ -102,12 +96,6 @@ def _with(model_xml: str, objects: Sequence[ObjectModel], names: Sequence[str]) 
         before, _, after = model_xml.rpartition(end)
         model_xml = f"{before}{''.join(added)}{end}{after}"
     return model_xml
-
-
-def _of_interest(task: Task) -> tuple[str, ...]:
-    """The objects that the task is about, as its BDDL file names them."""
-    found = re.search(r"\(:obj_of_interest([^()]*)\)", task.bddl_file.read_text())
-    return tuple(found[1].split()) if found else ()
 
 
 class _Room:

@@ -1,0 +1,139 @@
+"""What a BDDL file says of a task: its instruction, what is in its scene, where things start and what is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from bddl.parsing import scan_tokens
+
+from pipeline.errors import PipelineError
+
+Fact = tuple[str, ...]
+"""A predicate and what it is said of, such as ``("on", "plate_1", "main_table_plate_region")``."""
+
+
+@dataclass(frozen=True)
+class Bddl:
+    """A task as its file defines it; all names in lower case, as LIBERO reads them.
+
+    Attributes:
+        problem: name of the class that builds the scene.
+        language: the instruction.
+        regions: ``<target>_<region>`` to the centre (x, y) of its range in m, in the frame of the target; a region
+            that its target defines itself, such as a drawer, is not among them.
+        objects: movable object to category.
+        fixtures: thing that stays where it is, such as a table or a stove, to category.
+        of_interest: the objects and fixtures that the task is about.
+        start: what holds at first.
+        goal: what must hold in the end, all of it.
+    """
+
+    problem: str
+    language: str
+    regions: Mapping[str, tuple[float, float]]
+    objects: Mapping[str, str]
+    fixtures: Mapping[str, str]
+    of_interest: tuple[str, ...]
+    start: tuple[Fact, ...]
+    goal: tuple[Fact, ...]
+
+    @property
+    def places(self) -> dict[str, str]:
+        """Object or fixture to the region or thing that it starts on or in."""
+        return {fact[1]: fact[2] for fact in self.start if fact[0] in ("on", "in")}
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """The movable objects that the goal puts somewhere, none twice."""
+        put = (fact[1] for fact in self.goal if fact[0] in ("on", "in"))
+        return tuple(name for name in dict.fromkeys(put) if name in self.objects)
+
+    @property
+    def receptacles(self) -> tuple[str, ...]:
+        """The movable objects that the goal puts others on or in, none twice; basket_1 for basket_1_contain_region."""
+        places = [fact[2] for fact in self.goal if fact[0] in ("on", "in")]
+        return tuple(name for name in self.objects if any(f"{place}_".startswith(f"{name}_") for place in places))
+
+
+@cache
+def read(path: Path) -> Bddl:
+    """Read a task's file, once a process.
+
+    Raises:
+        PipelineError: when it cannot be read or does not define a task.
+    """
+    try:
+        return parse(path.read_text(), path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise PipelineError(f"cannot be read ({error})", where=path, expected="a BDDL file") from error
+
+
+def parse(text: str, where: object) -> Bddl:
+    """Read a definition.
+
+    Args:
+        text: of a BDDL file.
+        where: what an error names.
+
+    Raises:
+        PipelineError: when it does not define a task.
+    """
+    expected = "a BDDL problem with :language, :objects, :init and :goal"
+    try:
+        _, (_, problem), *rest = scan_tokens(string=text)
+        sections: dict[str, Any] = {name: content for name, *content in rest}
+        return Bddl(
+            problem=problem,
+            language=" ".join(sections[":language"]),
+            regions=dict(_regions(sections.get(":regions", []))),
+            objects=_declared(sections[":objects"]),
+            fixtures=_declared(sections.get(":fixtures", [])),
+            of_interest=tuple(sections.get(":obj_of_interest", [])),
+            start=tuple(map(_fact, sections[":init"])),
+            goal=tuple(map(_fact, _conjuncts(*sections[":goal"]))),
+        )
+    except KeyError as error:
+        raise PipelineError(f"has no {error.args[0]}", where=where, expected=expected) from error
+    except Exception as error:  # the tokeniser raises nothing more specific
+        raise PipelineError(f"not a BDDL file ({error})", where=where, expected=expected) from error
+
+
+def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:
+    """Name and centre of each of a list of ``[name, [":target", thing], [":ranges", [[x0, y0, x1, y1], ...]], ...]``;
+    of several ranges the first counts."""
+    found = []
+    for name, *fields in listed:
+        said = {field: content for field, *content in fields}
+        if ":ranges" in said:
+            x0, y0, x1, y1 = map(float, said[":ranges"][0][0])
+            found.append((f"{said[':target'][0]}_{name}", ((x0 + x1) / 2, (y0 + y1) / 2)))
+    return found
+
+
+def _declared(listed: list[str]) -> dict[str, str]:
+    """Name to category, of ``a_1 a_2 - kind b_1 - other``."""
+    categories: dict[str, str] = {}
+    names: list[str] = []
+    words = iter(listed)
+    for word in words:
+        if word == "-":
+            category = next(words)
+            categories |= dict.fromkeys(names, category)
+            names = []
+        else:
+            names.append(word)
+    return categories
+
+
+def _conjuncts(goal: list[Any]) -> list[Any]:
+    return goal[1:] if goal[0] == "and" else [goal]
+
+
+def _fact(expression: Any) -> Fact:
+    if not all(isinstance(word, str) for word in expression):
+        raise ValueError(f"{expression} is not a plain fact")
+    return tuple(expression)
