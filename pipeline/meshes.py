@@ -14,6 +14,9 @@ from PIL import Image
 
 from pipeline.errors import PipelineError
 
+RECIPE = 1
+"""Raise it whenever a change here changes what comes out: what was converted before is then converted again."""
+
 FACES = 6000
 """Faces that a model may have; LIBERO's own have up to 20,000."""
 _SMALL_PART = 300

@@ -61,7 +61,6 @@ class ObjectModel:
     """
 
     name: str
-    source: str
     category: str
     licence: str
     attribution: str
@@ -83,16 +82,25 @@ class ObjectModel:
 
     @cached_property
     def shape(self) -> Shape:
-        """Measured by compiling its collision geometry alone."""
+        """Measured by compiling its collision geometry alone.
+
+        Raises:
+            PipelineError: when there is none, or it is broken.
+        """
         import mujoco
 
         assets = "".join(ET.tostring(asset, "unicode") for asset in self._assets if asset.tag == "mesh")
         geoms = "".join(
             ET.tostring(geom, "unicode") for geom in self._geoms("", (0, 0, 0), 1.0) if not _is_visual(geom)
         )
-        model = mujoco.MjModel.from_xml_string(
-            f'<mujoco><asset>{assets}</asset><worldbody><body name="object">{geoms}</body></worldbody></mujoco>'
-        )
+        try:
+            model = mujoco.MjModel.from_xml_string(
+                f'<mujoco><asset>{assets}</asset><worldbody><body name="object">{geoms}</body></worldbody></mujoco>'
+            )
+        except ValueError as error:
+            raise PipelineError(f"MuJoCo cannot use the model ({error})", where=self.mjcf) from error
+        if not model.ngeom:
+            raise PipelineError("the model has nothing to touch", where=self.mjcf, expected="a geom that can collide")
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         points = np.concatenate([_points(model, data, geom) for geom in range(model.ngeom)])

@@ -1,154 +1,191 @@
-"""Objects made ready once: Debian's furniture models and a user's own, converted into ``pipeline.objects.FOLDER``."""
+"""What the sources of object models offer.
+
+``libero`` and ``robosuite`` are installed with the pipeline. ``sweethome3d`` (Debian's package of furniture models, CC0
+and CC-BY) and a :class:`Folder` of the user's are converted into ``FOLDER`` when they are first asked for. What is
+there stays as it is until its origin or the conversion changes, so a conversion that was cut short goes on.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import io
+import fcntl
 import json
 import re
 import shutil
-import subprocess
-import tarfile
 import tempfile
 import xml.etree.ElementTree as ET
-import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from hashlib import sha256
 from pathlib import Path
+from typing import Any, Literal
 
-import numpy as np
+import yaml
+from libero.libero import get_libero_path
+from rich.console import Console
+from rich.progress import track
 
+from pipeline import sweethome3d
+from pipeline.assets import package_folder
 from pipeline.errors import PipelineError
-from pipeline.files import keep_only, replaced
-from pipeline.meshes import convert
-from pipeline.objects import FOLDER, catalogue, models
+from pipeline.files import replaced
+from pipeline.meshes import RECIPE, convert
+from pipeline.object_model import ObjectModel
+from pipeline.seeding import digest
+from pipeline.sources import Folder
+from pipeline.sweethome3d import Piece
 
-PACKAGE = "sweethome3d-furniture"
-DEB = f"{PACKAGE}_1.8-1_all.deb"
-SHA256 = "3ccb90c63f9525e887a767b9cd5c8b6933b8b6b2973a615a5359ee68a2118668"
-LICENCES = {
-    "BlendSwap-CC-0": "CC0-1.0",
-    "BlendSwap-CC-BY": "CC-BY-3.0",
-    "KatorLegaz": "CC-BY-3.0-US",
-    "Scopia": "CC-BY-3.0",
-}
-"""As the package's copyright file has them."""
+Package = Literal["libero", "robosuite", "sweethome3d"]
+Source = Package | Folder
 
-Say = Callable[[str], None]
+FOLDER = Path("data/objects")
+"""Where converted models lie, one folder each: ``<source>/<name>/model.xml`` and ``about.json``."""
+CATALOGUE = Path(__file__).parent / "axes" / "layout_objects.yaml"
+
+LARGEST_M = 0.5
+"""What a user's model may measure in any direction: a larger one is not in metres, or of no use on a table."""
 
 
-def prepare_objects(folder: Path = FOLDER, own: Path | None = None, say: Say = print) -> int:
-    """Convert the models of ``sweethome3d`` that the catalogue names, and those of a folder of one's own.
-
-    Args:
-        folder: where converted models go; the package is looked for there, and fetched when it is missing (120 MB).
-        own: ``<own>/<category>/<name>.obj`` (y up, metres) or ``.xml`` (MJCF, z up); ``<own>/LICENSE`` is kept in mind.
-
-    Returns:
-        How many models there are now, of both sources.
+def offered(source: Source) -> Iterator[ObjectModel]:
+    """Every object of a source; what is not installed is fetched and converted first.
 
     Raises:
-        PipelineError: when the package cannot be had or is another, or a model cannot be converted.
+        PipelineError: when the source cannot be had, or a model cannot be converted.
     """
-    made = prepare_sweethome3d(fetch_deb(folder), folder / "sweethome3d", say)
-    if own is not None:
-        made += prepare_own(own, folder / "own", say)
-    models.cache_clear()
-    return made
+    match source:
+        case "libero":
+            assets = Path(get_libero_path("assets")).resolve()
+            for category, members in catalogue()["libero"].items():
+                for member, up in members.items():
+                    stem = member.rpartition("/")[2]
+                    mjcf = assets / member / f"{stem}.xml"
+                    if mjcf.is_file():  # upstream LIBERO lacks LIBERO-PRO's additions
+                        yield ObjectModel(f"libero/{stem}", category, "MIT", "LIBERO, LIBERO-PRO", mjcf, up)
+        case "robosuite":
+            folder = package_folder("robosuite") / "models" / "assets" / "objects"
+            for category, members in catalogue()["robosuite"].items():
+                for stem, up in members.items():
+                    mjcf = folder / f"{stem}.xml"
+                    yield ObjectModel(f"robosuite/{stem}", category, "MIT", "robosuite", mjcf, up)
+        case "sweethome3d":
+            yield from _sweethome3d()
+        case Folder():
+            yield from _own(source)
 
 
-def fetch_deb(folder: Path) -> Path:
-    """The Debian package, from ``folder`` or the machine's Debian mirror."""
-    deb = folder / DEB
-    if not deb.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            try:
-                command = ["apt-get", "download", f"{PACKAGE}=1.8-1"]
-                subprocess.run(command, cwd=scratch, check=True, capture_output=True, text=True)
-                (Path(scratch) / DEB).rename(deb)
-            except (OSError, subprocess.CalledProcessError) as error:
-                reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1]
-                raise PipelineError(
-                    f"Debian's {PACKAGE} could not be downloaded ({reason})",
-                    where=deb,
-                    remedy=f"put {DEB} of Debian 12 there; or leave sweethome3d out of plan.axes.layout.sources: "
-                    "libero, robosuite and own work without it",
-                ) from error
-    found = hashlib.sha256(deb.read_bytes()).hexdigest()
-    if found != SHA256:
+def converted(name: str) -> ObjectModel:
+    """The model that a conversion left under that name; nothing is fetched or converted.
+
+    Raises:
+        PipelineError: when there is none.
+    """
+    about = _about(name)
+    if about is None:
         raise PipelineError(
-            f"not the package that the catalogue was made for: its SHA-256 is {found}",
-            where=deb,
-            expected=SHA256,
-            remedy="delete it and run it again",
+            f"the object {name} is missing", where=FOLDER / name, remedy="run the plan stage again, which converts it"
         )
-    return deb
+    return ObjectModel(name, about["category"], about["licence"], about["attribution"], FOLDER / name / "model.xml")
 
 
-def prepare_sweethome3d(deb: Path, out: Path, say: Say) -> int:
-    """Convert every model that the catalogue names, to its real size; those that are there already are kept."""
-    wanted = {member: category for category, found in catalogue()["sweethome3d"].items() for member in found}
-    made: set[str] = set()
-    for library, archive in _libraries(deb):
-        listed = _properties(archive.read("PluginFurnitureCatalog.properties").decode("latin-1"))
-        for entry in _entries(listed):
-            member = f"{library}/{Path(entry['model']).stem}"
-            if member not in wanted:
-                continue
-            name = member.replace("/", "_").lower()
-            made.add(name)
-            if (out / name / "about.json").is_file():
-                continue
-            creator = entry.get("creator", library)
-            about = {
-                "category": wanted[member],
-                "licence": LICENCES[library],
-                "attribution": f"{entry['name']} by {creator}, from Sweet Home 3D's {library} catalogue, "
-                "simplified and converted to MJCF",
-            }
-            width, depth, height = (float(entry[side]) / 100 for side in ("width", "depth", "height"))
-            turn = np.array(entry["modelRotation"].split(), float).reshape(3, 3) if "modelRotation" in entry else None
-            with replaced(out / name) as made_here, tempfile.TemporaryDirectory() as scratch:
-                inside = str(Path(entry["model"]).parent).lstrip("/") + "/"
-                archive.extractall(scratch, [file for file in archive.namelist() if file.startswith(inside)])
-                made_here.mkdir()
-                convert(Path(scratch) / entry["model"].lstrip("/"), made_here, (width, depth, height), turn)
-                (made_here / "about.json").write_text(json.dumps(about, indent=2))
-            say(f"{len(made)}/{len(wanted)} {name}")
-    missing = len(wanted) - len(made)
-    if missing:
-        raise PipelineError(f"{missing} models of the catalogue are not in the package", where=deb, remedy="report it")
-    keep_only(out, made)
-    return len(made)
+@cache
+def catalogue() -> dict[str, dict[str, Any]]:
+    """Package to category to the members that it holds."""
+    catalogue: dict[str, dict[str, Any]] = yaml.safe_load(CATALOGUE.read_text())
+    return catalogue
 
 
-def prepare_own(own: Path, out: Path, say: Say) -> int:
-    """Convert or copy a user's models."""
-    found = sorted(path for path in own.glob("*/*") if path.suffix in (".obj", ".xml"))
+def _sweethome3d() -> Iterator[ObjectModel]:
+    wanted = {member: category for category, members in catalogue()["sweethome3d"].items() for member in members}
+    names = {member: f"sweethome3d/{member.replace('/', '_').lower()}" for member in wanted}
+    made_from = {
+        member: digest("object", RECIPE, sweethome3d.SHA256, member, category) for member, category in wanted.items()
+    }
+
+    def missing() -> set[str]:
+        return {member for member in wanted if (_about(names[member]) or {}).get("made_from") != made_from[member]}
+
+    def make(piece: Piece) -> None:
+        def write(folder: Path) -> None:
+            with tempfile.TemporaryDirectory() as scratch:
+                convert(piece.unpack(Path(scratch)), folder, piece.size_m, piece.turn)
+
+        about = {
+            "made_from": made_from[piece.member],
+            "category": wanted[piece.member],
+            "licence": piece.licence,
+            "attribution": f"{piece.title} by {piece.creator}, from Sweet Home 3D's {piece.member.partition('/')[0]} "
+            "catalogue, simplified and converted to MJCF",
+        }
+        _make(names[piece.member], about, write)
+
+    if missing():
+        with _alone():
+            deb = sweethome3d.fetch(FOLDER)
+            todo = missing()
+            pieces = [piece for piece in sweethome3d.pieces(deb) if piece.member in todo]
+            for piece in track(pieces, "converting sweethome3d", console=Console(stderr=True)):
+                make(piece)
+            if lost := missing():
+                raise PipelineError(f"the package lacks {', '.join(sorted(lost))}", where=deb, remedy="report it")
+    for name in names.values():
+        yield converted(name)
+
+
+def _own(source: Folder) -> Iterator[ObjectModel]:
+    found = sorted(path for path in source.folder.glob("*/*") if path.suffix in (".obj", ".xml"))
     if not found:
-        raise PipelineError("no models", where=own, expected="<category>/<name>.obj or <category>/<name>.xml")
-    licence = own / "LICENSE"
-    made: set[str] = set()
+        raise PipelineError(
+            "there are no models here",
+            where=source.folder,
+            expected="<category>/<name>.obj or <category>/<name>.xml",
+            remedy="correct the folder in plan.axes.layout.sources",
+        )
     for path in found:
-        name = f"{path.parent.name}_{path.stem}".lower()
-        if name in made:
-            raise PipelineError(f"two models of the name {name}", where=path, remedy="rename one of them")
-        made.add(name)
-        with replaced(out / name) as made_here:
-            made_here.mkdir()
-            if path.suffix == ".obj":
-                convert(path, made_here)
-            else:
-                _copy(path, made_here)
-            about = {
-                "category": path.parent.name.lower(),
-                "licence": licence.read_text().strip().splitlines()[0] if licence.is_file() else "unknown",
-                "attribution": f"{path.parent.name}/{path.name}",
-            }
-            (made_here / "about.json").write_text(json.dumps(about, indent=2))
-        say(f"{len(made)}/{len(found)} {name}")
-    keep_only(out, made)
-    return len(made)
+        category = path.parent.name
+        if not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)*", category):
+            raise PipelineError(
+                f"{category!r} is no category",
+                where=path.parent,
+                expected="what an instruction would call the objects, in small letters, such as bottle_of_milk",
+                remedy="rename the folder",
+            )
+        # A model's materials and textures lie beside it.
+        beside = [file for file in sorted(path.parent.rglob("*")) if file.is_file()]
+        content = [(file.relative_to(path.parent).as_posix(), sha256(file.read_bytes()).hexdigest()) for file in beside]
+        made_from = digest("object", RECIPE, path.name, content)
+        # The name tells what it was made from, so that an earlier plan still finds its own.
+        name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
+        about = {
+            "made_from": made_from,
+            "category": category,
+            "licence": source.licence,
+            "attribution": f"{category}/{path.name}",
+        }
+        if _about(name) != about:
+            with _alone():
+                _make(name, about, lambda folder, path=path: _convert_own(path, folder))  # type: ignore[misc]
+        yield converted(name)
+
+
+def _convert_own(path: Path, folder: Path) -> None:
+    if path.suffix == ".obj":
+        convert(path, folder)
+        _check_size(folder / "model.xml", path)
+    else:
+        _check_size(path, path)
+        _copy(path, folder)
+
+
+def _check_size(mjcf: Path, path: Path) -> None:
+    low, high, _ = ObjectModel("", "", "", "", mjcf).shape
+    longest = max(up - down for up, down in zip(high, low, strict=True))
+    if longest > LARGEST_M:
+        raise PipelineError(
+            f"the model measures {longest:.3g} m",
+            where=path,
+            expected=f"at most {LARGEST_M} m in any direction",
+            remedy="scale it to metres, or leave it out",
+        )
 
 
 def _copy(mjcf: Path, out: Path) -> None:
@@ -164,28 +201,26 @@ def _copy(mjcf: Path, out: Path) -> None:
     tree.write(out / "model.xml")
 
 
-def _libraries(deb: Path) -> Iterator[tuple[str, zipfile.ZipFile]]:
-    """The libraries of a Debian package of furniture: an ``ar`` archive with a tar file of zip files in it."""
-    content = deb.read_bytes()
-    at = len("!<arch>\n")
-    while not (header := content[at : at + 60]).startswith(b"data.tar"):
-        at += 60 + int(header[48:58]) + int(header[48:58]) % 2
-    with tarfile.open(fileobj=io.BytesIO(content[at + 60 : at + 60 + int(header[48:58])])) as data:
-        for library in LICENCES:
-            file = data.extractfile(f"./usr/share/sweethome3d/furniture/{library}.sh3f")
-            if file is not None:
-                yield library, zipfile.ZipFile(io.BytesIO(file.read()))
+def _make(name: str, about: dict[str, str], write: Callable[[Path], None]) -> None:
+    """Have ``write`` fill the folder of a converted model, which is whole or not there."""
+    with replaced(FOLDER / name) as folder:
+        folder.mkdir()
+        write(folder)
+        (folder / "about.json").write_text(json.dumps(about, indent=2) + "\n")
 
 
-def _properties(text: str) -> dict[str, str]:
-    """A Java properties file."""
-    found = re.findall(r"^\s*([^#!=:\s][^=:\s]*)\s*[=:]\s*(.*?)\s*$", re.sub(r"\\\r?\n\s*", "", text), re.MULTILINE)
-    return {key: re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value) for key, value in found}
+def _about(name: str) -> dict[str, str] | None:
+    try:
+        about: dict[str, str] = json.loads((FOLDER / name / "about.json").read_text())
+    except FileNotFoundError:
+        return None
+    return about
 
 
-def _entries(listed: dict[str, str]) -> Iterator[dict[str, str]]:
-    """The pieces of a catalogue, whose properties are written ``<property>#<number>``, numbered from 1."""
-    number = 1
-    while f"id#{number}" in listed:
-        yield {key.rpartition("#")[0]: value for key, value in listed.items() if key.endswith(f"#{number}")}
-        number += 1
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Let one process convert at a time, so that another finds its work done."""
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    with (FOLDER / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield

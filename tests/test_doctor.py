@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import doctor, gl
+from pipeline import doctor, gl, testset, wheels
 from pipeline.errors import PipelineError
 
 
@@ -58,6 +58,23 @@ def test_no_opengl(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     monkeypatch.setattr(gl, "choose", nothing)
     assert failures(tmp_path)["OpenGL"].remedy == gl.REMEDY
+
+
+def test_what_is_to_be_fetched_needs_something_to_fetch_it_with(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(wheels, "pip", lambda: ["pip"])
+    found = {finding.name: finding for finding in doctor.check(tmp_path, need_gb=0.001)}
+    # Every plan asks for the test set; further sources are for configurations that name them.
+    assert {name for name, finding in found.items() if finding.status == "fail"} == {"test set"}
+    assert testset.WHEEL in found["test set"].remedy
+    assert found["metaworld textures"].status == found["sweethome3d objects"].status == "warn"
+    wheel = tmp_path / testset.FOLDER / testset.WHEEL
+    wheel.parent.mkdir(parents=True)
+    wheel.touch()
+    assert failures(tmp_path) == {}
 
 
 def test_a_missing_asset_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

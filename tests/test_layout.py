@@ -13,14 +13,14 @@ from conftest import PLATE, STOVE, starter_demo
 
 from pipeline import seeding
 from pipeline.axes.base import RefusedError
-from pipeline.axes.layout import AddedObject, LayoutAxis, LayoutPerturbation
+from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.config import ReplayConfig
 from pipeline.environment import Environment
 from pipeline.errors import PipelineError
 from pipeline.object_model import ObjectModel
 from pipeline.objects import TEST_CATEGORIES, goes_with, models, taken
 from pipeline.placement import CLEARANCE_M, path, place
-from pipeline.replay import open_loop
+from pipeline.replay import replay
 from pipeline.tasks import tasks
 from pipeline.testset import TestSet, TestTask
 from pipeline.types import Demo, Scene
@@ -160,7 +160,7 @@ def test_objects_touch_the_table_only_and_the_demonstration_passes_them_by(
 def test_the_demonstration_still_succeeds_among_the_objects(
     environment: Environment, demo: Demo, three: LayoutPerturbation
 ) -> None:
-    trajectory = open_loop(environment, demo, "layout", ReplayConfig(), (three,))
+    trajectory = replay(environment, demo, "layout", ReplayConfig(), (three,))
     assert trajectory.verdict.kept, trajectory.verdict.reason
     assert np.abs(trajectory.states[-1, -18:]).max() < 0.05, "nothing was knocked over"
 
@@ -168,14 +168,14 @@ def test_the_demonstration_still_succeeds_among_the_objects(
 def test_impossible_wishes_are_refused_with_their_reason(tmp_path: Path, base: Scene, demo: Demo) -> None:
     file = tmp_path / "crate.xml"
     file.write_text('<mujoco><worldbody><body><geom type="box" size=".25 .25 .25"/></body></worldbody></mujoco>')
-    crate = ObjectModel("own/crate", "own", "crate", "", "", file)
+    crate = ObjectModel("own/crate", "crate", "", "", file)
     with pytest.raises(RefusedError) as refused:
         place(base, demo, [crate] * 5, seed=0)
     assert refused.value.reason in ("layout_in_the_way", "layout_out_of_view", "layout_off_the_surface")
 
 
 def test_an_object_that_is_another_now_is_refused(three: LayoutPerturbation, base: Scene, demo: Demo) -> None:
-    stale = AddedObject(name=three.objects[0].name, category="x", sha256="0" * 64)
+    stale = three.objects[0].model_copy(update={"sha256": "0" * 64})
     with pytest.raises(PipelineError, match="not the one that was planned with"):
         LayoutPerturbation(level=1, objects=(stale,), seed=0).apply(base, demo)
 
@@ -186,6 +186,6 @@ def test_distance_to_the_test_set_is_by_category_on_the_same_task(three: LayoutP
 
     test = TestSet((test_task(PLATE.name, "canned_food__1,can_of_sardines"), test_task(STOVE.name, "bag_of_yeast")))
     assert three.nearest(test, PLATE) == (float("inf"), 1)
-    same = AddedObject(name="own/x", category="canned_food", sha256="")
+    same = three.objects[0].model_copy(update={"category": "canned_food"})
     nearest = three.model_copy(update={"objects": (*three.objects, same)}).nearest(test, PLATE)
     assert nearest.distance < LayoutPerturbation.clearance

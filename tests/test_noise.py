@@ -17,7 +17,8 @@ from scipy.ndimage import zoom
 from skimage.filters import gaussian
 
 from pipeline import seeding, testset
-from pipeline.axes.noise import Effect, Fog, Gaussian, Glass, Motion, NoiseAxis, NoisePerturbation, Zoom
+from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
+from pipeline.axes.noise import Effect, NoiseAxis, NoisePerturbation
 from pipeline.testset import TestSet
 from pipeline.types import Floats, Frame, Task
 

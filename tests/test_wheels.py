@@ -1,0 +1,68 @@
+"""A wheel is fetched once, checked, left as it is, and asked for in words that help where it cannot be had."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from pipeline import wheels
+from pipeline.errors import PipelineError
+from pipeline.wheels import Wheel
+
+
+@pytest.fixture
+def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Wheel:
+    """A package in a folder that is all that pip can see."""
+    metadata = "Metadata-Version: 2.1\nName: tiny-wheel\nVersion: 1.0\n"
+    file = tmp_path / "index" / "tiny_wheel-1.0-py3-none-any.whl"
+    file.parent.mkdir()
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("tiny_wheel/__init__.py", "raise RuntimeError('imported')")
+        archive.writestr("tiny_wheel-1.0.dist-info/METADATA", f"{metadata}Requires-Dist: no-such-package\n")
+        archive.writestr(
+            "tiny_wheel-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+        )
+        archive.writestr("tiny_wheel-1.0.dist-info/RECORD", "")
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(file.parent))
+    return Wheel("tiny-wheel", "1.0", hashlib.sha256(file.read_bytes()).hexdigest(), "nothing much")
+
+
+def test_it_is_fetched_once_and_without_its_dependencies(
+    wheel: Wheel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = wheels.fetch(wheel, tmp_path / "data")
+    assert path == tmp_path / "data" / "tiny_wheel-1.0-py3-none-any.whl"
+    assert list(path.parent.iterdir()) == [path]
+    monkeypatch.setenv("PIP_FIND_LINKS", "")
+    assert wheels.fetch(wheel, tmp_path / "data") == path
+
+
+def test_where_it_cannot_be_had_the_error_says_what_to_do_and_nothing_is_left(
+    wheel: Wheel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PIP_FIND_LINKS", "")
+    with pytest.raises(PipelineError, match=r"nothing much could not be downloaded \(ERROR: ") as caught:
+        wheels.fetch(wheel._replace(without="do something else"), tmp_path / "data")
+    assert "`pip download --no-deps tiny-wheel==1.0` and put the file into" in str(caught.value)
+    assert str(caught.value).endswith("; or do something else")
+    assert list((tmp_path / "data").iterdir()) == []
+    # Without pip itself.
+    monkeypatch.setattr(wheels, "pip", lambda: [str(tmp_path / "no-pip")])
+    with pytest.raises(PipelineError, match="No such file or directory"):
+        wheels.fetch(wheel, tmp_path / "data")
+
+
+def test_another_file_is_refused_whether_it_was_there_or_downloaded(wheel: Wheel, tmp_path: Path) -> None:
+    expected = wheel._replace(sha256="0" * 64)
+    with pytest.raises(PipelineError, match=r"not the wheel of tiny-wheel==1\.0"):
+        wheels.fetch(expected, tmp_path / "data")
+    assert list((tmp_path / "data").iterdir()) == []
+    wheels.fetch(wheel, tmp_path / "data")
+    with pytest.raises(PipelineError, match="delete the file"):
+        wheels.fetch(expected, tmp_path / "data")
+    with pytest.raises(PipelineError, match="cannot read the wheel"):
+        wheels.check(wheel, tmp_path / "elsewhere.whl")
