@@ -9,21 +9,21 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
 
 import yaml
-from bddl.parsing import scan_tokens
 from pydantic import TypeAdapter, ValidationError
 
-from pipeline.axes.language import CLASSES, MAX_WORDS, MIN_WORDS, Bank, Component, lint, load_bank, normalise
+from pipeline.axes.language import CLASSES, MAX_WORDS, MIN_WORDS, REMEDY, Bank, Component, lint, load_bank, normalise
+from pipeline.bddl import Fact, read
 from pipeline.chat import UnusableError
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.tasks import SUITES, tasks
+from pipeline.types import Task
 
 IDLE_ANSWERS = 3
 """After so many answers in a row without one new rewrite, a class is given up."""
@@ -33,13 +33,14 @@ ASKED_AT_ONCE = 20
 
 WANTED: dict[Component, str] = {
     "distraction": "The request stands among talk that has nothing to do with it (weather, family, errands, moods), "
-    "as people talk while they ask for something. The talk must not name things of the scene or ask for anything else.",
+    "as people talk while they ask for something. The talk must not name things of the scene or ask for anything else. "
+    "What is asked for is called by its name.",
     "common_sense": "The things are not called by their names but by what everybody knows about them: what they are "
     "used for, made of or look like, where one buys them. Among the things of the scene each description fits one.",
     "reasoning_chain": "What to do has to be inferred in two or more steps: by exclusion, from a wish, a plan, a "
     "condition or an order of places, with one conclusion.",
-    "paraphrase": "The same request in other words and grammar: synonyms, another order, a question, a wish, a few "
-    "words only. Nothing is added.",
+    "paraphrase": "The same request in other words and grammar: other verbs, another order, a question, a wish, a few "
+    "words only. Things keep their names, and nothing is added.",
 }
 
 
@@ -48,17 +49,14 @@ class Brief:
     """What a model is told about a task.
 
     Attributes:
-        suite: name of the folder of the BDDL file; with ``name`` the task's place in a bank.
-        name: the stem of the BDDL file.
-        instruction: LIBERO's wording where the task is one of LIBERO's, else the BDDL file's own.
+        task: suite and name, its place in a bank, are the BDDL file's folder and stem; the instruction is LIBERO's
+            wording where the task is one of LIBERO's, else the BDDL file's own.
         things: kinds of movable objects and fixtures, with their number where there are several.
         start: what is where at first.
         goal: what has to be so at the end.
     """
 
-    suite: str
-    name: str
-    instruction: str
+    task: Task
     things: tuple[str, ...]
     start: tuple[str, ...]
     goal: tuple[str, ...]
@@ -68,55 +66,38 @@ def brief(bddl_file: Path) -> Brief:
     """Read a task's scene and goal.
 
     Raises:
-        PipelineError: when the file cannot be read or lacks a section.
+        PipelineError: when the file cannot be read or does not define a task.
     """
-    expected = "a BDDL problem with :language, :fixtures, :objects, :init and :goal"
-    try:
-        tokens = scan_tokens(filename=str(bddl_file))
-    except Exception as error:  # the parser raises nothing more specific
-        raise PipelineError(f"not a BDDL file ({error})", where=bddl_file, expected=expected) from error
-    sections = {str(section[0]): section[1:] for section in tokens if isinstance(section, list) and section}
-    if missing := [name for name in (":language", ":fixtures", ":objects", ":init", ":goal") if not sections.get(name)]:
-        raise PipelineError(f"has no {' and no '.join(missing)}", where=bddl_file, expected=expected)
+    bddl = read(bddl_file)
     suite, name = bddl_file.resolve().parent.name, bddl_file.stem
     known = {task.name: task.instruction for task in tasks(suite)} if suite in SUITES else {}
+    kinds = Counter([*bddl.objects.values(), *bddl.fixtures.values()])
     return Brief(
-        suite=suite,
-        name=name,
-        instruction=known.get(name, " ".join(map(str, sections[":language"]))),
-        things=tuple(_kinds(sections[":objects"] + sections[":fixtures"])),
-        start=tuple(_words(fact) for fact in sections[":init"]),
-        goal=tuple(_words(fact) for fact in sections[":goal"]),
+        task=Task(suite, name, known.get(name, bddl.language), bddl_file),
+        things=tuple(_words(kind) if count == 1 else f"{count} x {_words(kind)}" for kind, count in kinds.items()),
+        start=tuple(map(_sentence, bddl.start)),
+        goal=tuple(map(_sentence, bddl.goal)),
     )
 
 
-def _kinds(declared: list[str]) -> Iterator[str]:
-    """``plate`` or ``2 x plate`` for each kind of ``a_1 a_2 - kind b_1 - other``."""
-    instances = 0
-    for before, word in zip(["", *declared], declared, strict=False):
-        if before == "-":
-            yield _words(word) if instances < 2 else f"{instances} x {_words(word)}"
-            instances = 0
-        elif word != "-":
-            instances += 1
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
-def _words(fact: Any) -> str:
-    """A name without underscores; a fact such as ``(on plate_1 table)`` as ``on(plate 1, table)``, nested or not."""
-    if isinstance(fact, str):
-        return fact.replace("_", " ")
-    return f"{_words(fact[0])}({', '.join(map(_words, fact[1:]))})" if fact else ""
+def _sentence(fact: Fact) -> str:
+    """``on(plate 1, table)`` for ``(on plate_1 table)``."""
+    return f"{fact[0]}({', '.join(map(_words, fact[1:]))})"
 
 
-def prompt(task: Brief, component: Component, count: int, have: list[str], refused: Counter[str]) -> str:
+def prompt(told: Brief, component: Component, count: int, have: list[str], refused: Counter[str]) -> str:
     """The question for ``count`` more rewrites of one class."""
     return "\n".join(
         [
             "Rewrite an instruction for a robot arm at a table.",
-            f"The instruction: {task.instruction}",
-            f"Everything in the scene: {', '.join(task.things)}",
-            f"At first: {'; '.join(task.start)}",
-            f"Done when: {'; '.join(task.goal)}",
+            f"The instruction: {told.task.instruction}",
+            f"Everything in the scene: {', '.join(told.things)}",
+            f"At first: {'; '.join(told.start)}",
+            f"Done when: {'; '.join(told.goal)}",
             f"What kind of rewrite: {WANTED[component]}",
             "Each rewrite must ask for exactly this and nothing more, must be natural, and must leave only one "
             "reading in this scene: the same thing, the same place, the same relation, the same order. "
@@ -151,7 +132,8 @@ def extend(
     Raises:
         PipelineError: when a file cannot be read, the model cannot be reached, or too few rewrites were acceptable.
     """
-    task, bank = brief(bddl_file), _read(out)
+    told, bank = brief(bddl_file), _read(out)
+    task = told.task
     stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
     _check(stored, task, out)
     shipped = load_bank().get(task.suite, {}).get(task.name, {})
@@ -161,8 +143,8 @@ def extend(
         idle = 0
         while (missing := per_class - len(stored[component])) > 0 and idle < IDLE_ANSWERS:
             have = [*shipped.get(component, ()), *stored[component]]
-            question = prompt(task, component, min(missing, ASKED_AT_ONCE), have, refused)
-            accepted, reasons = _sift(_offered(ask, question), task, taken, missing)
+            question = prompt(told, component, min(missing, ASKED_AT_ONCE), have, refused)
+            accepted, reasons = _sift(_offered(ask, question), task, component, taken, missing)
             idle = 0 if accepted else idle + 1
             refused += reasons
             if accepted:
@@ -180,15 +162,15 @@ def extend(
         )
 
 
-def _check(stored: Mapping[Component, Iterable[str]], task: Brief, out: Path) -> None:
+def _check(stored: Mapping[Component, Iterable[str]], task: Task, out: Path) -> None:
     """Refuse a bank that the language axis would refuse."""
     for component, texts in stored.items():
         for text in texts:
-            if fault := lint(text, task.instruction):
+            if fault := lint(text, task, component):
                 raise PipelineError(
                     f"{component} rewrite {text!r} of {task.suite}/{task.name} is refused: {fault}",
                     where=out,
-                    remedy="correct or delete the sentence",
+                    remedy=REMEDY,
                 )
 
 
@@ -200,7 +182,9 @@ def _offered(ask: Callable[[str], str], question: str) -> list[str] | str:
         return str(error)
 
 
-def _sift(offered: list[str] | str, task: Brief, taken: set[str], wanted: int) -> tuple[list[str], Counter[str]]:
+def _sift(
+    offered: list[str] | str, task: Task, component: Component, taken: set[str], wanted: int
+) -> tuple[list[str], Counter[str]]:
     """The first ``wanted`` sentences that pass the gate, noted in ``taken``, and why others before them did not."""
     if isinstance(offered, str):
         return [], Counter([offered])
@@ -209,7 +193,7 @@ def _sift(offered: list[str] | str, task: Brief, taken: set[str], wanted: int) -
     for text in map(tidy, offered):
         if len(accepted) == wanted:
             break
-        fault = lint(text, task.instruction) or ("a repetition" if normalise(text) in taken else None)
+        fault = lint(text, task, component) or ("a repetition" if normalise(text) in taken else None)
         if fault:
             reasons[fault] += 1
         else:

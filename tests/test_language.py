@@ -10,13 +10,13 @@ import yaml
 from conftest import REPOSITORY
 from hypothesis import given
 from hypothesis import strategies as st
-from libero.libero.benchmark.libero_suite_task_map import libero_task_map
 from pydantic import ValidationError
 
 from pipeline import seeding, testset
 from pipeline.axes.base import Level
 from pipeline.axes.language import (
     CLASSES,
+    NAMED,
     LanguageAxis,
     LanguagePerturbation,
     deal,
@@ -27,6 +27,7 @@ from pipeline.axes.language import (
     normalise,
 )
 from pipeline.errors import PipelineError
+from pipeline.tasks import find_task, tasks
 from pipeline.testset import TestSet
 from pipeline.types import Task
 
@@ -34,13 +35,8 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 MIN_PER_CLASS = 10
 
 
-def make_task(suite: str, name: str) -> Task:
-    # The task names of libero_10 open with the scene in capitals; the rest is the instruction.
-    instruction = " ".join(word for word in name.split("_") if not word.isupper())
-    return Task(suite, name, instruction, Path(f"{name}.bddl"))
-
-
-TASKS = [make_task(suite, name) for suite in SUITES for name in libero_task_map[suite]]
+TASKS = [task for suite in SUITES for task in tasks(suite)]
+BOWL_ON_PLATE = find_task("libero_goal", "put_the_bowl_on_the_plate")
 
 
 def draw(task: Task, variant: int, axis: LanguageAxis | None = None, seed: int = 0) -> LanguagePerturbation:
@@ -63,9 +59,8 @@ def test_bank_is_complete_and_clean(task: Task) -> None:
     classes = load_bank()[task.suite][task.name]
     assert set(classes) == set(CLASSES)
     assert all(len(texts) >= MIN_PER_CLASS for texts in classes.values())
-    assert [
-        (text, fault) for texts in classes.values() for text in texts if (fault := lint(text, task.instruction))
-    ] == []
+    linted = {text: lint(text, task, component) for component, texts in classes.items() for text in texts}
+    assert {text: fault for text, fault in linted.items() if fault} == {}
 
 
 def test_no_rewrite_is_stored_twice(task: Task) -> None:
@@ -95,7 +90,7 @@ def test_no_rewrite_is_stored_twice(task: Task) -> None:
     ],
 )
 def test_lint_names_the_fault(text: str, reason: str) -> None:
-    fault = lint(text, "put the bowl on the plate")
+    fault = lint(text, BOWL_ON_PLATE, "paraphrase")
     assert fault is not None
     assert reason in fault
 
@@ -109,7 +104,7 @@ def test_lint_names_the_fault(text: str, reason: str) -> None:
     ],
 )
 def test_lint_accepts_natural_sentences(text: str) -> None:
-    assert lint(text, "put the bowl on the plate") is None
+    assert lint(text, BOWL_ON_PLATE, "distraction") is None
 
 
 def test_normalise_forgets_case_punctuation_and_spacing() -> None:
@@ -158,8 +153,9 @@ def test_perturbation_survives_json() -> None:
 
 
 def test_unknown_task_is_named_with_the_file_and_a_remedy() -> None:
+    juggle = Task("libero_goal", "juggle", "juggle", Path("juggle.bddl"))
     with pytest.raises(PipelineError, match=r"language_bank\.yaml.*libero_goal/juggle(?s:.*)try: add rewrites"):
-        draw(make_task("libero_goal", "juggle"), 0)
+        draw(juggle, 0)
 
 
 def test_rewrite_equal_to_the_instruction_is_refused() -> None:
@@ -172,6 +168,14 @@ def test_rewrite_equal_to_the_instruction_is_refused() -> None:
 def test_no_classes_is_refused() -> None:
     with pytest.raises(ValidationError):
         LanguageAxis(classes=())
+
+
+def test_among_more_objects_things_are_called_by_their_names() -> None:
+    axis = LanguageAxis(levels=(1, 2)).among_more_objects()
+    assert axis == LanguageAxis(levels=(1, 2), classes=NAMED)
+    assert LanguageAxis(classes=("paraphrase", "common_sense")).among_more_objects().classes == ("paraphrase",)
+    with pytest.raises(ValueError, match="distraction or paraphrase"):
+        LanguageAxis(classes=("common_sense", "reasoning_chain")).among_more_objects()
 
 
 def test_levels_follow_the_distance_to_the_original(task: Task) -> None:
@@ -241,8 +245,17 @@ def test_a_test_instruction_is_found_whatever_its_case_and_for_its_own_task_only
 def test_a_further_bank_joins_the_shipped_one(tmp_path: Path) -> None:
     known = TASKS[0]
     bank = tmp_path / "bank.yaml"
-    bank.write_text(yaml.safe_dump({known.suite: {known.name: {"paraphrase": ["kindly move that one over there"]}}}))
+    further = f"kindly {known.instruction}"
+    bank.write_text(yaml.safe_dump({known.suite: {known.name: {"paraphrase": [further]}}}))
     texts = {card.text for card in deal(known, CLASSES, bank=bank)}
-    assert texts - {card.text for card in deal(known)} == {"kindly move that one over there"}
+    assert texts - {card.text for card in deal(known)} == {further}
     with pytest.raises(PipelineError, match=r"missing\.yaml"):
         deal(known, CLASSES, bank=tmp_path / "missing.yaml")
+
+
+def test_a_further_bank_has_to_keep_the_goal(tmp_path: Path) -> None:
+    bank = tmp_path / "bank.yaml"
+    text = "kindly put the bowl next to the plate"
+    bank.write_text(yaml.safe_dump({BOWL_ON_PLATE.suite: {BOWL_ON_PLATE.name: {"paraphrase": [text]}}}))
+    with pytest.raises(PipelineError, match=r"relation 'on' to the plate(?s:.*)language_words\.yaml"):
+        deal(BOWL_ON_PLATE, CLASSES, bank=bank)

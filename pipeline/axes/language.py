@@ -4,7 +4,8 @@ How far two wordings are apart is their normalised edit distance: the fewest cha
 to turn one into the other, by the length of the longer, both without case and punctuation.
 
 The rewrites live in ``language_bank.yaml``, one list for each task and class. All are lower-case ASCII without a
-final full stop, as LIBERO's own instructions are, and each keeps one reading among the objects of its scene.
+final full stop, as LIBERO's own instructions are, each keeps one reading among the objects of its scene, and each
+keeps the goal as far as ``language_goal.py`` can tell.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
 from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
+from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
 from pipeline.types import Task
 
@@ -33,12 +35,16 @@ if TYPE_CHECKING:
 
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
 CLASSES: tuple[Component, ...] = get_args(Component)
+NAMED: tuple[Component, ...] = ("distraction", "paraphrase")
+"""The classes that call all things and places of the goal by their names; the others may tell them by what one knows
+of them, or by exclusion (``the only dairy product``), which holds for the task's own objects and no more."""
 
 Bank = dict[str, dict[str, dict[Component, tuple[str, ...]]]]
 """Suite to task name to class to rewrites."""
 
 BANK_FILE = Path(__file__).with_name("language_bank.yaml")
 MIN_WORDS, MAX_WORDS = 3, 60
+REMEDY = "correct or delete the sentence; or, where it is right, add its words to axes/language_words.yaml"
 LEVELS = (0.5, 0.6, 0.67, 0.72)
 """Distances to the original wording at which the levels 2 to 5 begin."""
 
@@ -59,7 +65,7 @@ class LanguagePerturbation(TextPerturbation):
     component: Component
     text: str
 
-    clearance: ClassVar[float] = 0.15
+    clearance: ClassVar[float] = 0.2
     measure: ClassVar[str] = "share of characters to edit, to the task's test instructions without case and punctuation"
 
     def apply(self, instruction: str) -> str:
@@ -67,7 +73,7 @@ class LanguagePerturbation(TextPerturbation):
         return self.text
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """The distance to the nearest of the task's test instructions; a clearance of about one word in seven."""
+        """The distance to the nearest of the task's test instructions; a clearance of about one word in five."""
         return _nearest(self.text, test, task)
 
 
@@ -81,6 +87,19 @@ class LanguageAxis(Axis):
 
     classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
     bank: Path | None = None
+
+    def among_more_objects(self) -> LanguageAxis:
+        """The axis for scenes with objects that the task does not have, such as the layout axis adds: ``NAMED`` only.
+
+        Names stay unambiguous there as far as the added objects are of categories that the scene does not have.
+
+        Raises:
+            ValueError: when none of ``classes`` is left.
+        """
+        classes = tuple(component for component in self.classes if component in NAMED)
+        if not classes:
+            raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")
+        return self.model_copy(update={"classes": classes})
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
         """The rewrite at ``place`` of the task's deal, which starts again once the bank is exhausted.
@@ -135,12 +154,12 @@ def deal(
             remedy="add rewrites of the task to the bank, or take language out of the configured axes",
         )
     for card in dealt:
-        if fault := lint(card.text, task.instruction):
+        if fault := lint(card.text, task, card.component):
             raise PipelineError(
                 f"{card.component} rewrite {card.text!r} of {task.suite}/{task.name} is refused: {fault}",
                 where=bank or BANK_FILE,
-                expected=f"lower-case ASCII, {MIN_WORDS} to {MAX_WORDS} words, no final punctuation",
-                remedy="correct or delete the sentence",
+                expected=f"lower-case ASCII, {MIN_WORDS} to {MAX_WORDS} words, no final punctuation, the task's goal",
+                remedy=REMEDY,
             )
     return dealt
 
@@ -196,8 +215,12 @@ def _nearest(text: str, test: TestSet, task: Task) -> Nearest:
     return Nearest(min((distance(text, wording) for wording in wordings), default=math.inf), len(wordings))
 
 
-def lint(text: str, original: str) -> str | None:
-    """The reason why ``text`` cannot stand in for the instruction ``original``; None when it can."""
+def lint(text: str, task: Task, component: Component) -> str | None:
+    """The reason why ``text`` cannot stand in for the task's instruction; None when it can.
+
+    Raises:
+        PipelineError: when the task's BDDL file cannot be read.
+    """
     words = len(text.split())
     if words == 0:
         return "empty"
@@ -209,6 +232,6 @@ def lint(text: str, original: str) -> str | None:
         return "characters, spacing or punctuation other than of a lower-case sentence without its final full stop"
     if not MIN_WORDS <= words <= MAX_WORDS:
         return f"{words} words, wanted {MIN_WORDS} to {MAX_WORDS}"
-    if normalise(text) == normalise(original):
+    if normalise(text) == normalise(task.instruction):
         return "equal to the original"
-    return None
+    return changed_goal(text, task, hints=component not in NAMED)

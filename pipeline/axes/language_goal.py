@@ -1,0 +1,203 @@
+"""Whether a rewrite keeps the goal of its task: what is moved, where to, how it then stands, what is opened or lit.
+
+The goal is that of the BDDL file, the words for it are those of ``language_words.yaml``. No grammar is parsed: each
+thing and each place must be called by a word that nothing else in the scene shares, the relation is told by the words
+right before a place, and where two things go to different places, the first goes to the first. What LIBERO's own
+wording does not tell by these words is not asked of a rewrite. So a changed goal is found, in plain words and in
+riddles; whether a riddle has one solution only is for its writer to see to.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import cache, partial
+from typing import NamedTuple
+
+from pipeline.axes.language_words import found, pattern, relation_words, thing_words, words
+from pipeline.goal import Aim, Goal, read_goal
+from pipeline.types import Task
+
+SIDES = ("front", "left", "right")
+"""Relations that may be told without a word for the place, as in ``to its right``."""
+
+UNTOLD = frozenset({"to", None})
+"""What leaves the relation open: ``bring it to the basket``, ``the basket should have it``."""
+
+WAYS = frozenset({"on", "in", "off", "to", None})
+"""Relations that tell no place where they are followed by another: ``hold it over the basket and let it in``."""
+
+DRAWERS = frozenset({"top", "middle", "bottom"})
+
+NEAR_WORDS = 5
+"""A relation belongs to a place that at most so many words come before."""
+
+_BACK = re.compile(
+    r"\s*(?:$|[,.;:?!]|(?:and|it|its|that|this|there|these|those|them|which|each|one|what)\b"
+    r"|the (?:former|latter|other)\b)"
+)
+"""What follows a relation to a place that was named before."""
+
+
+class Mention(NamedTuple):
+    """A word for a thing.
+
+    Attributes:
+        at: where it begins.
+        kinds: those in the scene that share the word.
+        relation: how something stands to it, by the words right before.
+    """
+
+    at: int
+    kinds: tuple[str, ...]
+    relation: str | None
+
+
+class Reading:
+    """What an instruction tells, as far as the words go.
+
+    Attributes:
+        plain: the text in lower case, without hyphens and apostrophes.
+        mentions: words for things of the scene, in order.
+        back: relations to a place that was named before, and sides, with where they begin.
+    """
+
+    def __init__(self, text: str, scene: Sequence[str], hints: bool):
+        self.plain, self.hints = _plain(text), hints
+        relations = [
+            (match.start(), match.end(), relation) for match, (relation,) in found(self.plain, relation_words())
+        ]
+        self.back = [
+            (start, relation) for start, end, relation in relations if relation in SIDES or _BACK.match(self.plain, end)
+        ]
+        self.mentions: list[Mention] = []
+        before = 0
+        for match, kinds in found(self.plain, thing_words(tuple(scene), hints)):
+            near = [
+                relation for start, end, relation in relations if start >= before and self._leads(end, match.start())
+            ]
+            self.mentions.append(Mention(match.start(), kinds, near[-1] if near else None))
+            before = match.end()
+
+    def _leads(self, end: int, start: int) -> bool:
+        between = self.plain[end:start]
+        return end <= start and not re.search(r"[,.;:?!]", between) and len(between.split()) <= NEAR_WORDS
+
+    def has(self, patterns: Sequence[str]) -> bool:
+        return pattern(tuple(patterns)).search(self.plain) is not None
+
+    def tells(self, kind: str, moved: frozenset[str]) -> bool:
+        """Whether a word tells this kind from all others in the scene, or both that are moved from the rest."""
+        together = moved if kind in moved and self.has(words().both) else frozenset()
+        return any(kind in mention.kinds and {*mention.kinds} <= together | {kind} for mention in self.mentions)
+
+    def tells_part(self, part: str) -> bool:
+        """Whether it says which drawer or side, if only by naming both of the other drawers."""
+        others = DRAWERS - {part} if part in DRAWERS and self.hints else {part}
+        return self.has(words().parts[part]) or all(self.has(words().parts[other]) for other in others)
+
+    def tells_state(self, state: str) -> bool:
+        return self.has(words().states[state].said) and not self.has(words().states[state].opposite)
+
+    def relates(self, aim: Aim, accepted: frozenset[str], others: frozenset[str]) -> bool:
+        """Whether the aim's place is named with an accepted relation, or at least with none but those of ``others``."""
+        told = [mention.relation for mention in self.mentions if aim.place in mention.kinds]
+        back = {relation for _, relation in self.back}
+        if aim.relation in SIDES or accepted & {*told}:
+            return bool(accepted & {*told, *back})
+        unexplained = [relation for relation in told if relation not in others]
+        if accepted & back:
+            return WAYS.issuperset(unexplained)
+        return bool(unexplained) and UNTOLD.issuperset(unexplained)
+
+    def in_order(self, aims: Sequence[Aim]) -> bool:
+        """Whether the places come in the order of the things that go there."""
+        things = [self._first(one.at for one in self.mentions if one.kinds == (aim.thing,)) for aim in aims]
+        return _ranks(things) == _ranks([self._first(self._places(aim)) for aim in aims])
+
+    def _first(self, places: Iterable[int]) -> int:
+        return min(places, default=len(self.plain))
+
+    def _places(self, aim: Aim) -> Iterator[int]:
+        if aim.part:
+            yield from (match.start() for match in pattern(words().parts[aim.part]).finditer(self.plain))
+            return
+        yield from (start for start, relation in self.back if relation == aim.relation)
+        yield from (
+            one.at for one in self.mentions if aim.place in one.kinds and one.relation in {aim.relation, *UNTOLD}
+        )
+
+
+class Demand(NamedTuple):
+    """Something that a rewrite has to tell, and the fault where it does not."""
+
+    fault: str
+    met: Callable[[Reading], bool]
+
+
+def changed_goal(text: str, task: Task, hints: bool) -> str | None:
+    """What of the task's goal ``text`` does not keep; None when it keeps all that is checked.
+
+    Args:
+        text: the rewrite.
+        task: whose goal.
+        hints: whether things may be told by what one knows of them, and a drawer by exclusion; else by name only.
+
+    Raises:
+        PipelineError: when the task's BDDL file cannot be read.
+    """
+    reading = Reading(text, read_goal(task.bddl_file).scene, hints)
+    return next((demand.fault for demand in demands(task) if not demand.met(reading)), None)
+
+
+@cache
+def demands(task: Task) -> tuple[Demand, ...]:
+    """What the goal demands of a rewrite, as far as LIBERO's own wording meets it."""
+    goal = read_goal(task.bddl_file)
+    original = Reading(task.instruction, goal.scene, hints=False)
+    return tuple(demand for demand in _of_goal(goal, original) if demand.met(original))
+
+
+def _of_goal(goal: Goal, original: Reading) -> Iterator[Demand]:
+    located = (*goal.aims, *goal.starts)
+    kinds = [kind for aim in located for kind in (aim.thing, aim.place) if kind]
+    moved = frozenset(aim.thing for aim in goal.aims)
+    for kind in dict.fromkeys([*kinds, *(change.thing for change in goal.changes)]):
+        yield Demand(f"has no word for the {_name(kind)} alone", partial(Reading.tells, kind=kind, moved=moved))
+    parts = [aim.part for aim in located] + [change.part for change in goal.changes]
+    for part in dict.fromkeys(part for part in parts if part):
+        yield Demand(f"does not say which, {part}", partial(Reading.tells_part, part=part))
+    for kind in goal.pairs:
+        yield Demand(f"does not say both {_name(kind)}s", partial(Reading.has, patterns=words().both))
+    for aim in located:
+        if aim.relation and aim.place:
+            yield Demand(
+                f"does not keep the relation {aim.relation!r} to the {_name(aim.place)}", _relation(aim, goal, original)
+            )
+    states = {change.state for change in goal.changes} | {*words().states} & {*original.plain.split()}
+    for state in sorted(states):
+        yield Demand(f"does not say to {state}", partial(Reading.tells_state, state=state))
+    if len({aim.thing for aim in goal.aims}) > 1 and len({aim._replace(thing="") for aim in goal.aims}) > 1:
+        yield Demand("lets the things change places", partial(Reading.in_order, aims=goal.aims))
+
+
+def _relation(aim: Aim, goal: Goal, original: Reading) -> Callable[[Reading], bool]:
+    """The demand for an aim's relation, in LIBERO's wording too: what is on a bowl lies in it; a start is left."""
+    same_place = [one.relation for one in (*goal.aims, *goal.starts) if one.place == aim.place and one != aim]
+    others = frozenset(relation for relation in same_place if relation)
+    worded = {one.relation for one in original.mentions if one.relation and aim.place in one.kinds} - others
+    also = {"off"} if aim in goal.starts else worded
+    others |= {"off"} if any(one.place == aim.place for one in goal.starts) else frozenset()
+    return partial(Reading.relates, aim=aim, accepted=frozenset({str(aim.relation), *also}), others=others)
+
+
+def _name(kind: str) -> str:
+    return kind.replace("_", " ")
+
+
+def _plain(text: str) -> str:
+    return " ".join(re.sub(r"[-']", " ", text.lower()).split())
+
+
+def _ranks(places: Sequence[int]) -> list[int]:
+    return sorted(range(len(places)), key=places.__getitem__)
