@@ -34,8 +34,9 @@ def relocate(xml: str, where: str) -> str:
     """Make a recorded model loadable here, and safe to hand to MuJoCo, which reads whatever file a model names.
 
     Every ``file`` attribute ends up as the absolute path of an installed LIBERO or robosuite asset; the compiler's
-    folder attributes, which absolute paths make void, are dropped. Every other attribute keeps its text, digit by
-    digit. Only what was checked is written out again, so MuJoCo's parser cannot read the document differently.
+    folder attributes, which absolute paths make void, are dropped, and masses are ``as_evaluated``. Every other
+    attribute keeps its text, digit by digit. Only what was checked is written out again, so MuJoCo's parser cannot
+    read the document differently.
 
     Args:
         xml: MJCF as LIBERO records it in ``model_file``.
@@ -75,10 +76,24 @@ def relocate(xml: str, where: str) -> str:
                 except (OSError, ValueError) as error:
                     described = f'<{element.tag} name="{element.get("name", "")}"> {name}="{value}"'
                     raise refuse(f"{described}: {error}", "check that LIBERO's assets are complete") from error
+    as_evaluated(root)
     try:
         return ET.tostring(root, encoding="unicode")
     except RecursionError as error:
         raise refuse("the model is nested too deeply") from error
+
+
+def as_evaluated(mujoco_root: ET.Element) -> None:
+    """Give a scene the masses that it has where policies are evaluated.
+
+    robosuite's own document says that only collision geoms, group 0, weigh anything. MuJoCo leaves that out when it
+    writes a model as MJCF, so that in a scene restored from a recording what is only seen weighs as well: a bowl of
+    LIBERO's 46 g instead of 5.6 g.
+    """
+    compiler = mujoco_root.find("compiler")
+    if compiler is None:
+        compiler = ET.SubElement(mujoco_root, "compiler")
+    compiler.set("inertiagrouprange", "0 0")
 
 
 @cache

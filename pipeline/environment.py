@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import logging
 import os
+import xml.etree.ElementTree as ET
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from pipeline.assets import as_evaluated
 from pipeline.errors import PipelineError
+from pipeline.stepping import ControlStep
 from pipeline.types import Floats, Task
 
 
@@ -29,11 +34,20 @@ def _control_env() -> Any:
     return ControlEnv
 
 
+def _without_textures(model_xml: str) -> str:
+    """The scene with plain colours for images: nothing here is looked at, and they are half of its compilation."""
+    scene = ET.fromstring(model_xml)
+    for texture in scene.iterfind("asset/texture[@name][@file]"):
+        del texture.attrib["file"]
+        texture.attrib.update(builtin="flat", width="1", height="1")
+    return ET.tostring(scene, encoding="unicode")
+
+
 class Environment:
     """One task's environment; every ``restore`` forgets what happened before it.
 
-    Building one parses the BDDL file and loads every mesh (1 to 2.5 s), restoring a scene recompiles its model
-    (0.4 to 1 s), so keep an environment for all demonstrations of its task.
+    Building one parses the BDDL file and loads every mesh (1 to 4 s), so keep an environment for all demonstrations
+    of its task.
 
     Args:
         task: the task to build.
@@ -49,26 +63,50 @@ class Environment:
                 use_camera_obs=False,
                 ignore_done=True,
             )
+        self._control_step = ControlStep(self._env.env)
+        self._openings = len(self._env.env.object_property_initializers)
+        self._placed: dict[int, str] = {}
+        self._scene: str | None = None
 
     def place_fixtures(self, seed: int) -> str:
-        """The scene as LIBERO's own reset makes it under ``seed``, as MJCF.
+        """The scene as LIBERO's own first reset makes it under ``seed``, as MJCF; 1.3 s, the second time nothing.
 
         For demonstrations whose source did not record the scene: movable objects are put where the recorded state
         says, but fixtures (cabinet, stove, rack, microwave) are not part of it and stay where the reset put them.
         """
-        with _seeded(seed):
-            self._env.reset()
-        return str(self._env.sim.model.get_xml())
+        if seed not in self._placed:
+            # Each reset adds its samplers of open drawers and doors to those of all resets before, and draws from
+            # every one of them: without this, the second placement under a seed differs from the first.
+            del self._env.env.object_property_initializers[self._openings :]
+            self._scene = None
+            with _seeded(seed):
+                self._env.reset()
+            self._control_step = ControlStep(self._env.env)
+            scene = ET.fromstring(self._env.sim.model.get_xml())
+            as_evaluated(scene)
+            self._placed[seed] = ET.tostring(scene, encoding="unicode")
+        return self._placed[seed]
 
     def restore(self, model_xml: str, state: Floats) -> None:
         """Put the environment into a recorded scene and state, as if nothing had ever happened in this process.
+
+        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms.
 
         Args:
             model_xml: MJCF of the scene.
             state: (S,) flattened MuJoCo state: time, qpos, qvel.
         """
-        env = self._env
-        env.reset_from_xml_string(model_xml)
+        env = self._env.env
+        if model_xml != self._scene:
+            self._scene = None
+            env.reset_from_xml_string(_without_textures(model_xml))
+            self._scene, self._site_rgba = model_xml, env.sim.model.site_rgba.copy()
+        else:
+            # What of the model LIBERO changes while it steps: a burner's site is lit.
+            env.sim.model.site_rgba[:] = self._site_rgba
+            env.deterministic_reset = True
+            env.reset()
+            env.deterministic_reset = False
         # The gripper model survives the reset with its last command, which the next command is added to.
         env.robots[0].gripper.current_action = np.zeros(env.robots[0].gripper.dof)
         env.sim.reset()
@@ -80,13 +118,39 @@ class Environment:
                 expected="time, qpos and qvel of the same model",
                 remedy="use demonstrations recorded with this LIBERO version, or ones that carry their model_file",
             )
-        env.set_state(state)
+        env.sim.set_state_from_flattened(state)
         env.sim.forward()
+        # As after a reset in an evaluation: the controller knows where the arm is, and its null space holds the arm to
+        # the posture that it starts in, not to robosuite's home posture.
+        robot = env.robots[0]
+        robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
         env._post_process()
+        self._control_step = ControlStep(env)
 
     def step(self, action: Floats) -> None:
         """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1]."""
-        self._env.step(action)
+        self._control_step(action)
+
+    @property
+    def sim(self) -> Any:
+        """robosuite's ``MjSim`` of the scene restored last, to read from; a later ``restore`` may replace it.
+
+        Its textures are plain: render from the scene's MJCF instead. What is written into its model stays there when
+        the same scene is restored again.
+        """
+        return self._env.sim
+
+    @property
+    def hand(self) -> tuple[Floats, Rotation]:
+        """Position (3,) in m and orientation of the grip site, in the world's frame."""
+        data = self.sim.data._data
+        grip = data.site("gripper0_grip_site")
+        return grip.xpos.copy(), Rotation.from_matrix(grip.xmat.reshape(3, 3))
+
+    def pose(self, name: str) -> Floats:
+        """(7,) position in m and rotation wxyz of a movable object, by its name in the BDDL file."""
+        pose: Floats = self.sim.data._data.joint(f"{name}_joint0").qpos.copy()
+        return pose
 
     @property
     def state(self) -> Floats:
@@ -104,6 +168,12 @@ class Environment:
 
     def close(self) -> None:
         self._env.close()
+
+
+@lru_cache(maxsize=1)
+def shared(task: Task) -> Environment:
+    """This process's environment for ``task``, for whoever restores it before stepping."""
+    return Environment(task)
 
 
 class _seeded:  # noqa: N801 - reads as a verb where it is used

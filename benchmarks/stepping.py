@@ -1,0 +1,107 @@
+"""What a control step and a restored scene cost, ours beside LIBERO's own, on one starter demonstration of each task.
+
+    nice -n 10 python benchmarks/stepping.py [--tasks 'libero_goal/turn_on_the_stove' ...]
+
+Both step the same whole demonstrations in turn, ten control steps each, in CPU time, and their states, lit burners and
+success are compared bit for bit; the last line is the result as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from statistics import median
+
+import numpy as np
+
+from pipeline.demos import StarterSource
+from pipeline.environment import Environment
+from pipeline.tasks import select_tasks
+from pipeline.types import Demo, Floats
+
+TASKS = (
+    "libero_spatial/pick_up_the_black_bowl_in_the_top_drawer_of_the_wooden_cabinet_and_place_it_on_the_plate",
+    "libero_object/pick_up_the_milk_and_place_it_in_the_basket",
+    "libero_goal/turn_on_the_stove",
+    "libero_goal/open_the_top_drawer_and_put_the_bowl_inside",
+    "libero_10/KITCHEN_SCENE3_turn_on_the_stove_and_put_the_moka_pot_on_it",
+    "libero_10/KITCHEN_SCENE4_put_the_black_bowl_in_the_bottom_drawer_of_the_cabinet_and_close_it",
+    "libero_10/KITCHEN_SCENE6_put_the_yellow_and_white_mug_in_the_microwave_and_close_it",
+    "libero_10/STUDY_SCENE1_pick_up_the_book_and_place_it_in_the_back_compartment_of_the_caddy",
+)
+TURN = 10
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS))
+    source = StarterSource()
+    measured = []
+    for task in select_tasks(parser.parse_args().tasks):
+        measured.append(compare(source.load(source.index([task]).entries[0].demo_id)))
+        print(f"{task.suite}/{task.name}: {json.dumps(measured[-1])}")
+    steps = sum(one["control_steps"] for one in measured)
+    ours, liberos = (
+        sum(one[name] * one["control_steps"] for one in measured) / steps for name in ("ours_ms", "liberos_ms")
+    )
+    restores = {name: median(one[name] for one in measured) for name in measured[0] if name.startswith("restore")}
+    print(
+        json.dumps(
+            {
+                "tasks": len(measured),
+                "control_steps": steps,
+                "identical": all(one["identical"] for one in measured),
+                "ours_ms": round(ours, 2),
+                "liberos_ms": round(liberos, 2),
+                "ratio": round(ours / liberos, 3),
+                **{name: round(seconds, 3) for name, seconds in restores.items()},
+            }
+        )
+    )
+
+
+def compare(demo: Demo) -> dict[str, float]:
+    """Replay a demonstration both ways: ms a control step, s a restore, and whether every number was the same."""
+    ours, liberos = Environment(demo.task), Environment(demo.task)
+    model_xml = demo.model_xml or ours.place_fixtures(0)
+    begun = time.process_time()
+    liberos._env.reset_from_xml_string(model_xml)
+    restores = [time.process_time() - begun]
+    liberos.restore(model_xml, demo.init_state)
+    for _ in range(2):
+        begun = time.process_time()
+        ours.restore(model_xml, demo.init_state)
+        restores.append(time.process_time() - begun)
+    spent, identical = np.zeros(2), True
+    for first in range(0, len(demo.actions), TURN):
+        reached: list[Floats] = []
+        for way, (environment, step) in enumerate(((ours, ours.step), (liberos, liberos._env.step))):
+            observed: list[Floats] = []
+            for action in demo.actions[first : first + TURN]:
+                begun = time.process_time()
+                step(action)
+                spent[way] += time.process_time() - begun
+                observed += [
+                    environment.state,
+                    environment.site_alpha.astype(float),
+                    np.array([environment.succeeded()]),
+                ]
+            reached.append(np.concatenate(observed))
+        identical &= np.array_equal(reached[0], reached[1])
+    ours.close()
+    liberos.close()
+    ours_ms, liberos_ms = spent / len(demo.actions) * 1000
+    return {
+        "control_steps": len(demo.actions),
+        "identical": identical,
+        "ours_ms": round(ours_ms, 2),
+        "liberos_ms": round(liberos_ms, 2),
+        "restore_liberos_s": round(restores[0], 3),
+        "restore_s": round(restores[1], 3),
+        "restore_again_s": round(restores[2], 4),
+    }
+
+
+if __name__ == "__main__":
+    main()
