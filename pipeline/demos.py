@@ -22,19 +22,23 @@ from pipeline.errors import PipelineError
 from pipeline.tasks import SUITES, find_task, tasks
 from pipeline.types import Demo, Floats, Task
 
+HUMAN, EXPANDED = "human", "expanded"
+"""Who made a demonstration."""
+
 
 @dataclass(frozen=True)
 class DemoEntry:
     """A demonstration in a source's index: all that planning needs, without its arrays.
 
     Attributes:
-        task, key, source, sha256: as in ``Demo``.
+        task, key, source, origin, sha256: as in ``Demo``.
         steps: number of actions, 20 a second.
     """
 
     task: Task
     key: str
     source: str
+    origin: str
     sha256: str
     steps: int
 
@@ -115,7 +119,7 @@ class StarterSource:
                 where=folder,
                 remedy="pip install --force-reinstall robouse==0.2.0",
             ) from error
-        return _demo(task, key, source, actions, init_state[None], None, where=str(folder))
+        return _demo(task, key, source, HUMAN, actions, init_state[None], None, where=str(folder))
 
 
 @dataclass(frozen=True)
@@ -205,11 +209,20 @@ class HDF5Source:
             )
         # Named within the set, not on this machine: provenance must not change from machine to machine.
         source = f"{task.suite}/{path.name} {key}"
-        return _demo(task, key, source, actions, states, hdf5.text(group, "model_file", where), where)
+        origin = EXPANDED if hdf5.EXPANDED_FROM in group.attrs else HUMAN
+        model_file = hdf5.text(group, "model_file", where)
+        return _demo(task, key, source, origin, actions, states, model_file, where)
 
 
 def _demo(
-    task: Task, key: str, source: str, actions: Floats, states: Floats, model_file: str | None, where: str
+    task: Task,
+    key: str,
+    source: str,
+    origin: str,
+    actions: Floats,
+    states: Floats,
+    model_file: str | None,
+    where: str,
 ) -> Demo:
     """Check what was recorded and make a ``Demo`` of it. States are (T, S), or (1, S) when only the first is known."""
     fault = None
@@ -231,11 +244,12 @@ def _demo(
         content.update(array.astype("<f8").tobytes())
     content.update((model_file or "").encode())
     model_xml = None if model_file is None else relocate(model_file, where=f"{where} model_file")
-    return Demo(task, key, source, content.hexdigest(), actions, states[0].copy(), model_xml)
+    whole = states if len(states) == len(actions) else None
+    return Demo(task, key, source, origin, content.hexdigest(), actions, states[0].copy(), whole, model_xml)
 
 
 def _entry(demo: Demo) -> DemoEntry:
-    return DemoEntry(demo.task, demo.key, demo.source, demo.sha256, len(demo.actions))
+    return DemoEntry(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
 
 
 def _parse(demo_id: str) -> tuple[Task, str]:

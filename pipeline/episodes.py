@@ -38,7 +38,8 @@ class EpisodeLoader:
         row = _rows_by_id(self.plan_file)[episode_id]
         shown = streams_of(row.perturbations)
         rendered = FrameStore(self.frames, self.config).load(row.trajectory_id, [s.stream_id for s in shown.values()])
-        known = asdict(row) | {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
+        known = asdict(row) | {"replay_mode": rendered.replay_mode}
+        known |= {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
         return Episode(
             episode_id=episode_id,
             frames={view: rendered.streams[stream.stream_id] for view, stream in shown.items()},

@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,6 +20,9 @@ from pipeline.files import replaced
 from pipeline.types import Floats, Task
 
 AGAIN = "delete the file and download it again; the starter set needs no download"
+
+EXPANDED_FROM = "expanded_from"
+"""Attribute of a demonstration that was made from another: that one's id."""
 
 # LIBERO's longest demonstrations have some 500 steps; without a limit a few bytes of header could ask for all memory.
 _MAX_NUMBERS = 10_000_000
@@ -118,6 +121,7 @@ class Recording:
         robot_states: (T, 9) finger positions, end-effector position in m, end-effector quaternion (x, y, z, w).
         model_file: MJCF of the scene.
         obs: name to (T, ...), such as ``agentview_rgb`` (T, 128, 128, 3) or ``ee_pos`` (T, 3).
+        attrs: further attributes.
     """
 
     actions: Floats
@@ -125,6 +129,7 @@ class Recording:
     robot_states: Floats
     model_file: str
     obs: Mapping[str, NDArray[Any]]
+    attrs: Mapping[str, str] = field(default_factory=dict)
 
 
 def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
@@ -199,6 +204,7 @@ def _write_demo(group: h5py.Group, recording: Recording) -> None:
             raise ValueError(f"{name} has {len(values)} rows for {steps} actions")
         group.create_dataset(name, data=values)
     group.attrs.update(num_samples=steps, model_file=recording.model_file, init_state=recording.states[0])
+    group.attrs.update(recording.attrs)
 
 
 def _in_bddl(bddl: str, keyword: str) -> str:

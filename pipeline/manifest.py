@@ -26,7 +26,7 @@ _TYPES = {"string": pa.string(), "int": pa.int64(), "bool": pa.bool_()}
 def build(
     rows: Sequence[Row],
     outcome: Mapping[str, Verdict],
-    replayed: Mapping[str, tuple[int, str]],
+    replayed: Mapping[str, tuple[str, int, str]],
     devices: Mapping[str, str],
     rlds: Mapping[str, tuple[str, int]],
     lerobot: Mapping[str, int],
@@ -36,7 +36,7 @@ def build(
     Args:
         rows: the plan.
         outcome: episode id to verdict.
-        replayed: trajectory id to the number of executed actions and what physics perturbations came to.
+        replayed: trajectory id to the mode used, the number of executed actions and what physics perturbations came to.
         devices: trajectory id to the OpenGL device that rendered it, for every rendered trajectory.
         rlds: episode id to its shard's file name and its place in it, for every kept episode.
         lerobot: episode id to its ``episode_index``, for every kept episode.
@@ -45,11 +45,12 @@ def build(
     table = []
     for row in rows:
         verdict = outcome[row.episode_id]
-        steps, resolved = replayed.get(row.trajectory_id, (None, None))
+        mode, steps, resolved = replayed.get(row.trajectory_id, (None, None, None))
         shard, index = rlds.get(row.episode_id, (None, None))
         made: dict[str, Any] = {
             "kept": verdict.kept,
             "reason": verdict.reason,
+            "replay_mode": mode,
             "steps": steps,
             "resolved": resolved,
             "gl_device": devices.get(row.trajectory_id),

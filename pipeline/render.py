@@ -19,6 +19,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.episodes import rejected, verdicts
 from pipeline.frames import Stream, encode, streams_of, to_policy
 from pipeline.plan import Row, select
+from pipeline.scene import proprioception
 from pipeline.store import FrameStore, Rendered, TrajectoryStore
 from pipeline.types import Frame, Trajectory
 
@@ -57,15 +58,6 @@ class Renderer:
         """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
         self._renderer.update_scene(self.data, camera, self._option)
         return np.ascontiguousarray(self._renderer.render()[::-1])
-
-    def proprioception(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """State (8,) and joint state (7,) of the restored state; names and units in ``schemas/episode.json``."""
-        position = self.data.site("gripper0_grip_site").xpos
-        w, *xyz = self.data.body("robot0_right_hand").xquat
-        fingers = [self.data.joint(f"gripper0_finger_joint{n}").qpos[0] for n in (1, 2)]
-        joints = [self.data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)]
-        state = np.concatenate([position, _axis_angle(w, np.array(xyz)), fingers])
-        return state.astype(np.float32), np.array(joints, np.float32)
 
     @contextmanager
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
@@ -127,13 +119,13 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
         variants.setdefault(to_json(of_layer(stream.perturbations, RenderPerturbation)), []).append(stream)
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     refused: dict[str, str] = {}
-    proprioception: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
+    proprioceptions: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
     steps = len(trajectory.actions)
     renderer = Renderer(trajectory.model_xml)
     try:
         for step in range(steps):
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
-            proprioception.append(renderer.proprioception())
+            proprioceptions.append(proprioception(renderer.data))
         for perturbations, members in variants.items():
             with renderer.perturbed(of_layer(from_json(perturbations), RenderPerturbation)):
                 for step in range(steps):
@@ -150,18 +142,9 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
                         encoded[stream.stream_id].append(encode(to_policy(frame), config))
     finally:
         renderer.close()
-    state, joint_state = (np.stack(column) for column in zip(*proprioception, strict=True))
+    state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
     shown = {stream_id: frames for stream_id, frames in encoded.items() if stream_id not in refused}
-    return Rendered(state, joint_state, trajectory.actions.astype(np.float32), shown, refused)
-
-
-def _axis_angle(w: float, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis times angle (rad) of a unit quaternion, the angle in [0, 2 pi] as robosuite's ``quat2axisangle`` has it."""
-    w = float(np.clip(w, -1.0, 1.0))
-    sine = np.sqrt(1.0 - w * w)
-    if np.isclose(sine, 0.0):
-        return np.zeros(3)
-    return np.asarray(xyz * 2.0 * np.arccos(w) / sine)
+    return Rendered(trajectory.mode, state, joint_state, trajectory.actions.astype(np.float32), shown, refused)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -13,12 +13,14 @@ from numpy.typing import NDArray
 
 from pipeline.axes import PhysicsPerturbation, RefusedError, from_json, of_layer
 from pipeline.compute import Run
-from pipeline.config import Config, DemosConfig, ReplayConfig
-from pipeline.environment import Environment
+from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.environment import Environment, shared
 from pipeline.judge import verdict
 from pipeline.plan import Row, pending
+from pipeline.reference import Reference
 from pipeline.store import TrajectoryStore
-from pipeline.types import Demo, Floats, Scene, Task, Trajectory, Verdict
+from pipeline.tracking import Route, follow
+from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
 
 NOOP_NORM = 1e-4
 """Largest norm of the six pose deltas that still counts as no motion (OpenVLA's `regenerate_libero_dataset.py`)."""
@@ -52,49 +54,98 @@ def kept_actions(actions: Floats, noops: str) -> NDArray[np.bool_]:
     return real
 
 
-def open_loop(
+def replay(
     environment: Environment,
     demo: Demo,
     trajectory_id: str,
     config: ReplayConfig,
     perturbations: Sequence[PhysicsPerturbation] = (),
+    reference: Callable[[], Reference | None] = lambda: None,
 ) -> Trajectory:
-    """Send the demonstration's actions as they were recorded, from its exact first state or a perturbed one."""
+    """Replay a demonstration from its exact first state, or a perturbed one, in the configured mode.
+
+    Args:
+        environment: of the demonstration's task.
+        demo: what to replay.
+        trajectory_id: names the result.
+        config: how to replay.
+        perturbations: what to change before the first step.
+        reference: gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
+            ``tracked``; the result says how its actions came about.
+    """
     mask = kept_actions(demo.actions, config.noops)
-    actions = demo.actions[mask]
+    scene, refused = _perturbed(environment, demo, config, perturbations)
+
+    def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
+        environment.restore(scene.model_xml, scene.state)
+        states, alphas, actions, succeeded = [environment.state], [environment.site_alpha], [], []
+        refusal = refused
+        try:
+            for action in policy() if not refused else ():
+                environment.step(action)
+                actions.append(action)
+                states.append(environment.state)
+                alphas.append(environment.site_alpha)
+                succeeded.append(environment.succeeded())
+        except RefusedError as error:
+            refusal = Verdict(False, error.reason)
+        return Trajectory(
+            trajectory_id=trajectory_id,
+            mode=mode,
+            model_xml=scene.model_xml,
+            states=np.stack(states),
+            actions=np.array(actions).reshape(-1, 7),
+            kept_mask=mask,
+            site_alpha=np.stack(alphas),
+            resolved=json.dumps(scene.resolved, sort_keys=True),
+            verdict=refusal or verdict(np.stack(states), np.array(succeeded, bool)),
+        )
+
+    followed = reference() if config.mode == "tracked" else None
+    if followed is None:
+        opened = rollout("open_loop", lambda: iter(demo.actions[mask]))
+        if config.mode == "open_loop" or opened.verdict.kept or refused:
+            return opened
+        followed = reference()
+        if followed is None:
+            return opened
+    return rollout("tracked", lambda: _tracking(environment, followed))
+
+
+def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
+    """The actions that follow a reference from where the restored environment stands."""
+    poses = {name: environment.pose(name) for name in reference.poses}
+    return follow(Route.through(reference, environment.hand, poses), lambda: environment.hand)
+
+
+def _perturbed(
+    environment: Environment, demo: Demo, config: ReplayConfig, perturbations: Sequence[PhysicsPerturbation]
+) -> tuple[Scene, Verdict | None]:
+    """Where the replay starts, and the reason if a perturbation cannot be made there."""
     scene = Scene(demo.model_xml or environment.place_fixtures(config.fixture_seed), demo.init_state)
-    refusal: Verdict | None = None
     try:
         for perturbation in perturbations:
             scene = perturbation.apply(scene, demo)
-    except RefusedError as refused:
-        refusal, actions = Verdict(False, refused.reason), actions[:0]
-    environment.restore(scene.model_xml, scene.state)
-    states, alphas, succeeded = [environment.state], [environment.site_alpha], []
-    for action in actions:
-        environment.step(action)
-        states.append(environment.state)
-        alphas.append(environment.site_alpha)
-        succeeded.append(environment.succeeded())
-    return Trajectory(
-        trajectory_id=trajectory_id,
-        model_xml=scene.model_xml,
-        states=np.stack(states),
-        actions=actions,
-        kept_mask=mask,
-        site_alpha=np.stack(alphas),
-        resolved=json.dumps(scene.resolved, sort_keys=True),
-        verdict=refusal or verdict(np.stack(states), np.array(succeeded, bool)),
-    )
+    except RefusedError as error:
+        return scene, Verdict(False, error.reason)
+    return scene, None
 
 
 @dataclass(frozen=True)
 class ReplayJob:
-    """One trajectory's replay, as it is sent to a worker."""
+    """One trajectory's replay, as it is sent to a worker.
+
+    Attributes:
+        trajectory_id, demo_id, perturbations: as in the plan's row.
+        twin: trajectory of the same demonstration without perturbations, which tracking follows.
+        demos, config: sections of the run's configuration.
+        folder: of the trajectory store.
+    """
 
     trajectory_id: str
     demo_id: str
     perturbations: str
+    twin: str
     demos: DemosConfig
     config: ReplayConfig
     folder: Path
@@ -103,31 +154,63 @@ class ReplayJob:
         """Replay, judge and store; returns the verdict."""
         demo = self.demos.open().load(self.demo_id)
         physics = of_layer(from_json(self.perturbations), PhysicsPerturbation)
-        trajectory = open_loop(_environment(demo.task), demo, self.trajectory_id, self.config, physics)
+        environment = shared(demo.task)
+
+        def reference() -> Reference | None:
+            if self.twin != self.trajectory_id and (found := _twin(self.folder, self.twin)):
+                return found
+            if demo.states is None:
+                return None
+            mask = kept_actions(demo.actions, self.config.noops)
+            # The state after the last action is not recorded: as if the hand rested.
+            states = np.vstack([demo.states[mask], demo.states[-1:]])
+            model_xml = demo.model_xml or environment.place_fixtures(self.config.fixture_seed)
+            return Reference.of(model_xml, states, demo.actions[mask])
+
+        trajectory = replay(environment, demo, self.trajectory_id, self.config, physics, reference)
         TrajectoryStore(self.folder).save(trajectory)
         return trajectory.verdict
 
 
-def replay_plan(rows: Sequence[Row], config: Config, folder: Path, run: Run) -> dict[str, Verdict]:
+def replay_plan(
+    rows: Sequence[Row], demos: DemosConfig, config: ReplayConfig, folder: Path, run: Run
+) -> dict[str, Verdict]:
     """Replay what the plan needs and ``folder`` does not hold yet; reserves only where a candidate failed.
+
+    The twins come first, because tracking follows them.
 
     Returns:
         Trajectory id to verdict, for every trajectory that was needed.
     """
+    twins = [row for row in rows if row.role == "twin"]
+    verdicts = _replay(twins, twins, {}, demos, config, folder, run)
+    return _replay(rows, twins, verdicts, demos, config, folder, run)
+
+
+def _replay(
+    rows: Sequence[Row],
+    twins: Sequence[Row],
+    verdicts: dict[str, Verdict],
+    demos: DemosConfig,
+    config: ReplayConfig,
+    folder: Path,
+    run: Run,
+) -> dict[str, Verdict]:
     store = TrajectoryStore(folder)
     row_of = {row.trajectory_id: row for row in rows}
-    verdicts: dict[str, Verdict] = {}
+    twin_of = {row.demo_id: row.trajectory_id for row in twins}
     while needed := pending(rows, verdicts):
         found = {trajectory_id: store.verdict(trajectory_id) for trajectory_id in needed}
         verdicts |= {trajectory_id: verdict for trajectory_id, verdict in found.items() if verdict is not None}
-        # Ordered by task: a worker builds a task's environment once.
+        # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
         jobs = [
             ReplayJob(
                 trajectory_id,
                 row_of[trajectory_id].demo_id,
                 row_of[trajectory_id].perturbations,
-                config.demos,
-                config.replay,
+                twin_of[row_of[trajectory_id].demo_id],
+                demos,
+                config,
                 folder,
             )
             for trajectory_id in sorted(needed, key=lambda trajectory_id: row_of[trajectory_id].demo_id)
@@ -140,6 +223,9 @@ def replay_plan(rows: Sequence[Row], config: Config, folder: Path, run: Run) -> 
 
 
 @lru_cache(maxsize=1)
-def _environment(task: Task) -> Environment:
-    """This process's environment for ``task``."""
-    return Environment(task)
+def _twin(folder: Path, trajectory_id: str) -> Reference | None:
+    """What a twin did, if it reached its goal."""
+    trajectory = TrajectoryStore(folder).load(trajectory_id)
+    if not trajectory.verdict.kept:
+        return None
+    return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)

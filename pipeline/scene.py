@@ -38,6 +38,11 @@ class Compiled:
         mask: NDArray[np.bool_] = self.model.body_rootid == self.model.body(body).rootid
         return mask
 
+    def xy_m(self, name: str) -> Floats:
+        """(2,) where a movable object stands, by its name in the BDDL file."""
+        position: Floats = self.data.body(f"{name}_main").xpos[:2]
+        return position
+
     def touching(self, part: NDArray[np.bool_]) -> dict[tuple[str, str], float]:
         """Each pair of (a body of the part, a body outside of it) in contact, and the gap in m: deepest, negative."""
         gaps: dict[tuple[str, str], float] = {}
@@ -50,3 +55,22 @@ class Compiled:
             pair = (self.model.body(own).name, self.model.body(other).name)
             gaps[pair] = min(gaps.get(pair, 0.0), float(contact.dist))
         return gaps
+
+
+def proprioception(data: mujoco.MjData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """State (8,) and joint state (7,) of a restored scene; names and units in ``schemas/episode.json``."""
+    position = data.site("gripper0_grip_site").xpos
+    w, *xyz = data.body("robot0_right_hand").xquat
+    fingers = [data.joint(f"gripper0_finger_joint{n}").qpos[0] for n in (1, 2)]
+    joints = [data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)]
+    state = np.concatenate([position, _axis_angle(w, np.array(xyz)), fingers])
+    return state.astype(np.float32), np.array(joints, np.float32)
+
+
+def _axis_angle(w: float, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axis times angle (rad) of a unit quaternion, the angle in [0, 2 pi] as robosuite's ``quat2axisangle`` has it."""
+    w = float(np.clip(w, -1.0, 1.0))
+    sine = np.sqrt(1.0 - w * w)
+    if np.isclose(sine, 0.0):
+        return np.zeros(3)
+    return np.asarray(xyz * 2.0 * np.arccos(w) / sine)

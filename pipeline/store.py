@@ -37,6 +37,7 @@ class TrajectoryStore:
     def save(self, trajectory: Trajectory) -> None:
         with replaced(self.path(trajectory.trajectory_id)) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["made_by"] = fingerprint()
+            file.attrs["mode"] = trajectory.mode
             file.attrs["kept"] = trajectory.verdict.kept
             file.attrs["reason"] = trajectory.verdict.reason
             file.attrs["resolved"] = trajectory.resolved
@@ -55,6 +56,7 @@ class TrajectoryStore:
         with _opened(self.path(trajectory_id), fingerprint(), "replay") as file:
             return Trajectory(
                 trajectory_id=trajectory_id,
+                mode=str(file.attrs["mode"]),
                 model_xml=file["model_xml"][()].tobytes().decode(),
                 states=file["states"][()],
                 actions=file["actions"][()],
@@ -72,10 +74,10 @@ class TrajectoryStore:
         except PipelineError:
             return None
 
-    def outcome(self, trajectory_id: str) -> tuple[int, str]:
-        """How many actions were executed, and JSON of what physics perturbations came to."""
+    def outcome(self, trajectory_id: str) -> tuple[str, int, str]:
+        """The replay's mode, how many actions were executed, and JSON of what physics perturbations came to."""
         with _opened(self.path(trajectory_id), fingerprint(), "replay") as file:
-            return len(file["actions"]), str(file.attrs["resolved"])
+            return str(file.attrs["mode"]), len(file["actions"]), str(file.attrs["resolved"])
 
 
 @dataclass(frozen=True)
@@ -83,11 +85,13 @@ class Rendered:
     """Everything that a policy may see of one trajectory.
 
     Attributes:
+        replay_mode: how the trajectory's actions came about.
         state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
         streams: stream id to K encoded frames.
         rejected: stream id to the reason why it was not rendered.
     """
 
+    replay_mode: str
     state: NDArray[np.float32]
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]
@@ -116,6 +120,7 @@ class FrameStore:
         with replaced(self.path(trajectory_id)) as temporary, h5py.File(temporary, "w") as file:
             file.attrs["made_by"] = self._made_by
             file.attrs["device"] = self._device or ""
+            file.attrs["replay_mode"] = rendered.replay_mode
             for name in ("state", "joint_state", "action"):
                 file[name] = getattr(rendered, name)
             for stream, frames in sorted(rendered.streams.items()):
@@ -160,6 +165,7 @@ class FrameStore:
                     remedy="run the render stage again",
                 )
             return Rendered(
+                replay_mode=str(file.attrs["replay_mode"]),
                 state=file["state"][()],
                 joint_state=file["joint_state"][()],
                 action=file["action"][()],

@@ -40,9 +40,11 @@ class Demo:
         task: the task it solves.
         key: its name in its source, such as ``demo_0``.
         source: where it came from, for provenance (never parsed).
+        origin: who made it, ``human``, or ``expanded`` when it was made from a human one.
         sha256: hash of the recorded content (actions, states, model), 64 hex digits.
         actions: (T, 7) OSC_POSE deltas in [-1, 1] and gripper (-1 open, +1 close), 20 Hz.
         init_state: (S,) flattened MuJoCo state before the first action: time, qpos, qvel.
+        states: (T, S) the same before each action, or None when the source recorded only the first.
         model_xml: MJCF of the recorded scene with asset paths of this machine, or None when the source did
             not record it (then fixtures are placed by LIBERO's own reset under a fixed seed).
     """
@@ -50,9 +52,11 @@ class Demo:
     task: Task
     key: str
     source: str
+    origin: str
     sha256: str
     actions: Floats
     init_state: Floats
+    states: Floats | None
     model_xml: str | None
 
     @property
@@ -90,6 +94,7 @@ class Trajectory:
 
     Attributes:
         trajectory_id: hash of everything that determines it.
+        mode: how its actions came about, ``open_loop`` or ``tracked``.
         model_xml: MJCF of the scene it happened in, asset paths of this machine.
         states: (K+1, S) flattened states: before each executed action, and after the last.
         actions: (K, 7) executed actions.
@@ -100,6 +105,7 @@ class Trajectory:
     """
 
     trajectory_id: str
+    mode: str
     model_xml: str
     states: Floats
     actions: Floats

@@ -14,7 +14,7 @@ def run(config: Config) -> None:
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "trajectories"
     with runner(config.compute) as workers:
-        verdicts = replay_plan(rows, config, folder, workers)
+        verdicts = replay_plan(rows, config.demos, config.replay, folder, workers)
     keep_only(folder, {f"{trajectory_id}.h5" for trajectory_id in verdicts})
     kept = sum(verdict.kept for verdict in verdicts.values())
     (config.data / "replay.json").write_text(json.dumps({"replayed": len(verdicts), "kept": kept}) + "\n")

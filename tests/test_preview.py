@@ -164,6 +164,7 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
     environment.restore(stage.scene.model_xml, stage.scene.state)
     begun = Trajectory(
         trajectory_id="begun",
+        mode="open_loop",
         model_xml=stage.scene.model_xml,
         states=np.stack([environment.state] * 2),
         actions=np.zeros((1, 7)),

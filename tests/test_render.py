@@ -20,6 +20,7 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import Stream, decode, encode, streams_of, to_policy
 from pipeline.render import Renderer, render
+from pipeline.scene import proprioception
 from pipeline.seeding import rng
 from pipeline.store import FrameStore
 from pipeline.types import Frame, Task, Trajectory
@@ -60,7 +61,7 @@ def test_frames_and_proprioception_equal_libero(libero_frames: tuple[Trajectory,
         for step in steps:
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             frames = {view: renderer.frame(spec.camera) for view, spec in SCHEMA.views.items()}
-            ours[step] = frames, *renderer.proprioception()
+            ours[step] = frames, *proprioception(renderer.data)
     renderer.close()
 
     model = libero.env.sim.model._model
@@ -131,7 +132,7 @@ def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path
     del short_demos
     source = whole[MILK]
     steps = 8
-    trajectory = Trajectory("t", source.model_xml, source.states[: steps + 1], source.actions[:steps],
+    trajectory = Trajectory("t", "open_loop", source.model_xml, source.states[: steps + 1], source.actions[:steps],
                             source.kept_mask, source.site_alpha[: steps + 1], "{}", source.verdict)  # fmt: skip
     noise = NoiseAxis().sample(rng("order"), MILK, 0)
     streams = [

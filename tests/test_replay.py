@@ -18,7 +18,7 @@ from pipeline.demos import HDF5Source
 from pipeline.environment import Environment
 from pipeline.errors import PipelineError
 from pipeline.judge import verdict
-from pipeline.replay import NOOP_NORM, kept_actions, open_loop
+from pipeline.replay import NOOP_NORM, kept_actions, replay
 from pipeline.types import Floats, Task, Trajectory
 
 ACTIONS = st.lists(st.tuples(st.sampled_from([0.0, 5e-5, 0.3]), st.sampled_from([-1.0, 1.0])), min_size=1, max_size=30)
@@ -62,7 +62,7 @@ def test_policies_nest(drawn: list[tuple[float, float]]) -> None:
 
 def replayed(root: Path, task: Task, environment: Environment, key: str = "demo_0") -> Trajectory:
     demo = HDF5Source(root).load(f"{task.suite}/{task.name}/{key}")
-    return open_loop(environment, demo, "t", ReplayConfig())
+    return replay(environment, demo, "t", ReplayConfig())
 
 
 def hashed(trajectory: Trajectory) -> str:

@@ -12,7 +12,7 @@ from pipeline.axes.base import RefusedError
 from pipeline.axes.robot import HOME_RAD, RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
 from pipeline.environment import Environment
-from pipeline.replay import open_loop
+from pipeline.replay import replay
 from pipeline.scene import Compiled
 from pipeline.seeding import rng
 from pipeline.testset import TestSet, TestTask
@@ -112,7 +112,7 @@ def test_the_replay_starts_there(environment: Environment) -> None:
     demo = starter_demo(PLATE)
     short = replace(demo, actions=demo.actions[:3])
     drawn = RobotAxis(levels=(5,)).sample(rng("another"), PLATE, 0)
-    clean, moved = (open_loop(environment, short, "t", ReplayConfig(), changes) for changes in ((), (drawn,)))
+    clean, moved = (replay(environment, short, "t", ReplayConfig(), changes) for changes in ((), (drawn,)))
     starts = [recorded_rad(Scene(t.model_xml, t.states[0])) for t in (clean, moved)]
     assert np.allclose(starts[1] - starts[0], drawn.joint_offsets_rad, rtol=0, atol=1e-9)
     assert len(moved.states) == len(clean.states)

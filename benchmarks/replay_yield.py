@@ -1,0 +1,144 @@
+"""How many replays reach their goal, open-loop and in ``auto``, by suite, axis and level; and how smooth they are.
+
+    nice -n 10 python benchmarks/replay_yield.py [--draws 1] [--axes robot pose layout] [--levels 1 3 5]
+
+Draws come from the planner, over the starter demonstrations; ``--folder`` keeps the trajectories, so that a run that
+was stopped goes on where it was. The last line is the result as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from pipeline import plan, testset
+from pipeline.axes import from_json
+from pipeline.compute import runner
+from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
+from pipeline.reference import Reference
+from pipeline.replay import replay_plan
+from pipeline.store import TrajectoryStore
+from pipeline.tasks import SUITES
+from pipeline.types import Verdict
+
+AXES = ("robot", "pose", "layout")
+SATURATED = 0.93
+"""The largest action that a demonstrator's input device gives is 0.9375."""
+
+REPLAY = ReplayConfig(mode="auto")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--axes", nargs="+", choices=AXES, default=AXES)
+    parser.add_argument("--levels", nargs="+", type=int, default=[1, 2, 3, 4, 5])
+    parser.add_argument("--draws", type=int, default=1, help="of each demonstration at each level")
+    parser.add_argument("--tasks", nargs="+", default=[f"{suite}/*" for suite in SUITES[:4]])
+    parser.add_argument("--folder", type=Path)
+    arguments = parser.parse_args()
+    demos = DemosConfig(tasks=tuple(arguments.tasks))
+    entries, test = demos.index().entries, testset.load()
+    rows: dict[str, plan.Row] = {}
+    for axis, level in product(arguments.axes, arguments.levels):
+        episodes = {axis: len(entries) * arguments.draws}
+        drawn = PlanConfig.model_validate({"seed": 1, "axes": {axis: {"levels": [level]}}, "episodes": episodes})
+        rows |= {row.episode_id: row for row in plan.make(entries, drawn, REPLAY, test)}
+    with tempfile.TemporaryDirectory() as temporary, runner(ComputeConfig()) as run:
+        store = TrajectoryStore(arguments.folder or Path(temporary))
+        verdicts = replay_plan(list(rows.values()), demos, REPLAY, store.root, run)
+        lines = _lines(rows.values(), verdicts, store)
+        shapes = list(_shapes(rows.values(), verdicts, store))
+    _print(lines)
+    print(json.dumps({"yields": lines, "smoothness": _medians(shapes)}))
+
+
+def _lines(rows: Iterable[plan.Row], verdicts: Mapping[str, Verdict], store: TrajectoryStore) -> list[dict[str, Any]]:
+    """A line for each axis and level. Draws that the scene refuses are counted apart, as they cost no replay."""
+    reasons: dict[tuple[str, int], dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
+    for row in rows:
+        level: int = from_json(row.perturbations)[0].level if row.perturbations != "[]" else 0
+        reason = verdicts[row.trajectory_id].reason
+        mode, steps, _ = store.outcome(row.trajectory_id)
+        if not steps:
+            reason = f"refused: {reason}"
+        elif reason == "kept":
+            # In `auto`, what is kept as tracked has failed open-loop before.
+            reason = mode
+        reasons[row.axis, level][row.suite][reason] += 1
+    lines: list[dict[str, Any]] = []
+    for (axis, level), by_suite in reasons.items():
+        total = sum(by_suite.values(), Counter[str]())
+        tried = sum(number for reason, number in total.items() if not reason.startswith("refused"))
+        line: dict[str, Any] = {"axis": axis, "level": level, "tried": tried}
+        for mode, kept in (("open_loop", ("open_loop",)), ("auto", ("open_loop", "tracked"))):
+            number = sum(total[reason] for reason in kept)
+            line[mode] = {"kept": number, "interval": _interval(number, tried)} | {
+                suite: f"{sum(of[reason] for reason in kept)}/{sum(n for r, n in of.items() if r[:7] != 'refused')}"
+                for suite, of in by_suite.items()
+            }
+        line["dropped"] = {reason: n for reason, n in total.items() if reason not in ("open_loop", "tracked")}
+        lines.append(line)
+    return lines
+
+
+def _shapes(
+    rows: Iterable[plan.Row], verdicts: Mapping[str, Verdict], store: TrajectoryStore
+) -> Iterator[dict[str, float]]:
+    """How each tracked replay compares with what the demonstrator did, as ratios."""
+    twins = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
+    for row in rows:
+        if verdicts[row.trajectory_id].kept and store.outcome(row.trajectory_id)[0] == "tracked":
+            own, twin = (_shape(store, trajectory_id) for trajectory_id in (row.trajectory_id, twins[row.demo_id]))
+            ratios = {name: own[name] / twin[name] for name in own if name != "saturated"}
+            yield ratios | {"saturated": own["saturated"], "saturated_twin": twin["saturated"]}
+
+
+@cache
+def _shape(store: TrajectoryStore, trajectory_id: str) -> dict[str, float]:
+    trajectory = store.load(trajectory_id)
+    reference = Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
+    arm = trajectory.actions[:, :6]
+    return reference.shape | {
+        "action_change": float(np.sqrt((np.diff(arm, axis=0) ** 2).sum(axis=1).mean())),
+        "saturated": float((np.abs(arm) > SATURATED).any(axis=1).mean()),
+    }
+
+
+def _medians(shapes: Sequence[dict[str, float]]) -> dict[str, float]:
+    names = shapes[0] if shapes else ()
+    return {"replays": len(shapes)} | {n: round(float(np.median([shape[n] for shape in shapes])), 3) for n in names}
+
+
+def _interval(kept: int, tried: int) -> tuple[float, float]:
+    """Wilson's 95 % interval of a share."""
+    if not tried:
+        return 0.0, 1.0
+    z = 1.96
+    centre, spread = (kept + z * z / 2) / (tried + z * z), z * np.sqrt(kept * (tried - kept) / tried + z * z / 4)
+    return round(float(centre - spread / (tried + z * z)), 3), round(float(centre + spread / (tried + z * z)), 3)
+
+
+def _print(lines: Sequence[Mapping[str, Any]]) -> None:
+    table = Table("axis", "level", "mode", *SUITES[:4], "all", "95 %", "dropped")
+    for line, mode in product(lines, ("open_loop", "auto")):
+        of = line[mode]
+        suites = [of.get(suite, "-") for suite in SUITES[:4]]
+        kept = f"{of['kept']}/{line['tried']}"
+        dropped = ", ".join(f"{reason} {number}" for reason, number in line["dropped"].items())
+        table.add_row(line["axis"], str(line["level"]), mode, *suites, kept, str(of["interval"]), dropped)
+    Console(stderr=True, width=180).print(table)
+
+
+if __name__ == "__main__":
+    main()

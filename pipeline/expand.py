@@ -1,0 +1,195 @@
+"""New demonstrations from old ones: other starts of the arm, other places of the target, in LIBERO's own HDF5 layout.
+
+For whoever cannot reach the hub's 50 demonstrations of each task: the starter set's one human demonstration becomes
+many, made by the planner and the replay that also make the datasets, and marked as expanded wherever they are used.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import hdf5, plan
+from pipeline.axes import Axes
+from pipeline.axes.pose import PoseAxis
+from pipeline.axes.robot import RobotAxis
+from pipeline.compute import Run
+from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
+from pipeline.reference import Reference
+from pipeline.replay import replay_plan
+from pipeline.scene import Compiled, proprioception
+from pipeline.store import TrajectoryStore
+from pipeline.testset import TestSet
+from pipeline.types import Floats, Scene, Trajectory
+
+RESERVE = 1.0
+"""Candidates drawn beyond those wanted, as a share: poses that collide are refused, and not every replay succeeds."""
+
+ROUGH = {"steps": 1.5, "path_m": 1.5, "jerk": 2.0}
+"""Largest multiples of the human's episode length, path length and jerk (root mean square) that count as smooth."""
+
+APART_RAD, APART_M = 0.05, 0.005
+"""Two demonstrations of a task are the same when their arms start closer than this, and every object of theirs does."""
+
+REPLAY = ReplayConfig(mode="auto", noops="keep")
+"""No-ops are kept, as in LIBERO's files: whoever reads them drops what they do not want."""
+
+
+@dataclass
+class Expansion:
+    """What came of it.
+
+    Attributes:
+        files: what was written.
+        written: demonstrations in them.
+        dropped: reason to number of candidates.
+        short: task to the number of demonstrations that no candidate was left for.
+    """
+
+    files: list[Path] = field(default_factory=list)
+    written: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+    short: dict[str, int] = field(default_factory=dict)
+
+
+def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSet, run: Run) -> Expansion:
+    """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
+
+    Every candidate is a demonstration whose arm starts elsewhere and, where the task moves an object, whose target
+    stands elsewhere. It is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those
+    before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was.
+
+    Raises:
+        PipelineError: when a demonstration cannot be read.
+    """
+    rows = _rows(demos, per_task, seed, test)
+    store = TrajectoryStore(out / ".replays")
+    result = Expansion()
+    while True:
+        verdicts = replay_plan(rows, demos, REPLAY, store.root, run)
+        outcome = plan.select(rows, verdicts)
+        kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
+        faults = _faults(kept, rows, store)
+        if not faults:
+            break
+        result.dropped.update(faults.values())
+        rows = [row for row in rows if row.episode_id not in faults]
+    unwanted = {"kept", "reserve_not_needed"}
+    reasons = [outcome[row.episode_id].reason for row in rows if row.role == "perturbed"]
+    result.dropped.update(reason for reason in reasons if reason not in unwanted)
+    tasks = {f"{entry.task.suite}/{entry.task.name}": entry.task for entry in demos.index().entries}
+    by_task: dict[str, list[plan.Row]] = defaultdict(list)
+    for row in kept:
+        by_task[f"{row.suite}/{row.task}"].append(row)
+    for name, task in tasks.items():
+        made = by_task[name]
+        if len(made) < per_task:
+            result.short[name] = per_task - len(made)
+        if made:
+            file = out / task.suite / f"{task.name}_demo.hdf5"
+            hdf5.write(file, task, (_recording(store.load(row.trajectory_id), row) for row in made))
+            result.files.append(file)
+            result.written += len(made)
+    return result
+
+
+def _rows(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
+    """The candidates: arm and target moved where a task moves something, the arm alone where it only opens or turns."""
+    entries = demos.index().entries
+    axes = Axes(pose=PoseAxis(), robot=RobotAxis())
+    rows: list[plan.Row] = []
+    for moves in (True, False):
+        group = [entry for entry in entries if PoseAxis().applies(entry.task) == moves]
+        if group:
+            name = "pose+robot" if moves else "robot"
+            drawn_from = axes if moves else Axes(robot=axes.robot)
+            tasks = {entry.task for entry in group}
+            wanted = PlanConfig(seed=seed, axes=drawn_from, episodes={name: per_task * len(tasks)}, reserve=RESERVE)
+            rows += plan.make(group, wanted, REPLAY, test)
+    return rows
+
+
+def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: TrajectoryStore) -> dict[str, str]:
+    """Episode id to what is wrong with a replay that reached its goal, where something is."""
+    twins = {row.demo_id: row.trajectory_id for row in planned if row.role == "twin"}
+    accepted: dict[tuple[str, str], list[_Motion]] = defaultdict(list)
+    faults: dict[str, str] = {}
+    for row in rows:
+        motion, human = (_motion(store, trajectory_id) for trajectory_id in (row.trajectory_id, twins[row.demo_id]))
+        before = accepted[row.suite, row.task]
+        if any(motion.shape[name] > limit * human.shape[name] for name, limit in ROUGH.items()):
+            faults[row.episode_id] = "not_smooth"
+        elif any(motion.starts_like(other) for other in before):
+            faults[row.episode_id] = "duplicate"
+        else:
+            before.append(motion)
+    return faults
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What candidates are compared by: see ``Reference.shape``; arm joints (7,) in rad and objects (N, 3) in m."""
+
+    shape: Mapping[str, float]
+    joints_rad: Floats
+    objects_m: Floats
+
+    def starts_like(self, other: _Motion) -> bool:
+        turned = np.linalg.norm(self.joints_rad - other.joints_rad)
+        moved = np.linalg.norm(self.objects_m - other.objects_m, axis=1).max(initial=0.0)
+        return bool(turned < APART_RAD and moved < APART_M)
+
+
+@cache
+def _motion(store: TrajectoryStore, trajectory_id: str) -> _Motion:
+    trajectory = store.load(trajectory_id)
+    reference = Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
+    objects_m = np.array([pose[0, :3] for pose in reference.poses.values()]).reshape(-1, 3)
+    # After the time, a flattened state has the arm's seven joints.
+    return _Motion(reference.shape, trajectory.states[0, 1:8], objects_m)
+
+
+def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
+    """A replay as LIBERO records demonstrations, without images, and with its origin.
+
+    As in LIBERO's files, states are those before each action and observations those after it.
+    """
+    compiled = Compiled(Scene(trajectory.model_xml, trajectory.states[0]))
+    robot, state, joints = [], [], []
+    for number, flattened in enumerate(trajectory.states):
+        compiled.restore(flattened)
+        hand, arm = proprioception(compiled.data)
+        w, *xyz = compiled.data.body("robot0_right_hand").xquat
+        if number < len(trajectory.actions):
+            robot.append([*hand[6:], *hand[:3], *xyz, w])
+        if number:
+            state.append(hand)
+            joints.append(arm)
+    seen = np.array(state, np.float64)
+    return hdf5.Recording(
+        actions=trajectory.actions,
+        states=trajectory.states[:-1],
+        robot_states=np.array(robot, np.float64),
+        model_file=trajectory.model_xml,
+        obs={
+            "ee_pos": seen[:, :3],
+            "ee_ori": seen[:, 3:6],
+            "ee_states": seen[:, :6],
+            "gripper_states": seen[:, 6:],
+            "joint_states": np.array(joints, np.float64),
+        },
+        attrs={
+            hdf5.EXPANDED_FROM: row.demo_id,
+            "expanded_from_sha256": row.demo_sha256,
+            "expanded_by": f"perturbed-libero {version('pipeline')}",
+            "perturbations": row.perturbations,
+            "resolved": trajectory.resolved,
+            "replay_mode": trajectory.mode,
+        },
+    )

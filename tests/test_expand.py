@@ -1,0 +1,68 @@
+"""Expansion: new demonstrations of a task that differ, succeed, and read back through the ordinary source."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import STOVE, link_testset, starter_demo
+
+from pipeline import testset
+from pipeline.compute import loop
+from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.demos import HDF5Source
+from pipeline.environment import Environment
+from pipeline.expand import APART_RAD, Expansion, expand
+from pipeline.replay import replay
+
+TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
+
+
+@pytest.fixture(scope="module")
+def expanded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Expansion]:
+    folder = tmp_path_factory.mktemp("expanded")
+    link_testset(folder)
+    return folder / "demos", expand(folder / "demos", TASKS, 2, 1, testset.load(folder / testset.FOLDER), loop)
+
+
+def test_as_many_as_asked_for_in_liberos_layout(expanded: tuple[Path, Expansion]) -> None:
+    root, made = expanded
+    assert (made.written, made.short) == (2, {})
+    index = HDF5Source(root).index([STOVE])
+    assert not index.problems
+    assert [entry.origin for entry in index.entries] == ["expanded", "expanded"]
+
+
+def test_each_succeeds_again_open_loop_and_starts_elsewhere(expanded: tuple[Path, Expansion]) -> None:
+    """The executed actions are the demonstration: sent from the recorded state they give the recorded states."""
+    source, environment = HDF5Source(expanded[0]), Environment(STOVE)
+    arms = []
+    for entry in source.index([STOVE]).entries:
+        demo = source.load(entry.demo_id)
+        trajectory = replay(environment, demo, "t", ReplayConfig(noops="keep"))
+        assert trajectory.verdict.kept
+        assert demo.states is not None
+        assert np.array_equal(trajectory.states[:-1], demo.states)
+        arms.append(demo.init_state[1:8])
+    assert np.linalg.norm(arms[0] - arms[1]) > APART_RAD
+
+
+def test_a_second_time_nothing_is_replayed_and_the_bytes_are_the_same(expanded: tuple[Path, Expansion]) -> None:
+    root, made = expanded
+    before = made.files[0].read_bytes()
+    replays = {file: file.stat().st_mtime_ns for file in (root / ".replays").iterdir()}
+    again = expand(root, TASKS, 2, 1, testset.load(root.parent / testset.FOLDER), loop)
+    assert again.written == 2
+    assert made.files[0].read_bytes() == before
+    assert {file: file.stat().st_mtime_ns for file in (root / ".replays").iterdir()} == replays
+
+
+def test_the_file_says_what_was_changed(expanded: tuple[Path, Expansion]) -> None:
+    with h5py.File(expanded[1].files[0]) as file:
+        attributes = dict(file["data/demo_0"].attrs)
+    assert attributes["expanded_from"] == starter_demo(STOVE).demo_id
+    assert [change["axis"] for change in json.loads(attributes["perturbations"])] == ["robot"]
+    assert attributes["replay_mode"] in ("open_loop", "tracked")

@@ -1,0 +1,178 @@
+"""Tracked replay: routes through moved things, actions that a policy could have sent, and goals reached from afar."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import MILK, PLATE, STOVE, starter_demo
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from pipeline.axes.base import PhysicsPerturbation, RefusedError
+from pipeline.axes.pose import PosePerturbation
+from pipeline.axes.robot import RobotAxis
+from pipeline.config import ReplayConfig
+from pipeline.environment import Environment
+from pipeline.reference import Reference
+from pipeline.replay import replay
+from pipeline.seeding import rng
+from pipeline.tracking import GAIN, PATIENCE, STRIDE, Hand, Route, follow
+from pipeline.types import Demo, Floats, Task, Trajectory
+
+AUTO = ReplayConfig(mode="auto")
+
+
+def reference_of(trajectory: Trajectory) -> Reference:
+    return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
+
+
+@pytest.fixture(scope="module")
+def milk(whole: dict[Task, Trajectory]) -> Reference:
+    return reference_of(whole[MILK])
+
+
+def start_of(reference: Reference) -> Hand:
+    return reference.positions_m[0], reference.rotations[0]
+
+
+def poses_of(reference: Reference, **moved: Floats) -> dict[str, Floats]:
+    return {name: poses[0] for name, poses in reference.poses.items()} | moved
+
+
+def displaced(pose: Floats, dx_m: float, dy_m: float, yaw_rad: float) -> Floats:
+    turned = Rotation.from_euler("z", yaw_rad) * Rotation.from_quat(pose[[4, 5, 6, 3]])
+    return np.concatenate([pose[:3] + np.array([dx_m, dy_m, 0.0]), turned.as_quat()[[3, 0, 1, 2]]])
+
+
+def test_the_reference_tells_grasp_carrying_and_release(milk: Reference) -> None:
+    """The human closes the gripper on the milk, carries it over to the basket and opens the gripper there."""
+    carried = np.flatnonzero(milk.carried["milk_1"])
+    closes, opens = (np.flatnonzero(np.diff(milk.actions[:, 6]) == sign * 2)[0] for sign in (1, -1))
+    assert closes < carried[0] < carried[-1] <= opens + 6
+    assert not milk.busy[: closes - 10].any(), "nothing is touched on the way there"
+    assert np.flatnonzero(milk.met["basket_1"])[0] > carried[0], "the basket is met with the milk in hand"
+    others = set(milk.poses) - {"milk_1", "basket_1"}
+    assert not any(milk.held[name].any() for name in others)
+
+
+def test_an_unchanged_scene_leaves_the_reference_and_its_actions_as_they_are(milk: Reference) -> None:
+    route = Route.through(milk, start_of(milk), poses_of(milk))
+    assert np.allclose(route.positions_m, milk.positions_m, rtol=0, atol=1e-12)
+    places = iter(range(len(milk)))
+    actions = np.array(list(follow(route, lambda: route.at(next(places)))))
+    assert np.allclose(actions, milk.actions, rtol=0, atol=1e-9)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.floats(-0.08, 0.08), st.floats(-0.08, 0.08), st.floats(-0.35, 0.35))
+def test_the_moved_object_is_grasped_as_the_human_did_and_put_where_the_human_did(
+    milk: Reference, dx_m: float, dy_m: float, yaw_rad: float
+) -> None:
+    pose = displaced(milk.poses["milk_1"][0], dx_m, dy_m, yaw_rad)
+    route = Route.through(milk, start_of(milk), poses_of(milk, milk_1=pose))
+    carried = np.flatnonzero(milk.carried["milk_1"])
+    grasp, release = int(carried[0]), int(np.flatnonzero(milk.held["milk_1"])[-1])
+
+    def in_object(position: Floats, rotation: Rotation, pose: Floats) -> tuple[Floats, Floats]:
+        frame = Rotation.from_quat(pose[[4, 5, 6, 3]]).inv()
+        return frame.apply(position - pose[:3]), (frame * rotation).as_matrix()
+
+    then = in_object(milk.positions_m[grasp], milk.rotations[grasp], milk.poses["milk_1"][0])
+    now = in_object(route.positions_m[grasp], route.rotations[grasp], pose)
+    # A displacement of less than 0.1 mm and 1 mrad is none.
+    assert np.allclose(now[0], then[0], rtol=0, atol=2e-4)
+    assert np.allclose(now[1], then[1], rtol=0, atol=2e-3)
+    assert np.allclose(route.positions_m[release:], milk.positions_m[release:], rtol=0, atol=1e-12)
+    assert np.allclose(route.positions_m[0], milk.positions_m[0], rtol=0, atol=1e-12)
+
+
+def test_a_moved_basket_is_where_the_milk_is_let_go(milk: Reference) -> None:
+    shift = np.array([0.03, -0.04, 0.0])
+    pose = displaced(milk.poses["basket_1"][0], shift[0], shift[1], 0.0)
+    route = Route.through(milk, start_of(milk), poses_of(milk, basket_1=pose))
+    grasp, release = np.flatnonzero(milk.carried["milk_1"])[0], np.flatnonzero(milk.held["milk_1"])[-1]
+    assert np.allclose(route.positions_m[: grasp + 1], milk.positions_m[: grasp + 1], rtol=0, atol=1e-12)
+    assert np.allclose(route.positions_m[release], milk.positions_m[release] + shift, rtol=0, atol=1e-9)
+
+
+def test_a_tilted_object_is_refused(milk: Reference) -> None:
+    pose = milk.poses["milk_1"][0].copy()
+    pose[3:] = (Rotation.from_euler("x", 0.3) * Rotation.from_quat(pose[[4, 5, 6, 3]])).as_quat()[[3, 0, 1, 2]]
+    with pytest.raises(RefusedError, match="object_not_upright"):
+        Route.through(milk, start_of(milk), poses_of(milk, milk_1=pose))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.tuples(*[st.floats(-0.25, 0.25)] * 3), st.tuples(*[st.floats(-0.4, 0.4)] * 3))
+def test_a_hand_that_starts_elsewhere_joins_the_demonstration_before_it_touches_anything(
+    milk: Reference, shift_m: tuple[float, ...], turn_rad: tuple[float, ...]
+) -> None:
+    """With an ideal hand, which moves by one stride under an action of 1."""
+    position, rotation = start_of(milk)
+    been: list[Hand] = [(position + shift_m, Rotation.from_rotvec(turn_rad) * rotation)]
+    route = Route.through(milk, been[0], poses_of(milk))
+    actions = []
+    for action in follow(route, lambda: been[-1]):
+        assert (np.abs(action) <= 1).all()
+        position, rotation = been[-1]
+        been.append((position + STRIDE[:3] * action[:3], Rotation.from_rotvec(STRIDE[3:] * action[3:6]) * rotation))
+        actions.append(action)
+    assert len(milk) <= len(actions) <= len(milk) + PATIENCE + 1
+    contact = int(np.flatnonzero(milk.busy)[0])
+    assert np.allclose(route.positions_m[contact - 4 :], milk.positions_m[contact - 4 :], rtol=0, atol=1e-9)
+    gripper = np.array(actions)[:, 6]
+    assert np.diff(gripper).nonzero()[0].size == np.diff(milk.actions[:, 6]).nonzero()[0].size, "grasps once, as shown"
+
+
+def test_a_hand_that_is_stuck_does_not_wait_for_ever(milk: Reference) -> None:
+    route = Route.through(milk, start_of(milk), poses_of(milk))
+    actions = list(follow(route, lambda: start_of(milk)))
+    assert len(actions) <= len(milk) + PATIENCE + 1
+    assert 0 < GAIN <= 1, "beyond 1 the loop overshoots"
+
+
+CHANGES: dict[Task, PhysicsPerturbation] = {
+    STOVE: RobotAxis(levels=(3,)).sample(rng("tracking", 0), STOVE, 0),
+    MILK: PosePerturbation(component="target", level=3, moved="milk_1", dx_m=0.03, dy_m=-0.03, dyaw_deg=12.0),
+}
+
+
+@pytest.mark.parametrize("task", list(CHANGES), ids=lambda task: task.name)
+def test_tracking_reaches_what_open_loop_misses(task: Task, whole: dict[Task, Trajectory]) -> None:
+    """And what it executed, sent open-loop from the stored first state, gives the stored states bit for bit."""
+    demo, environment, changes = starter_demo(task), Environment(task), (CHANGES[task],)
+    missed = replay(environment, demo, "t", ReplayConfig(), changes)
+    assert (missed.mode, missed.verdict.reason) == ("open_loop", "goal_not_reached")
+    kept = replay(environment, demo, "t", AUTO, changes, lambda: reference_of(whole[task]))
+    assert (kept.mode, kept.verdict.reason) == ("tracked", "kept")
+    assert np.array_equal(kept.states[0], missed.states[0])
+    assert len(kept.actions) < 1.3 * len(whole[task].actions)
+    executed = Demo(task, "k", "s", "expanded", "0", kept.actions, kept.states[0], None, kept.model_xml)
+    again = replay(environment, executed, "t", ReplayConfig(noops="keep"))
+    assert np.array_equal(again.states, kept.states)
+    assert again.verdict == kept.verdict
+
+
+def test_auto_leaves_a_success_alone(whole: dict[Task, Trajectory]) -> None:
+    def never() -> Reference:
+        raise AssertionError("the reference is not needed")
+
+    trajectory = replay(Environment(PLATE), starter_demo(PLATE), "t", AUTO, (), never)
+    assert trajectory.mode == "open_loop"
+    assert np.array_equal(trajectory.states, whole[PLATE].states)
+
+
+def test_recorded_states_recover_what_open_loop_loses(whole: dict[Task, Trajectory]) -> None:
+    """A demonstration whose actions no longer lead where they led: here because its first third is lost."""
+    recorded = whole[STOVE]
+    third = len(recorded.actions) // 3
+    actions = recorded.actions.copy()
+    actions[:third, :3] *= 0.3
+    demo = replace(starter_demo(STOVE), actions=actions, states=recorded.states[:-1], model_xml=recorded.model_xml)
+    environment, keep = Environment(STOVE), ReplayConfig(mode="auto", noops="keep")
+    assert not replay(environment, demo, "t", keep).verdict.kept
+    recovered = replay(environment, demo, "t", keep, (), lambda: reference_of(recorded))
+    assert (recovered.mode, recovered.verdict.reason) == ("tracked", "kept")
