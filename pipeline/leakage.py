@@ -1,6 +1,7 @@
 """The report that a plan keeps clear of the benchmark's test tasks.
 
-Every perturbation is read back from the plan as it was recorded and compared anew, whatever the planner thought.
+Every perturbation is read back from the plan as it was recorded and compared anew, whatever the planner thought. A row
+with several counts for each of its axes: the benchmark perturbs one at a time, but each part must keep clear by itself.
 """
 
 from __future__ import annotations

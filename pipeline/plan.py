@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.axes import AnyPerturbation, PhysicsPerturbation, TextPerturbation, of_layer, to_json
+from pipeline.axes import AnyAxis, AnyPerturbation, PhysicsPerturbation, TextPerturbation, in_order, of_layer, to_json
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.demos import DemoEntry
 from pipeline.errors import PipelineError
@@ -31,7 +32,7 @@ class Row:
         twin_id: the episode of the same demonstration without perturbations (its own id for a twin).
         trajectory_id: the physics it is rendered from; episodes that differ in render, pixels or text share it.
         role: ``twin`` or ``perturbed``.
-        axis, component: what is perturbed; ``clean`` for a twin.
+        axis, component: what is perturbed, several joined by +; ``clean`` for a twin.
         perturbations: canonical JSON with every parameter.
         instruction: the text the policy is prompted with.
         rank: place among the candidates of its (axis, task).
@@ -48,12 +49,12 @@ class Row:
     demo_id: str
     demo_sha256: str
     demo_source: str
+    demo_origin: str
     demo_steps: int
     axis: str
     component: str
     perturbations: str
     instruction: str
-    replay_mode: str
     rank: int
     wanted: bool
     seed: int
@@ -61,12 +62,13 @@ class Row:
 
 
 def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, test: TestSet) -> list[Row]:
-    """Draw the plan: a clean twin of every demonstration, then each axis's candidates, task by task.
+    """Draw the plan: a clean twin of every demonstration, then each axis's or combination's candidates, task by task.
 
-    A draw that comes closer to one of the benchmark's ``test`` tasks than its axis allows is drawn anew.
+    A draw that comes closer to one of the benchmark's ``test`` tasks than its axis allows is drawn anew. The benchmark
+    perturbs one axis at a time, but so must each part of a combination keep clear.
 
     Raises:
-        PipelineError: when there is nothing to plan from.
+        PipelineError: when there is nothing to plan from, at all or for an axis.
     """
     if not demos:
         raise PipelineError("no demonstrations to plan from", remedy="widen demos.tasks or check demos.root")
@@ -78,14 +80,22 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
         for group in by_task.values()
         for rank, demo in enumerate(group)
     ]
-    for axis, episodes in plan.episodes.items():
-        for (_, group), wanted in zip(by_task.items(), _shares(episodes, len(by_task)), strict=True):
-            rows += _candidates(axis, group, wanted, plan, replay, test)
+    for name, episodes in plan.episodes.items():
+        axes = plan.drawn_from(name)
+        groups = [group for group in by_task.values() if all(axis.applies(group[0].task) for axis in axes)]
+        if not groups:
+            raise PipelineError(
+                "none of the chosen tasks has anything that this could change",
+                where=f"plan.episodes.{name}",
+                remedy="widen demos.tasks, or take it out of plan.episodes",
+            )
+        for group, wanted in zip(groups, _shares(episodes, len(groups)), strict=True):
+            rows += _candidates(name, axes, group, wanted, plan, replay, test)
     return rows
 
 
 def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
-    """Axis to the number of wanted episodes that no different draw was left for, where there are any."""
+    """Axis or combination to the number of wanted episodes that no different draw was left for, where there are any."""
     missing = {
         axis: wanted - sum(row.axis == axis and row.wanted for row in rows) for axis, wanted in plan.episodes.items()
     }
@@ -98,22 +108,30 @@ def _shares(total: int, parts: int) -> list[int]:
 
 
 def _candidates(
-    axis: str, group: Sequence[DemoEntry], wanted: int, plan: PlanConfig, replay: ReplayConfig, test: TestSet
+    name: str,
+    axes: Sequence[AnyAxis],
+    group: Sequence[DemoEntry],
+    wanted: int,
+    plan: PlanConfig,
+    replay: ReplayConfig,
+    test: TestSet,
 ) -> Iterator[Row]:
-    """A task's candidates on one axis: every demonstration's first variant, then every second one, and so on.
+    """A task's candidates: every demonstration's first variant, then every second one, and so on.
 
-    There are fewer than wanted when an axis has no more different draws that keep clear of the test set.
+    There are fewer than wanted when no more different draws are left that keep clear of the test set.
     """
-    sampler = getattr(plan.axes, axis)
-    first = {demo.demo_id: int(rng(plan.seed, axis, demo.demo_id).integers(2**31)) for demo in group}
+    first = {demo.demo_id: int(rng(plan.seed, name, demo.demo_id).integers(2**31)) for demo in group}
     seen: set[str] = set()
     for rank in range(wanted + round(wanted * plan.reserve)):
         demo, variant = group[rank % len(group)], rank // len(group)
         for attempt in range(_ATTEMPTS):
-            key = rng(plan.seed, axis, demo.demo_id, variant, attempt)
-            draw = sampler.sample(key, demo.task, first[demo.demo_id] + variant + attempt)
-            row = _row(demo, (draw,), plan.seed, variant, rank, rank < wanted, replay)
-            if row.episode_id not in seen and draw.nearest(test, demo.task).distance >= draw.clearance:
+            key = rng(plan.seed, name, demo.demo_id, variant, attempt)
+            place = first[demo.demo_id] + variant + attempt
+            draws = tuple(axis.sample(key, demo.task, place) for axis in axes)
+            row = _row(demo, draws, plan.seed, variant, rank, rank < wanted, replay)
+            if row.episode_id not in seen and all(
+                draw.nearest(test, demo.task).distance >= draw.clearance for draw in draws
+            ):
                 break
         else:
             return
@@ -123,35 +141,35 @@ def _candidates(
 
 def _row(
     demo: DemoEntry,
-    perturbations: tuple[AnyPerturbation, ...],
+    perturbations: Sequence[AnyPerturbation],
     seed: int,
     variant: int,
     rank: int,
     wanted: bool,
     replay: ReplayConfig,
 ) -> Row:
-    how = replay.model_dump()
+    perturbations = in_order(perturbations)
     physics = to_json(of_layer(perturbations, PhysicsPerturbation))
     listed = to_json(perturbations)
     instruction = demo.task.instruction
     for change in of_layer(perturbations, TextPerturbation):
         instruction = change.apply(instruction)
     return Row(
-        episode_id=digest("episode", demo.sha256, how, listed)[:16],
-        twin_id=digest("episode", demo.sha256, how, "[]")[:16],
-        trajectory_id=digest("trajectory", demo.sha256, how, physics)[:16],
+        episode_id=_identity("episode", demo.sha256, replay, listed),
+        twin_id=_identity("episode", demo.sha256, replay, "[]"),
+        trajectory_id=_identity("trajectory", demo.sha256, replay, physics),
         role="perturbed" if perturbations else "twin",
         suite=demo.task.suite,
         task=demo.task.name,
         demo_id=demo.demo_id,
         demo_sha256=demo.sha256,
         demo_source=demo.source,
+        demo_origin=demo.origin,
         demo_steps=demo.steps,
         axis="+".join(p.axis for p in perturbations) or "clean",
         component="+".join(p.component for p in perturbations) or "clean",
         perturbations=listed,
         instruction=instruction,
-        replay_mode=replay.mode,
         rank=rank,
         wanted=wanted,
         seed=seed,
@@ -159,8 +177,13 @@ def _row(
     )
 
 
+@lru_cache(maxsize=4096)
+def _identity(kind: str, demo_sha256: str, replay: ReplayConfig, perturbations: str) -> str:
+    return digest(kind, demo_sha256, replay.model_dump(), perturbations)[:16]
+
+
 def write(rows: Sequence[Row], path: Path) -> None:
-    table = pa.Table.from_pylist([asdict(row) for row in rows])
+    table = pa.table({column.name: [getattr(row, column.name) for row in rows] for column in fields(Row)})
     with replaced(path) as temporary:
         pq.write_table(table, temporary)
 
@@ -172,8 +195,8 @@ def read(path: Path) -> list[Row]:
         PipelineError: when the file is not a plan of this version.
     """
     try:
-        table = pq.read_table(path)
-        return [Row(**row) for row in table.select([field.name for field in fields(Row)]).to_pylist()]
+        columns = pq.read_table(path).select([column.name for column in fields(Row)]).to_pydict()
+        return [Row(*row) for row in zip(*columns.values(), strict=True)]
     except (OSError, pa.ArrowException, KeyError, TypeError) as error:
         raise PipelineError("not a readable plan", where=path, remedy="run the plan stage again") from error
 
@@ -220,7 +243,7 @@ def select(
 
 
 def _groups(rows: Iterable[Row]) -> list[list[Row]]:
-    """Rows that fill one quota: the twins and each axis, task by task, in order of rank."""
+    """Rows that fill one quota: the twins and each axis or combination, task by task, in order of rank."""
     groups: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
     for row in rows:
         groups[row.axis, row.suite, row.task].append(row)

@@ -48,6 +48,23 @@ def test_schema_file_is_that_of_the_code() -> None:
         ("closed_loop", ("replay", "mode"), "replay.mode: Input should be"),
         ({"camera": 0, "noise": 1, "language": 1}, ("plan", "episodes"), "plan.episodes.camera"),
         ({"camera": 4}, ("plan", "episodes"), "axes and episodes must name the same axes"),
+        ({"camera+camera": 4}, ("plan", "episodes"), "plan.episodes: Value error, 'camera+camera' names an axis twice"),
+        ({"camera+wind": 4}, ("plan", "episodes"), "names no axis with 'wind', expected layout, pose"),
+        ({"camera+": 4}, ("plan", "episodes"), "names no axis with ''"),
+        (
+            {"camera+light": 4, "light+camera": 2},
+            ("plan", "episodes"),
+            "'camera+light' is asked for twice, in two orders",
+        ),
+        (
+            {
+                "seed": 1,
+                "axes": {"layout": {}, "language": {"classes": ["common_sense"]}},
+                "episodes": {"language+layout": 4},
+            },
+            ("plan",),
+            "language with added objects needs distraction or paraphrase",
+        ),
         ({"camera": {"distance": {"distance_scale": [[[2, 1]]] * 5}}}, ("plan", "axes"), "with low <= high"),
         ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: Extra inputs"),
         ("/tmp", ("demos", "root"), "root goes with source: hdf5"),

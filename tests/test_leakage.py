@@ -9,6 +9,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,6 +20,7 @@ from conftest import REPOSITORY, tiny_config
 
 from pipeline import leakage, plan, seeding, testset
 from pipeline.axes import AnyPerturbation, Axes, from_json, to_json
+from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.robot import HOME_RAD, benchmark_offsets_rad
 from pipeline.errors import PipelineError
@@ -44,7 +46,8 @@ AS_DRAWN: dict[str, Callable[[TestTask], dict[str, Any]]] = {
     "pose": lambda tested: {
         "component": "target",
         "dyaw_deg": 0,
-        **{name: tested.parameters[name] for name in ("target", "dx_m", "dy_m")},
+        "moved": tested.parameters["target"],
+        **{name: tested.parameters[name] for name in ("dx_m", "dy_m")},
     },
 }
 """Axis to the fields of the perturbation that would repeat a test task. Light's values are in no file of the wheel."""
@@ -77,12 +80,12 @@ def row(task: Task, perturbations: Iterable[AnyPerturbation], name: str) -> Row:
         demo_id=f"{task.suite}/{task.name}/demo_0",
         demo_sha256="0",
         demo_source="test",
+        demo_origin="human",
         demo_steps=100,
         axis="+".join(axis for axis, _ in changed),
         component="+".join(component for _, component in changed),
         perturbations=listed,
         instruction=task.instruction,
-        replay_mode="open_loop",
         rank=0,
         wanted=True,
         seed=0,
@@ -145,6 +148,30 @@ def test_a_row_with_several_perturbations_counts_for_each_axis(test: TestSet) ->
     }
 
 
+def test_a_combination_overlaps_where_one_of_its_parts_does(test: TestSet) -> None:
+    language = test.of("language")[0]
+    task = find_task(language.suite, language.base)
+    clear = NoiseAxis().sample(seeding.rng(1), task, 0)
+    findings = leakage.check([row(task, [clear, repeated(language)], "both")], test)
+    assert {axis: (f.rows, f.overlaps, f.verdict) for axis, f in findings.items()} == {
+        "noise": (1, 0, "disjoint"),
+        "language": (1, 1, "overlap"),
+    }
+
+
+def test_a_plan_of_another_version_is_named(test: TestSet) -> None:
+    task = find_task("libero_goal", "turn_on_the_stove")
+    noise = row(task, [NoiseAxis().sample(seeding.rng(1), task, 0)], "old")
+    for was, now, fault in (
+        ('"seed":', '"sead":', r"noise\.seed: Field required"),
+        ('"axis":"noise"', '"axis":"snow"', "'snow'"),
+        ("[{", "{", "Invalid JSON"),
+    ):
+        old = replace(noise, perturbations=noise.perturbations.replace(was, now))
+        with pytest.raises(PipelineError, match=f"not perturbations of this version: .*{fault}(?s:.*)plan stage again"):
+            leakage.check([old], test)
+
+
 def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -> None:
     noise = next(iter(test.of("noise")))
     task = find_task(noise.suite, noise.base)
@@ -182,7 +209,8 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     planted = row(task, [repeated(test.on(task, "language")[0])], "planted")
     done = run_stage(tmp_path, [*clear, planted])
     assert done.returncode == 1
-    assert "1 of 1 on the language axis (such as planted, distance 0, clearance 0.15)" in done.stderr
+    clearance = f"clearance {LanguagePerturbation.clearance:g}"
+    assert f"1 of 1 on the language axis (such as planted, distance 0, {clearance})" in done.stderr
     assert "noise axis" not in done.stderr
     report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
     assert (report["language"]["overlaps"], report["language"]["verdict"]) == (1, "overlap")

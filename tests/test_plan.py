@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -13,22 +14,27 @@ from pipeline.axes import Axes, from_json
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis, deal
 from pipeline.axes.noise import NoiseAxis
+from pipeline.axes.pose import PoseAxis
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.demos import DemoEntry
 from pipeline.errors import PipelineError
-from pipeline.tasks import tasks
+from pipeline.tasks import find_task, tasks
 from pipeline.testset import TestSet, TestTask
 from pipeline.types import Verdict
 
 REPLAY = ReplayConfig()
 NO_TESTS = TestSet(())
 TASKS = tasks("libero_goal")[:3]
+STILL = {"open_the_middle_drawer_of_the_cabinet", "turn_on_the_stove"}
+"""Tasks that put nothing anywhere."""
 ALL = Axes(camera=CameraAxis(), noise=NoiseAxis(), language=LanguageAxis())
 
 
 def entries(per_task: int = 4) -> list[DemoEntry]:
     return [
-        DemoEntry(task, f"demo_{n}", "test", f"{task.name}/{n}", steps=100) for task in TASKS for n in range(per_task)
+        DemoEntry(task, f"demo_{n}", "test", "human", f"{task.name}/{n}", steps=100)
+        for task in TASKS
+        for n in range(per_task)
     ]
 
 
@@ -154,6 +160,74 @@ def test_draws_that_overlap_with_a_test_task_are_drawn_anew() -> None:
         (drawn,) = from_json(row.perturbations)
         assert drawn.nearest(test, TASKS[0]).distance >= drawn.clearance
     assert sum(one.perturbations == other.perturbations for one, other in zip(first, again, strict=True)) >= 5
+
+
+def combined(written: str, **axes: object) -> list[plan.Row]:
+    one = config(axes=Axes.model_validate(axes), episodes={written: 6})
+    return [row for row in plan.make(entries(), one, REPLAY, NO_TESTS) if row.role == "perturbed"]
+
+
+def test_a_combination_is_the_same_in_whatever_order_it_was_written() -> None:
+    axes: dict[str, object] = {"camera": {}, "noise": {}, "language": {}}
+    rows = combined("noise+language+camera", **axes)
+    assert rows == combined("camera+noise+language", **axes)
+    assert len(rows) == 9, "six wanted and half as many in reserve"
+    assert sorted(sum(row.wanted and row.task == task.name for row in rows) for task in TASKS) == [2, 2, 2]
+    for row in rows:
+        drawn = from_json(row.perturbations)
+        assert row.axis == "camera+noise+language" == "+".join(p.axis for p in drawn)
+        assert row.component == "+".join(p.component for p in drawn)
+        assert row.instruction in {p.text for p in drawn if p.axis == "language"}
+    levels = {tuple(p.level for p in from_json(row.perturbations)) for row in rows}
+    assert any(len(set(of_parts)) > 1 for of_parts in levels), "each part has a level of its own"
+
+
+def test_a_combination_fills_a_quota_of_its_own() -> None:
+    axes: dict[str, object] = {"camera": {}, "noise": {}}
+    together = config(axes=Axes.model_validate(axes), episodes={"camera": 3, "noise+camera": 3, "noise": 3}, reserve=0)
+    rows = plan.make(entries(), together, REPLAY, NO_TESTS)
+    assert Counter(row.axis for row in rows) == {"clean": 12, "camera": 3, "camera+noise": 3, "noise": 3}
+    kept = plan.select(rows, {row.trajectory_id: Verdict(True, "kept") for row in rows})
+    assert all(verdict.kept for verdict in kept.values())
+    assert plan.shortage(rows, together) == {}
+    alone = plan.make(
+        entries(), config(axes=Axes(camera=CameraAxis()), episodes={"camera": 3}, reserve=0), REPLAY, NO_TESTS
+    )
+    assert {row.episode_id for row in alone} <= {row.episode_id for row in rows}
+
+
+def test_every_part_of_a_combination_keeps_clear_of_the_test_set() -> None:
+    axes: dict[str, object] = {"noise": {}, "language": {}}
+    first = combined("noise+language", **axes)
+    planted = next(p for p in from_json(first[0].perturbations) if p.axis == "language")
+    test = TestSet((TestTask("libero_goal", TASKS[0].name, "planted", "language", "rewrite", {"text": planted.text}),))
+    again = plan.make(entries(), config(axes=Axes.model_validate(axes), episodes={"noise+language": 6}), REPLAY, test)
+    rows = [row for row in again if row.role == "perturbed"]
+    assert rows[0].perturbations != first[0].perturbations
+    for row in rows:
+        assert all(
+            p.nearest(test, find_task(row.suite, row.task)).distance >= p.clearance
+            for p in from_json(row.perturbations)
+        )
+
+
+def test_rewrites_stay_unambiguous_among_added_objects() -> None:
+    axes: dict[str, object] = {"layout": {}, "language": {}}
+    rows = combined("language+layout", **axes)
+    assert {row.axis for row in rows} == {"layout+language"}
+    classes = {p.component for row in rows for p in from_json(row.perturbations) if p.axis == "language"}
+    assert classes == {"distraction", "paraphrase"}
+    assert len({row.trajectory_id for row in rows}) == len(rows), "layout has physics of its own"
+
+
+def test_an_axis_is_spread_over_the_tasks_that_it_applies_to() -> None:
+    demos = [DemoEntry(task, "demo_0", "test", "human", task.name, steps=100) for task in tasks("libero_goal")]
+    pose = config(axes=Axes(pose=PoseAxis()), episodes={"pose": 16}, reserve=0)
+    wanted = Counter(row.task for row in plan.make(demos, pose, REPLAY, NO_TESTS) if row.axis == "pose")
+    assert wanted.keys() == {task.name for task in tasks("libero_goal")} - STILL
+    assert set(wanted.values()) == {2}
+    with pytest.raises(PipelineError, match=r"plan\.episodes\.pose: none of the chosen tasks"):
+        plan.make([demo for demo in demos if demo.task.name in STILL], pose, REPLAY, NO_TESTS)
 
 
 def test_nothing_to_plan_from() -> None:

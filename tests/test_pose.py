@@ -16,7 +16,8 @@ from pipeline.axes.base import RefusedError
 from pipeline.axes.pose import PoseAxis, PosePerturbation
 from pipeline.config import ReplayConfig
 from pipeline.environment import Environment
-from pipeline.replay import open_loop
+from pipeline.errors import PipelineError
+from pipeline.replay import replay
 from pipeline.scene import Compiled
 from pipeline.seeding import rng
 from pipeline.tasks import find_task, select_tasks
@@ -28,6 +29,7 @@ NEXT_TO = find_task("libero_spatial", "pick_up_the_black_bowl_next_to_the_plate_
 BETWEEN = find_task(
     "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
 )
+POTS = find_task("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove")
 BOWL = "akita_black_bowl_1"
 
 Scenes = Callable[[Task], Scene]
@@ -48,8 +50,8 @@ def scenes(plate_environment: Environment) -> Scenes:
     return scene
 
 
-def moved(target: str | None, dx_m: float = 0.0, dy_m: float = 0.0, dyaw_deg: float = 0.0) -> PosePerturbation:
-    return PosePerturbation(level=1, target=target, dx_m=dx_m, dy_m=dy_m, dyaw_deg=dyaw_deg)
+def moved(target: str, dx_m: float = 0.0, dy_m: float = 0.0, dyaw_deg: float = 0.0) -> PosePerturbation:
+    return PosePerturbation(component="target", level=1, moved=target, dx_m=dx_m, dy_m=dy_m, dyaw_deg=dyaw_deg)
 
 
 def draws(axis: PoseAxis, task: Task, count: int) -> list[PosePerturbation]:
@@ -63,26 +65,22 @@ def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
     for p in drawn:
         assert 0.016 * (p.level - 1) - 1e-4 <= math.hypot(p.dx_m, p.dy_m) <= 0.016 * p.level + 1e-4
         assert 4 * (p.level - 1) - 0.01 <= abs(p.dyaw_deg) <= 4 * p.level + 0.01
-        assert p.target == "plate_1"
+        assert p.moved == "plate_1"
     assert {np.sign(p.dyaw_deg) for p in drawn} == {-1, 1}
     assert PosePerturbation.model_validate_json(drawn[0].model_dump_json()) == drawn[0]
 
 
 def test_the_target_is_what_the_goal_moves() -> None:
-    targets = {
-        task: {p.target for p in draws(PoseAxis(), task, 12)}
-        for task in select_tasks(["libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*"])
-    }
-    assert {task.name for task, found in targets.items() if found == {None}} == {
-        "turn_on_the_stove",
-        "open_the_middle_drawer_of_the_cabinet",
-    }
+    axis = PoseAxis()
+    suites = select_tasks(["libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*"])
+    still = [task for task in suites if not axis.applies(task)]
+    assert [task.name for task in still] == ["open_the_middle_drawer_of_the_cabinet", "turn_on_the_stove"]
+    targets = {task: {p.moved for p in draws(axis, task, 12)} for task in suites if task not in still}
     assert targets[MILK] == {"milk_1"}
     assert targets[COOKIES] == {BOWL}
-    assert targets[find_task("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove")] == {
-        "moka_pot_1",
-        "moka_pot_2",
-    }
+    assert targets[POTS] == {"moka_pot_1", "moka_pot_2"}
+    with pytest.raises(PipelineError, match="libero_goal/turn_on_the_stove has no target"):
+        draws(axis, STOVE, 1)
 
 
 def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
@@ -99,25 +97,36 @@ def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
     assert np.allclose(turn.as_rotvec(degrees=True), [0, 0, 15], atol=1e-6)
     now[address : address + 7] = before[address : address + 7]
     assert np.array_equal(now, before)
-    assert after.resolved["pose"]["target"] == "plate_1"
+    assert after.resolved["pose"]["moved"] == "plate_1"
 
 
 @pytest.mark.parametrize(
     ("task", "change", "reason"),
     [
-        (STOVE, moved(None, 0.01), "no_movable_target"),
         # Off the table.
         (PLATE, moved("plate_1", 1.0), "relation_broken"),
-        (BETWEEN, moved(BOWL, 0.06), "target_in_collision"),
+        (BETWEEN, moved(BOWL, 0.06), "object_in_collision"),
         (NEXT_TO, moved(BOWL, -0.03, 0.05), "relation_broken"),
         (BETWEEN, moved(BOWL, 0.0, 0.08), "relation_broken"),
         # Off the box, and let go in the air.
-        (COOKIES, moved(BOWL, -0.08), "target_in_collision"),
+        (COOKIES, moved(BOWL, -0.08), "object_in_collision"),
     ],
 )
 def test_what_cannot_be_is_refused(task: Task, change: PosePerturbation, reason: str, scenes: Scenes) -> None:
     with pytest.raises(RefusedError, match=reason):
         change.apply(scenes(task), starter_demo(task))
+
+
+def test_a_receptacle_moves_when_asked_for_and_the_targets_relation_still_holds(scenes: Scenes) -> None:
+    axis = PoseAxis(components=("receptacle",))
+    assert {(p.component, p.moved) for p in draws(axis, MILK, 6)} == {("receptacle", "basket_1")}
+    both = PoseAxis(components=("target", "receptacle"))
+    assert {p.moved for p in draws(both, BETWEEN, 12)} == {BOWL, "plate_1"}
+    assert not axis.applies(PLATE), "the plate goes to a place on the table"
+    change = moved("plate_1", 0.01, 0.01, 5)
+    assert change.apply(scenes(BETWEEN), starter_demo(BETWEEN)).resolved["pose"]["moved"] == "plate_1"
+    with pytest.raises(RefusedError, match="relation_broken"):
+        moved("plate_1", 0.25).apply(scenes(NEXT_TO), starter_demo(NEXT_TO))
 
 
 @pytest.mark.parametrize("task", [COOKIES, NEXT_TO, BETWEEN], ids=["on", "next to", "between"])
@@ -153,13 +162,28 @@ def test_nearest_compares_moves_of_the_same_object() -> None:
     assert moved("plate_1", 0.01, 0.024).nearest(test, PLATE).distance < PosePerturbation.clearance
     assert moved("plate_1", 0.02, 0.0).nearest(test, PLATE).distance == pytest.approx(math.hypot(0.01, 0.02))
     assert moved(BOWL, 0.01, 0.02).nearest(test, PLATE) == (math.inf, 0)
-    assert moved(None, 0.01).nearest(test, STOVE) == (math.inf, 0)
+
+
+def test_nearest_knows_each_of_several_objects_that_a_test_task_moves() -> None:
+    moves: dict[str, str | int | float] = {"target": "moka_pot_1", "dx_m": 0.01, "dy_m": 0.02}
+    both = moves | {"others": "moka_pot_2:-0.03,0.04;plate_1:1e-05,0"}
+    test = TestSet(
+        (
+            TestTask(POTS.suite, POTS.name, "both", "pose", "pose", both),
+            TestTask(POTS.suite, POTS.name, "one", "pose", "pose", moves | {"dx_m": 0.05}),
+        )
+    )
+    assert moved("moka_pot_1", 0.01, 0.02).nearest(test, POTS) == (0, 2)
+    assert moved("moka_pot_1", -0.03, 0.04).nearest(test, POTS).distance > 0.04, "that is how the other one moves"
+    assert moved("moka_pot_2", -0.03, 0.04).nearest(test, POTS) == (0, 1)
+    assert moved("moka_pot_2", -0.03, 0.05).nearest(test, POTS) == pytest.approx((0.01, 1))
+    assert moved("plate_1", 0.0, 0.0).nearest(test, POTS) == pytest.approx((1e-5, 1))
 
 
 def test_the_replay_starts_there(plate_environment: Environment) -> None:
     demo = starter_demo(PLATE)
     short = replace(demo, actions=demo.actions[:3])
     change = moved("plate_1", 0.02, 0.0, 10)
-    trajectory = open_loop(plate_environment, short, "t", ReplayConfig(fixture_seed=4), (change,))
+    trajectory = replay(plate_environment, short, "t", ReplayConfig(), (change,))
     (position,) = np.flatnonzero(trajectory.states[0] == demo.init_state + 0.02)
     assert trajectory.states[-1, position] == pytest.approx(trajectory.states[0, position], abs=1e-3), "it slides"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Annotated, TypeVar
 
-from pydantic import Field, TypeAdapter
+from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
 from pipeline.axes.base import (
@@ -24,6 +24,7 @@ from pipeline.axes.light import LightAxis, LightPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.axes.pose import PoseAxis, PosePerturbation
 from pipeline.axes.robot import RobotAxis, RobotPerturbation
+from pipeline.errors import PipelineError
 
 AnyPerturbation = Annotated[
     CameraPerturbation
@@ -38,36 +39,75 @@ AnyPerturbation = Annotated[
 ]
 AnyAxis = CameraAxis | LightAxis | BackgroundAxis | NoiseAxis | LanguageAxis | LayoutAxis | PoseAxis | RobotAxis
 
-Layered = TypeVar("Layered", bound=Perturbation)
+Kind = TypeVar("Kind", bound=Perturbation)
 
 _LIST = TypeAdapter(tuple[AnyPerturbation, ...])
 
 
 class Axes(Frozen):
-    """The axes that a run draws from; an axis left out is not drawn."""
+    """The axes that a run draws from; an axis left out is not drawn.
 
+    They stand in the order in which their perturbations apply, deepest layer first. Objects are added where a
+    demonstration's scene leaves room, then the target and the arm move, and are refused where they meet an object.
+    """
+
+    layout: LayoutAxis | None = None
+    pose: PoseAxis | None = None
+    robot: RobotAxis | None = None
     camera: CameraAxis | None = None
     light: LightAxis | None = None
     background: BackgroundAxis | None = None
     noise: NoiseAxis | None = None
     language: LanguageAxis | None = None
-    layout: LayoutAxis | None = None
-    pose: PoseAxis | None = None
-    robot: RobotAxis | None = None
+
+
+_PLACE = {axis: place for place, axis in enumerate(Axes.model_fields)}
+
+
+def axes_of(name: str) -> tuple[str, ...]:
+    """The axes that a name such as ``language+camera`` joins, in the order in which they apply.
+
+    Raises:
+        ValueError: when one of them is no axis, or is named twice.
+    """
+    axes = name.split("+")
+    if unknown := [axis for axis in axes if axis not in _PLACE]:
+        raise ValueError(
+            f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(_PLACE)}, or some joined by +"
+        )
+    if len(set(axes)) < len(axes):
+        raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
+    return tuple(sorted(axes, key=_PLACE.__getitem__))
+
+
+def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:
+    """Perturbations in the order in which they apply, whatever order they were listed in."""
+    return tuple(sorted(perturbations, key=lambda p: _PLACE[p.axis]))
 
 
 def to_json(perturbations: Iterable[Perturbation]) -> str:
     """Canonical JSON of a set of perturbations: the same whatever order they were listed in."""
-    ordered = sorted(perturbations, key=lambda p: (-p.layer, p.axis))
-    return f"[{','.join(p.model_dump_json() for p in ordered)}]"
+    return f"[{','.join(p.model_dump_json() for p in in_order(perturbations))}]"
 
 
 def from_json(text: str) -> tuple[AnyPerturbation, ...]:
-    """Read perturbations back, deepest layer first, which is the order they apply in."""
-    return _LIST.validate_json(text)
+    """Read perturbations back, in the order in which they apply.
+
+    Raises:
+        PipelineError: when they were recorded by a version of this project with other axes or parameters.
+    """
+    try:
+        return _LIST.validate_json(text)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        raise PipelineError(
+            f"not perturbations of this version: {'.'.join(map(str, fault['loc'][1:])) or 'the list'}: {fault['msg']}",
+            where=f"perturbations {text:.80}",
+            remedy="run the plan stage again, or read it with the version that wrote it",
+        ) from error
 
 
-def of_layer(perturbations: Sequence[Perturbation], layer: type[Layered]) -> tuple[Layered, ...]:
+def of_layer(perturbations: Sequence[Perturbation], layer: type[Kind]) -> tuple[Kind, ...]:
     """Those that act on one layer, named by its class."""
     return tuple(p for p in perturbations if isinstance(p, layer))
 
@@ -81,7 +121,9 @@ __all__ = [
     "RefusedError",
     "RenderPerturbation",
     "TextPerturbation",
+    "axes_of",
     "from_json",
+    "in_order",
     "of_layer",
     "to_json",
 ]

@@ -52,6 +52,13 @@ class Axis(Frozen):
 
     levels: Annotated[tuple[Level, ...], Field(min_length=1)] = (1, 2, 3, 4, 5)
 
+    def applies(self, task: Task) -> bool:
+        """Whether the axis can change anything that ``task`` has; its episodes are spread over the tasks that it can.
+
+        What cannot be known before the scene is built is refused when the perturbation is applied.
+        """
+        return True
+
     def draw_level(self, rng: np.random.Generator) -> Level:
         return self.levels[rng.integers(len(self.levels))]
 

@@ -1,18 +1,20 @@
-"""Pose: where the object that a task moves stands at the start. Physics layer."""
+"""Pose: where the object that a task moves, or what it is put on or in, stands at the start. Physics layer."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import PositiveFloat
+from pydantic import Field, PositiveFloat
 
+from pipeline import bddl
 from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation, RefusedError
+from pipeline.errors import PipelineError
 from pipeline.types import Demo, Floats, Scene, Task
 
 if TYPE_CHECKING:
@@ -20,13 +22,13 @@ if TYPE_CHECKING:
     from pipeline.testset import TestSet
 
 SETTLE_S = 0.3
-"""How long a target is watched. The farthest that one of the starter demonstrations still falls takes 0.06 s."""
+"""How long an object is watched. The farthest that one of the starter demonstrations still falls takes 0.06 s."""
 
 DEEPER_M = 0.001
-"""How much deeper than recorded a moved target may sit in what it touches, such as the wall of its drawer."""
+"""How much deeper than recorded a moved object may sit in what it touches, such as the wall of its drawer."""
 
 CREEP_M, CREEP_DEG = 0.002, 2.0
-"""How much farther than the recorded target a moved one may slide and tilt until it rests."""
+"""How much farther than the recorded object a moved one may slide and tilt until it rests."""
 
 NEXT_TO_M = 0.17
 """Distance of centres up to which things stand next to each other; LIBERO has them 0.12 to 0.13 m apart."""
@@ -35,18 +37,22 @@ BETWEEN = 0.25
 """Share of the way between two things that still counts as at one of them, and as beside the line between them."""
 
 
+Component = Literal["target", "receptacle"]
+"""What the goal puts somewhere, and what it is put on or in, where that is an object that can be moved."""
+
+
 class PosePerturbation(PhysicsPerturbation):
-    """The target moved in the horizontal plane and turned on the spot.
+    """One object moved in the horizontal plane and turned on the spot.
 
     Attributes:
-        target: the object's name in the BDDL file; None when the task moves none.
+        moved: the object's name in the BDDL file.
         dx_m, dy_m: displacement along the world's axes from where the demonstration has it.
         dyaw_deg: counter-clockwise turn about the vertical through its origin.
     """
 
     axis: Literal["pose"] = "pose"
-    component: Literal["target"] = "target"
-    target: str | None
+    component: Component
+    moved: str
     dx_m: float
     dy_m: float
     dyaw_deg: float
@@ -56,41 +62,39 @@ class PosePerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "m: the norm of the difference between the displacements of the same object"
 
     def apply(self, scene: Scene, demo: Demo) -> Scene:
-        """The scene with the target moved; its height and velocity and everything else stay as they are.
+        """The scene with the object moved; its height and velocity and everything else stay as they are.
 
-        The recorded and the moved target are both watched for ``SETTLE_S`` while everything else is held: they must
+        The recorded and the moved object are both watched for ``SETTLE_S`` while everything else is held: they must
         come to rest on the same things, after as little motion.
 
         Raises:
-            RefusedError: ``no_movable_target`` when the task only turns or opens something; ``relation_broken`` when
-                the target leaves what it stands on or in, or the place that the instruction names;
-                ``target_in_collision`` when it touches something else; ``target_unstable`` when it slides or tilts
-                more than the recorded one.
+            RefusedError: ``relation_broken`` when the object leaves what it stands on or in, or a target the place
+                that the instruction names; ``object_in_collision`` when it touches something else;
+                ``object_unstable`` when it slides or tilts more than the recorded one.
         """
         from pipeline.scene import Compiled
 
-        if self.target is None:
-            raise RefusedError("no_movable_target")
         compiled = Compiled(scene)
-        then = _settle(compiled, self.target)
+        then = _settle(compiled, self.moved)
         state = scene.state.copy()
-        address = 1 + int(compiled.model.joint(f"{self.target}_joint0").qposadr[0])
+        address = 1 + int(compiled.model.joint(f"{self.moved}_joint0").qposadr[0])
         pose = state[address : address + 7]
         pose[:] = self._moved(pose)
         compiled.restore(state)
-        if not _relation_holds(demo.task, self.target, lambda name: compiled.data.body(f"{name}_main").xpos[:2]):
+        targets = bddl.read(demo.task.bddl_file).targets
+        if not all(_relation_holds(demo.task, target, compiled.xy_m) for target in targets):
             raise RefusedError("relation_broken")
-        now = _settle(compiled, self.target)
+        now = _settle(compiled, self.moved)
 
         new = (now.started.keys() | now.rested.keys()) - (then.started.keys() | then.rested.keys())
         deeper = any(gap_m < then.started.get(pair, 0.0) - DEEPER_M for pair, gap_m in now.started.items())
         if new or deeper:
-            raise RefusedError("target_in_collision")
+            raise RefusedError("object_in_collision")
         if then.rested.keys() - now.rested.keys():
             raise RefusedError("relation_broken")
         if now.slid_m > then.slid_m + CREEP_M or now.tilted_deg > then.tilted_deg + CREEP_DEG:
-            raise RefusedError("target_unstable")
-        found = {"target": self.target, "position_m": pose[:3].tolist(), "rotation_wxyz": pose[3:].tolist()}
+            raise RefusedError("object_unstable")
+        found = {"moved": self.moved, "position_m": pose[:3].tolist(), "rotation_wxyz": pose[3:].tolist()}
         return replace(scene, state=state, resolved={**scene.resolved, "pose": found})
 
     def _moved(self, pose: Floats) -> Floats:
@@ -102,21 +106,31 @@ class PosePerturbation(PhysicsPerturbation):
         return np.array([x + self.dx_m, y + self.dy_m, z, *turned])
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """Compared with the test tasks that move the same object of the same task.
+        """Compared with the test tasks that move the same object of the same task, alone or with others.
 
         These move every other thing as well, each its own way, so even at distance zero the scenes would differ.
         """
-        moved = [
-            (float(other.parameters["dx_m"]), float(other.parameters["dy_m"]))
-            for other in test.on(task, "pose")
-            if other.parameters.get("target") == self.target is not None
-        ]
-        distance_m = min((math.hypot(self.dx_m - dx, self.dy_m - dy) for dx, dy in moved), default=math.inf)
-        return Nearest(distance_m, len(moved))
+        moves_m = _test_moves_m(test, task).get(self.moved, np.empty((0, 2)))
+        distance_m = np.linalg.norm(moves_m - (self.dx_m, self.dy_m), axis=1).min(initial=math.inf)
+        return Nearest(float(distance_m), len(moves_m))
+
+
+@cache
+def _test_moves_m(test: TestSet, task: Task) -> dict[str, Floats]:
+    """Object to its displacements (N, 2) in the test tasks that move it, where ``task`` is to move it too."""
+    moves: dict[str, list[tuple[float, float]]] = {}
+    for tested in test.on(task, "pose"):
+        known = tested.parameters
+        if "target" in known:
+            moves.setdefault(str(known["target"]), []).append((float(known["dx_m"]), float(known["dy_m"])))
+        # Such as moka_pot_2:0.01,-0.02;plate_1:0,0.03.
+        for name, dx_m, dy_m in re.findall(r"([^;:]+):([^,]+),([^;]+)", str(known.get("others", ""))):
+            moves.setdefault(name, []).append((float(dx_m), float(dy_m)))
+    return {name: np.array(displacements_m) for name, displacements_m in moves.items()}
 
 
 class _Settled(NamedTuple):
-    """How the target came to rest: what it touched at the start and at rest, and how far its pose is from the start."""
+    """How the object came to rest: what it touched at the start and at rest, and how far its pose is from the start."""
 
     started: Mapping[tuple[str, str], float]
     rested: Mapping[tuple[str, str], float]
@@ -124,13 +138,13 @@ class _Settled(NamedTuple):
     tilted_deg: float
 
 
-def _settle(compiled: Compiled, target: str) -> _Settled:
-    """Let the target come to rest from the compiled state while everything else is held."""
+def _settle(compiled: Compiled, moved: str) -> _Settled:
+    """Let the object come to rest from the compiled state while everything else is held."""
     import mujoco
 
     model, data = compiled.model, compiled.data
-    part = compiled.part(f"{target}_main")
-    joint = model.joint(f"{target}_joint0")
+    part = compiled.part(f"{moved}_main")
+    joint = model.joint(f"{moved}_joint0")
     pose, velocity = slice(joint.qposadr[0], joint.qposadr[0] + 7), slice(joint.dofadr[0], joint.dofadr[0] + 6)
     started, first = compiled.touching(part), data.qpos[pose].copy()
     held = data.qpos.copy()
@@ -149,38 +163,24 @@ def _settle(compiled: Compiled, target: str) -> _Settled:
     )
 
 
-@dataclass(frozen=True)
-class _Setting:
-    """What a BDDL file says of the objects.
-
-    Attributes:
-        targets: the movable objects that the goal puts somewhere.
-        anchors: object to the one thing it starts next to or the two it starts between.
-        alike: object to the others of its category.
-    """
-
-    targets: tuple[str, ...]
-    anchors: dict[str, tuple[str, ...]]
-    alike: dict[str, tuple[str, ...]]
+@cache
+def _alike(task: Task, thing: str) -> tuple[str, ...]:
+    """The other objects of the category of ``thing``."""
+    objects = bddl.read(task.bddl_file).objects
+    return tuple(name for name, category in objects.items() if category == objects[thing] and name != thing)
 
 
 @cache
-def _setting(task: Task) -> _Setting:
-    named = re.split(r"\(:(\w+)", task.bddl_file.read_text())
-    sections = dict(zip(named[1::2], named[2::2], strict=True))
-    groups = [names.split() for names in re.findall(r"([\w\s]+?)\s-\s", sections["objects"])]
-    alike = {name: tuple(other for other in group if other != name) for group in groups for name in group}
-    goal = re.findall(r"\((?:On|In)\s+(\w+)\s", sections["goal"])
-    start_of = dict(re.findall(r"\(On\s+(\w+)\s+(\w+)\)", sections["init"]))
-    at = {region: name for name, region in start_of.items()}
-    anchors = {}
-    for name, region in start_of.items():
-        # Such as main_table_between_plate_ramekin_region: the plate starts in main_table_plate_region.
-        found = re.fullmatch(r"(\w+?)_(?:next_to_([a-z]+)|between_([a-z]+)_([a-z]+))_region", region)
-        if found:
-            surface, *words = (word for word in found.groups() if word)
-            anchors[name] = tuple(at[f"{surface}_{word}_region"] for word in words)
-    return _Setting(tuple(dict.fromkeys(name for name in goal if name in alike)), anchors, alike)
+def _anchors(task: Task, thing: str) -> tuple[str, ...]:
+    """The one thing that an object starts next to, or the two that it starts between; none where neither is said."""
+    places = bddl.read(task.bddl_file).places
+    # Such as main_table_between_plate_ramekin_region: the plate starts in main_table_plate_region.
+    found = re.fullmatch(r"(\w+?)_(?:next_to_([a-z]+)|between_([a-z]+)_([a-z]+))_region", places.get(thing, ""))
+    if found is None:
+        return ()
+    surface, *words = (word for word in found.groups() if word)
+    at = {region: name for name, region in places.items()}
+    return tuple(at[f"{surface}_{word}_region"] for word in words)
 
 
 def _relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:
@@ -189,13 +189,12 @@ def _relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> b
     Next to something: within ``NEXT_TO_M`` of it, and no like object nearer to it. Between two things: its foot on the
     line between them in the middle half, and off that line by at most a quarter of its length.
     """
-    setting = _setting(task)
     own = xy_m(target)
-    match setting.anchors.get(target, ()):
+    match _anchors(task, target):
         case (anchor,):
             away = np.linalg.norm(own - xy_m(anchor))
             nearest_alike = min(
-                (np.linalg.norm(xy_m(o) - xy_m(anchor)) for o in setting.alike[target]), default=math.inf
+                (np.linalg.norm(xy_m(other) - xy_m(anchor)) for other in _alike(task, target)), default=math.inf
             )
             return bool(away <= min(NEXT_TO_M, nearest_alike))
         case (first, second):
@@ -210,21 +209,48 @@ class PoseAxis(Axis):
     """Displacements in all directions alike, and turns either way.
 
     At level k the displacement is k - 1 to k times ``step_m``, uniform over the ring, and the turn k - 1 to k times
-    ``step_deg``. Where a task moves several objects, one is drawn.
+    ``step_deg``. Where there are several objects to choose from, one is drawn.
+
+    Attributes:
+        components: what to move.
     """
 
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("target",)
     step_m: PositiveFloat = 0.016
     step_deg: PositiveFloat = 4.0
 
+    def applies(self, task: Task) -> bool:
+        """Whether there is something to move: some tasks only open, close or turn what stays where it is."""
+        return bool(self._choices(task))
+
+    def _choices(self, task: Task) -> list[tuple[Component, str]]:
+        known = bddl.read(task.bddl_file)
+        named: dict[Component, tuple[str, ...]] = {"target": known.targets, "receptacle": known.receptacles}
+        return [(component, name) for component in self.components for name in named[component]]
+
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation:
-        targets = _setting(task).targets
+        """One draw for a task that the axis applies to.
+
+        Raises:
+            PipelineError: when the task moves nothing.
+        """
+        choices = self._choices(task)
+        if not choices:
+            raise PipelineError(
+                f"the task {task.suite}/{task.name} has no {' or '.join(self.components)} that could be displaced",
+                where="axis pose",
+                expected="a task whose goal puts an object somewhere",
+                remedy="choose another task or another axis",
+            )
+        component, moved = choices[rng.integers(len(choices))]
         level = self.draw_level(rng)
         reach_m = self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2))
         bearing_rad = rng.uniform(-math.pi, math.pi)
         dyaw_deg = self.step_deg * rng.uniform(level - 1, level) * rng.choice([-1, 1])
         return PosePerturbation(
             level=level,
-            target=targets[rng.integers(len(targets))] if targets else None,
+            component=component,
+            moved=moved,
             dx_m=round(reach_m * math.cos(bearing_rad), 4),
             dy_m=round(reach_m * math.sin(bearing_rad), 4),
             dyaw_deg=round(float(dyaw_deg), 2),
