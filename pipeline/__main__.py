@@ -8,14 +8,15 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline import doctor
+from pipeline import doctor, inventory, testset
 from pipeline.axes import Axes
 from pipeline.chat import Chat
-from pipeline.config import Config, load
+from pipeline.compute import runner
+from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
+from pipeline.expand import expand
 from pipeline.fetch import fetch
 from pipeline.files import replaced
-from pipeline.object_sources import prepare_objects
 from pipeline.rewrite import extend
 from pipeline.tasks import SUITES, select_tasks
 
@@ -56,9 +57,29 @@ def _rewrite(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _objects(arguments: argparse.Namespace) -> int:
-    print(f"{prepare_objects(own=arguments.own)} models are ready")
+def _sources(arguments: argparse.Namespace) -> int:
+    print(json.dumps(inventory.counts(load(arguments.config).plan.axes)))
     return 0
+
+
+def _expand(arguments: argparse.Namespace) -> int:
+    demos = DemosConfig(tasks=tuple(arguments.tasks))
+    with runner(ComputeConfig()) as run:
+        made = expand(arguments.out, demos, arguments.per_task, arguments.seed, testset.load(), run)
+    print(
+        f"{made.written} demonstrations in {len(made.files)} files: set demos.source: hdf5 and {arguments.out} as root"
+    )
+    print(json.dumps({"written": made.written, "dropped": dict(made.dropped.most_common()), "short": made.short}))
+    return 0
+
+
+def _check_oft(arguments: argparse.Namespace) -> int:
+    # TFDS takes seconds to import, which the other commands can do without.
+    from pipeline import oft_check
+
+    found = oft_check.check_run(arguments.data)
+    print(json.dumps(found))
+    return int(any(dataset["violations"] for dataset in found.values()))
 
 
 def _schema(arguments: argparse.Namespace) -> int:
@@ -139,11 +160,46 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(run=_rewrite)
 
     command = commands.add_parser(
-        "objects",
-        help="fetch and convert further object models for the layout axis (Debian's sweethome3d-furniture, 120 MB)",
+        "sources",
+        help="fetch and convert the textures and objects that a configuration names, as its plan would, and count them",
     )
-    command.add_argument("--own", type=Path, metavar="FOLDER", help="models of your own: <category>/<name>.obj or .xml")
-    command.set_defaults(run=_objects)
+    command.add_argument(
+        "--config",
+        type=Path,
+        default=Path("configs/paper.yaml"),
+        help="whose sources (default: configs/paper.yaml)",
+    )
+    command.set_defaults(run=_sources)
+
+    command = commands.add_parser("demos", help="make demonstrations")
+    made = command.add_subparsers(dest="verb", required=True, metavar="VERB")
+    command = made.add_parser(
+        "expand",
+        help="make many demonstrations of each task from the starter set's one, where the hub cannot be reached",
+        description="Replays each human demonstration from other starts of the arm, with the target elsewhere, and "
+        "writes those that reach the goal in LIBERO's own HDF5 layout (states, actions and scenes; no images). They "
+        "are marked as expanded in the files and in every dataset made from them.",
+    )
+    command.add_argument("out", type=Path, help="folder to use as demos.root afterwards")
+    command.add_argument(
+        "--per-task", type=_positive, default=10, metavar="N", help="demonstrations of each task (default: 10)"
+    )
+    command.add_argument(
+        "--tasks",
+        nargs="+",
+        default=DemosConfig().tasks,
+        metavar="PATTERN",
+        help="patterns of <suite>/<task> (default: the four suites)",
+    )
+    command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
+    command.set_defaults(run=_expand)
+
+    command = commands.add_parser(
+        "check-oft",
+        help="read a run's RLDS as OpenVLA-OFT's loader does, and print what it would train on as one line of JSON",
+    )
+    command.add_argument("data", type=Path, metavar="DIR", help="the run's data folder, such as data/starter")
+    command.set_defaults(run=_check_oft)
 
     command = commands.add_parser("schema", help="write schemas/config.schema.json from the code")
     command.set_defaults(run=_schema)

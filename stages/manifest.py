@@ -7,6 +7,7 @@ from pipeline.config import Config
 from pipeline.episodes import EpisodeLoader, kept, outcome, verdicts
 from pipeline.stage import main
 from pipeline.store import FrameStore, TrajectoryStore
+from pipeline.writers.rlds import by_suite
 
 
 def run(config: Config) -> None:
@@ -31,8 +32,9 @@ def run(config: Config) -> None:
 
     load = EpisodeLoader(plan_file, data / "frames", config.render)
     ids = kept(rows, data, config.render)
-    figures = stats.openvla([load.motion(episode_id) for episode_id in ids])
-    (data / "dataset_statistics.json").write_text(json.dumps({config.export.rlds.name: figures}, indent=1) + "\n")
+    sets = by_suite(ids, {row.episode_id: row.suite for row in rows}, config.export.rlds.name)
+    figures = {name: stats.openvla([load.motion(episode) for episode in members]) for name, members in sets.items()}
+    (data / "dataset_statistics.json").write_text(json.dumps(figures, indent=1) + "\n")
     (data / "counts.json").write_text(json.dumps(manifest.counts(table.to_pylist()), indent=1) + "\n")
 
 

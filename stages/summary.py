@@ -18,8 +18,9 @@ def run(config: Config) -> None:
     console = Console()
     console.print(manifest.counts_table(rows))
     for name, path in {
-        "RLDS": config.data / "rlds" / config.export.rlds.name / "1.0.0",
+        "RLDS": config.data / "rlds",
         "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
+        "fine-tuning": config.data / "finetune" / "finetune.yaml",
         "manifest": config.data / "manifest.parquet",
         **{f"{axis} sheet": path for axis, path in drawn.items()},
         **{f"{suite} previews": path for suite, path in previews.items()},

@@ -22,7 +22,7 @@ from conftest import REPOSITORY, STAGES, STOVE, dvc, link_testset, run_stages, t
 from PIL import Image
 from test_writers import records
 
-from pipeline import manifest, plan
+from pipeline import manifest, oft_check, plan
 from pipeline.axes import from_json
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
@@ -86,12 +86,14 @@ def test_lerobot_reads_what_the_manifest_says(finished: Path, rows: list[dict[st
 
 
 def test_tfds_reads_what_the_manifest_says(finished: Path, rows: list[dict[str, Any]]) -> None:
-    folder = finished / "rlds" / "tiny" / "1.0.0"
     kept = [row for row in rows if row["kept"]]
-    builder = tfds.builder_from_directory(folder)
-    assert builder.info.splits["train"].num_examples == len(kept)
-    stored = {shard.name: list(records(shard)) for shard in folder.glob("*.tfrecord-*")}
+    folders = {suite: finished / "rlds" / f"libero_tiny_{suite}" / "1.0.0" for suite in ("goal", "object")}
+    builders = {suite: tfds.builder_from_directory(folder) for suite, folder in folders.items()}
+    stored = {shard.name: list(records(shard)) for folder in folders.values() for shard in folder.glob("*.tfrecord-*")}
+    assert sum(map(len, stored.values())) == len(kept)
     for row in kept:
+        builder = builders[row["suite"].removeprefix("libero_")]
+        assert row["rlds_shard"].startswith(builder.info.name)
         record = stored[row["rlds_shard"]][row["rlds_index"]]
         episode = loader(finished)(row["episode_id"])
         read = tf_readback.columns(builder.info.features.deserialize_example_np(record))
@@ -136,8 +138,10 @@ def test_twins_share_what_does_not_differ(finished: Path, rows: list[dict[str, A
 
 
 def test_statistics_and_sheets(finished: Path, rows: list[dict[str, Any]]) -> None:
-    (figures,) = json.loads((finished / "dataset_statistics.json").read_text()).values()
-    kept = [row for row in rows if row["kept"]]
+    found = json.loads((finished / "dataset_statistics.json").read_text())
+    assert set(found) == {"libero_tiny_goal", "libero_tiny_object"}
+    figures = found["libero_tiny_goal"]
+    kept = [row for row in rows if row["kept"] and row["suite"] == "libero_goal"]
     assert figures["num_transitions"] == sum(row["steps"] for row in kept)
     assert figures["num_trajectories"] == len(kept)
     actions = np.concatenate([loader(finished)(row["episode_id"]).action for row in kept]).astype(np.float64)
@@ -149,6 +153,15 @@ def test_statistics_and_sheets(finished: Path, rows: list[dict[str, Any]]) -> No
     for axis in ("camera", "noise", "language"):
         with Image.open(finished / "sheets" / f"{axis}.png") as sheet:
             assert sheet.width > 300
+
+
+def test_openvla_oft_would_train_on_all_of_it(finished: Path, rows: list[dict[str, Any]]) -> None:
+    found = oft_check.check_run(finished)
+    assert [dataset["violations"] for dataset in found.values()] == [[], []]
+    kept = [row for row in rows if row["kept"]]
+    assert sum(dataset["chunks"] for dataset in found.values()) == sum(row["steps"] - 7 for row in kept)
+    recipe = yaml.safe_load((finished / "finetune" / "finetune.yaml").read_text())
+    assert recipe["dataset"]["mixtures"]["value"] == {"libero_tiny": dict.fromkeys(found, 1.0)}
 
 
 def hashes(data: Path) -> dict[str, str]:

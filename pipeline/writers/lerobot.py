@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import SCHEMA, check
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.stats import describe
 from pipeline.types import Episode, Floats, Frame
 from pipeline.writers.base import Load, folder_bytes, split
 from pipeline.writers.video import QUANTILES, Counts, VideoEncoder, statistics
@@ -169,14 +170,7 @@ def _pixels(episode: Episode, view: str, t: int) -> Frame:
 
 def _column_statistics(values: Floats) -> dict[str, NDArray[Any]]:
     """lerobot's statistics of a (N, D) column, each (D,); ``count`` is (1,)."""
-    return {
-        "min": values.min(axis=0),
-        "max": values.max(axis=0),
-        "mean": values.mean(axis=0),
-        "std": values.std(axis=0),
-        "count": np.array([len(values)]),
-        **{name: np.quantile(values, q, axis=0) for name, q in QUANTILES.items()},
-    }
+    return describe(values, QUANTILES) | {"count": np.array([len(values)])}
 
 
 def _write_statistics(root: Path, counts: Mapping[str, Counts]) -> None:

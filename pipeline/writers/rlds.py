@@ -66,6 +66,24 @@ class _Written:
     example_bytes: int
 
 
+def by_suite(episode_ids: Sequence[str], suites: Mapping[str, str], name: str) -> dict[str, list[str]]:
+    """Set name to its episodes, in the caller's order: a set for each suite, so that clients train on one or on all.
+
+    Args:
+        episode_ids: ids of the episodes to write.
+        suites: episode id to LIBERO suite.
+        name: what the sets' names begin with; ``libero_spatial`` comes into ``<name>_spatial``.
+
+    Raises:
+        PipelineError: when there is nothing to write.
+    """
+    split(episode_ids, 1)
+    sets: dict[str, list[str]] = {}
+    for episode_id in episode_ids:
+        sets.setdefault(f"{name}_{suites[episode_id].removeprefix('libero_')}", []).append(episode_id)
+    return sets
+
+
 def write(episode_ids: Sequence[str], load: Load, out: Path, *, name: str, shards: int, run: Run) -> RldsReport:
     """Write ``out/<name>/1.0.0/``, replacing what is there.
 

@@ -1,0 +1,159 @@
+"""Read an RLDS folder the way OpenVLA-OFT's loader does, without OFT and without TensorFlow.
+
+Followed, in OFT's order: ``libero_dataset_transform`` (gripper to 1 open, 0 close; state split into end effector and
+fingers), normalisation to [-1, 1] by the 1st and 99th percentile, trajectories without an instruction left out, and
+``chunk_act_obs``, which gives a trajectory of T steps T - 7 samples of 8 actions: none starts where fewer than 8 are
+left, so nothing is padded.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import tensorflow_datasets as tfds
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from pipeline import stats
+from pipeline.errors import PipelineError
+
+CHUNK = 8
+"""Actions that OFT predicts at once on LIBERO: the current one and seven to come."""
+
+VIEWS = {"image_primary": "image", "image_wrist": "wrist_image"}
+"""OFT's name of a view to its name in the dataset."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """An episode as it is stored.
+
+    Attributes:
+        name: its ``episode_id``.
+        action: (T, 7) float32, gripper -1 open, +1 close.
+        state: (T, 8) float32, end-effector pose and fingers.
+        frames: view (``image``, ``wrist_image``) to T JPEG files.
+        instructions: one text per step.
+    """
+
+    name: str
+    action: NDArray[np.float32]
+    state: NDArray[np.float32]
+    frames: Mapping[str, Sequence[bytes]]
+    instructions: Sequence[str]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """What OFT makes of an episode: one sample for each place at which a whole chunk begins, S = T - 7 in all.
+
+    Attributes:
+        prompt: the instruction, lower-cased as OFT prompts with it.
+        actions: (S, 8, 7) float32, normalised, gripper 1 open, 0 close.
+        proprio: (S, 8) float32, normalised.
+        frames: ``image_primary`` and ``image_wrist`` to S JPEG files, which OFT decodes, resizes and augments.
+    """
+
+    prompt: str
+    actions: NDArray[np.float32]
+    proprio: NDArray[np.float32]
+    frames: Mapping[str, Sequence[bytes]]
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def datasets(root: Path) -> list[Path]:
+    """Version folders of the datasets below OFT's ``data_root_dir``.
+
+    Raises:
+        PipelineError: when there is none.
+    """
+    found = sorted(file.parent for file in root.glob("*/*/dataset_info.json"))
+    if not found:
+        raise PipelineError(
+            "no RLDS dataset", where=root, expected="NAME/1.0.0/dataset_info.json", remedy="run `dvc repro`"
+        )
+    return found
+
+
+def read(folder: Path) -> Iterator[Recorded]:
+    """The episodes of a version folder, shard by shard, frames left encoded.
+
+    Raises:
+        PipelineError: naming the file and the record, when a checksum is wrong or a feature that OFT reads is missing.
+    """
+    features = tfds.builder_from_directory(folder).info.features
+    parser = tfds.core.example_parser.ExampleParserNp(features.get_serialized_info())
+    for shard in sorted(folder.glob("*.tfrecord-*")):
+        for index, record in enumerate(_records(shard)):
+            try:
+                yield _recorded(parser.parse_example(record))
+            except KeyError as error:
+                raise PipelineError(
+                    f"record {index} has no feature {error}", where=shard, expected="the feature tree of OpenVLA's sets"
+                ) from error
+
+
+def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Trajectory | None:
+    """What OFT trains on, or None where it passes the episode by: no instruction, or fewer than 8 steps."""
+    if not any(episode.instructions) or len(episode.action) < CHUNK:
+        return None
+    action = normalise(stats.open_is_one(episode.action), statistics["action"])
+    end_effector, fingers = episode.state[:, :6], episode.state[:, -2:]
+    proprio = normalise(np.concatenate((end_effector, fingers), axis=1), statistics["proprio"])
+    chunks = sliding_window_view(action, CHUNK, axis=0).swapaxes(1, 2)
+    samples = len(chunks)
+    return Trajectory(
+        prompt=episode.instructions[0].lower(),
+        actions=chunks,
+        proprio=proprio[:samples],
+        frames={name: episode.frames[view][:samples] for name, view in VIEWS.items()},
+    )
+
+
+def normalise(values: NDArray[np.float32], figures: Mapping[str, Any]) -> NDArray[np.float32]:
+    """Columns of ``values`` (T, D) mapped from [q01, q99] to [-1, 1] and clipped; a constant column becomes 0.
+
+    Where ``figures`` has a mask, columns that it leaves out stay as they are (the gripper).
+    """
+    low, high, smallest, largest = (np.asarray(figures[name]) for name in ("q01", "q99", "min", "max"))
+    mask = np.asarray(figures.get("mask", [True] * values.shape[1]))
+    scaled = np.clip(2 * (values - low) / (high - low + 1e-8) - 1, -1, 1)
+    return np.where(smallest == largest, 0.0, np.where(mask, scaled, values)).astype(np.float32)
+
+
+def _recorded(example: Mapping[str, Any]) -> Recorded:
+    steps, observation = example["steps"], example["steps"]["observation"]
+    return Recorded(
+        name=example["episode_metadata"]["episode_id"].decode(),
+        action=steps["action"],
+        state=observation["state"],
+        frames={view: list(observation[view]) for view in VIEWS.values()},
+        instructions=[text.decode() for text in steps["language_instruction"]],
+    )
+
+
+def _records(shard: Path) -> Iterator[bytes]:
+    """The records of a TFRecord file: length (8 bytes), its checksum (4), data, its checksum (4)."""
+    with shard.open("rb") as file:
+        for index, head in enumerate(iter(partial(file.read, 12), b"")):
+            data = file.read(struct.unpack("<Q", head[:8])[0]) if head[8:] == _checksum(head[:8]) else None
+            if data is None or file.read(4) != _checksum(data):
+                raise PipelineError(
+                    f"record {index} is damaged", where=shard, expected="its checksum", remedy="write the dataset again"
+                )
+            yield data
+
+
+def _checksum(data: bytes) -> bytes:
+    """TFRecord's masked CRC-32C."""
+    crc = google_crc32c.value(data)
+    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)

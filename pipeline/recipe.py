@@ -1,0 +1,196 @@
+"""The fine-tuning manifest and, beside it, what OpenVLA-OFT, openpi and lerobot need to train on a run's datasets."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import pyarrow.parquet as pq
+import yaml
+
+from pipeline import stats
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+
+SCHEMA_FILE = Path(__file__).parent.parent / "schemas" / "finetune.json"
+TEMPLATES = Path(__file__).parent / "templates"
+COPIED = ("run_openvla_oft.py", "run_openpi.py", "lerobot_v3.py")
+
+PAPER = "LIBERO-Plus (arXiv:2510.13626), fine-tuning details"
+OFT = "OpenVLA-OFT's command for LIBERO (github.com/moojink/openvla-oft, LIBERO.md)"
+BOTH = f"{PAPER}; the same in {OFT}"
+MADE = "manifest.parquet of this run"
+
+
+def sourced(value: Any, source: str) -> dict[str, Any]:
+    """A field of the fine-tuning manifest."""
+    return {"value": value, "source": source}
+
+
+RECIPE = {
+    "base_weights": sourced(
+        "openvla/openvla-7b",
+        OFT + "; LIBERO-Plus's repository names what came of it, openvla-7b-oft-finetuned-libero-plus-mixdata",
+    ),
+    "gpus": sourced(8, PAPER),
+    "batch_size_per_gpu": sourced(2, PAPER + "; OpenVLA-OFT's command for LIBERO has 8"),
+    "effective_batch_size": sourced(16, "gpus x batch_size_per_gpu, gradients not accumulated"),
+    "learning_rate": sourced(5e-4, BOTH),
+    "steps": sourced(100_000, PAPER + "; OpenVLA-OFT's command for LIBERO has 150,005"),
+    "optimizer": sourced("adamw", BOTH),
+    "weight_decay": sourced(
+        0.1, PAPER + "; OpenVLA-OFT has no flag for it and leaves PyTorch's 0.01: run_openvla_oft.py sets it"
+    ),
+    "schedule": sourced(
+        "cosine_with_warmup",
+        PAPER + "; OpenVLA-OFT has only a division by 10 after 100,000 steps: run_openvla_oft.py replaces it",
+    ),
+    "warmup_steps": sourced(1000, "this project: 1 % of the steps, for want of a published length"),
+    "images": sourced(len(SCHEMA.views), BOTH),
+    "proprioception": sourced(True, BOTH),
+    "action_head": sourced("l1_regression", BOTH),
+    "chunk": sourced(8, PAPER + "; the same in OpenVLA-OFT's constants for LIBERO (prismatic/vla/constants.py)"),
+    "image_augmentation": sourced(True, BOTH),
+    "lora_rank": sourced(32, OFT),
+    "shuffle_buffer": sourced(100_000, "OpenVLA-OFT's default, in frames; lower it where memory is short"),
+}
+
+
+def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, lerobot: str) -> dict[str, Any]:
+    """The fine-tuning manifest of a run.
+
+    Args:
+        manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
+            episode, its place in each format, and the versions and the device that made it.
+        rows: its rows.
+        name: what OpenVLA-OFT is to call all RLDS datasets together.
+        lerobot: name of the LeRobot dataset.
+
+    Raises:
+        PipelineError: when nothing was kept, or OFT would take the name for another robot's.
+    """
+    if "libero" not in name or "aloha" in name:
+        raise PipelineError(
+            f"{name} would be read with another robot's constants and cameras by OpenVLA-OFT, which goes by the name",
+            where="export.rlds.name",
+            expected="a name with libero and without aloha in it",
+        )
+    kept = [row for row in rows if row["kept"]]
+    if not kept:
+        raise PipelineError("no episode was kept", where=manifest_file, remedy="read its column reason")
+    suites = {row["suite"]: _dataset(row["rlds_shard"]) for row in kept}
+    counts: dict[str, dict[str, int]] = {}
+    for row in kept:
+        by_axis = counts.setdefault(row["suite"], {})
+        by_axis[row["axis"]] = by_axis.get(row["axis"], 0) + 1
+    made = {
+        "name": name,
+        "dataset": {
+            "sha256": sourced(hashlib.sha256(manifest_file.read_bytes()).hexdigest(), "hash of " + MADE),
+            "episodes": sourced(len(kept), MADE),
+            "steps": sourced(sum(row["steps"] for row in kept), MADE),
+            "episodes_by_suite_and_axis": sourced(counts, MADE),
+            "suites": sourced(suites, MADE + ": the RLDS dataset that holds each suite"),
+            "mixtures": sourced(
+                {name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
+                "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
+            ),
+            "lerobot": sourced(lerobot, "the run's configuration, export.lerobot.name"),
+        },
+        "recipe": RECIPE,
+        "clients": _clients(name, lerobot),
+    }
+    check(made, manifest_file)
+    return made
+
+
+def write(manifest: Mapping[str, Any], lerobot: Path, folder: Path) -> None:
+    """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``folder``.
+
+    Args:
+        manifest: what ``build`` made.
+        lerobot: root of the LeRobot dataset, whose actions and states are measured.
+        folder: where to write; the scripts look for ``rlds`` and ``lerobot`` beside it.
+    """
+    columns = [SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key]
+    table = pq.read_table(lerobot / "data", columns=columns)
+    actions, states = (np.stack(table[column].to_numpy()) for column in columns)
+    with replaced(folder) as made:
+        (made / "openpi_assets").mkdir(parents=True)
+        (made / "openpi_assets" / "norm_stats.json").write_text(
+            json.dumps(stats.openpi(actions, states), indent=1) + "\n"
+        )
+        # One line for each field: a folded command could not be copied.
+        text = yaml.dump(dict(manifest), Dumper=_Dumper, sort_keys=False, width=10_000)
+        (made / "finetune.yaml").write_text(text)
+        for file in COPIED:
+            shutil.copyfile(TEMPLATES / file, made / file)
+
+
+def check(manifest: Mapping[str, Any], where: object) -> None:
+    """Validate a fine-tuning manifest.
+
+    Raises:
+        PipelineError: naming the first field that breaks ``schemas/finetune.json``.
+    """
+    validator = jsonschema.Draft202012Validator(json.loads(SCHEMA_FILE.read_text()))
+    if error := jsonschema.exceptions.best_match(validator.iter_errors(manifest)):
+        raise PipelineError(
+            f"{'.'.join(map(str, error.path)) or 'top level'}: {error.message}",
+            where=where,
+            expected="what schemas/finetune.json says",
+        )
+
+
+class _Dumper(yaml.SafeDumper):
+    """Leaves quotation marks as they are, so that a command can be copied."""
+
+
+def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style="|" if '"' in text else None)
+
+
+_Dumper.add_representer(str, _text)
+
+
+def _dataset(shard: str) -> str:
+    """Name of the RLDS dataset that a shard belongs to, which its file name begins with."""
+    return shard.rsplit("-", maxsplit=4)[0]
+
+
+def _clients(name: str, lerobot: str) -> dict[str, dict[str, str]]:
+    """Command lines; ``$DATA`` stands for the run's data folder, by its absolute path."""
+    train = f"lerobot-train --dataset.repo_id={lerobot} --dataset.root=$DATA/lerobot/{lerobot}"
+    local = "--policy.push_to_hub=false"
+    views = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), start=1)}
+    return {
+        "openvla_oft": {
+            "where": "a checkout of github.com/moojink/openvla-oft, in its environment",
+            "command": "torchrun --standalone --nnodes 1 --nproc-per-node 8 $DATA/finetune/run_openvla_oft.py",
+            "source": "the recipe above; --dataset_name NAME trains on one suite, see dataset.suites",
+        },
+        "openpi": {
+            "where": "a checkout of github.com/Physical-Intelligence/openpi",
+            "command": "uv run python $DATA/finetune/run_openpi.py scripts/train.py "
+            f"pi05_{lerobot} --exp-name={lerobot}",
+            "source": "openpi's configuration pi05_libero, with this dataset",
+        },
+        "lerobot_act": {
+            "where": "an environment with lerobot",
+            "command": f"{train} {local} --policy.type=act --batch_size=8 --steps=100000",
+            "source": "lerobot's defaults",
+        },
+        "lerobot_smolvla": {
+            "where": "an environment with lerobot[smolvla]",
+            "command": f"{train} {local} --policy.path=lerobot/smolvla_base --rename_map='{json.dumps(views)}' "
+            "--batch_size=64 --steps=20000",
+            "source": "lerobot's command for fine-tuning SmolVLA; the weights' cameras are camera1, camera2, camera3",
+        },
+    }

@@ -1,0 +1,17 @@
+"""Stage recipe: the fine-tuning manifest, and what each policy's code needs to train on the datasets as they are."""
+
+from pipeline import manifest, recipe
+from pipeline.config import Config
+from pipeline.stage import main
+
+
+def run(config: Config) -> None:
+    file, name = config.data / "manifest.parquet", config.export.lerobot.name
+    made = recipe.build(file, manifest.read(file), name=config.export.rlds.name, lerobot=name)
+    folder = config.data / "finetune"
+    recipe.write(made, config.data / "lerobot" / name, folder)
+    print(f"{folder / 'finetune.yaml'} has the recipe and a command line for each of {', '.join(made['clients'])}")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

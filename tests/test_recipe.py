@@ -1,0 +1,313 @@
+"""The fine-tuning manifest, and the clients' scripts: run as a user would, in stand-ins for the clients' checkouts.
+
+OpenVLA-OFT and openpi cannot be installed here. A stand-in has the names that the scripts touch, and a training script
+that writes down what it was given.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from test_writers import REPO, write_lerobot
+
+from pipeline import recipe
+from pipeline.errors import PipelineError
+from pipeline.templates.lerobot_v3 import LeRobotV3
+
+NAME = "libero_tiny"
+SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}
+
+
+def row(suite: str, axis: str, kept: bool = True) -> dict[str, Any]:
+    shard = f"{SUITES[suite]}-train.tfrecord-00000-of-00002" if kept else None
+    return {"suite": suite, "axis": axis, "kept": kept, "steps": 100 if kept else None, "rlds_shard": shard}
+
+
+ROWS = [
+    row("libero_spatial", "clean"),
+    row("libero_spatial", "camera"),
+    row("libero_spatial", "camera"),
+    row("libero_10", "light"),
+    row("libero_10", "camera", kept=False),
+]
+
+
+def build(folder: Path, name: str = NAME, rows: list[dict[str, Any]] = ROWS) -> dict[str, Any]:
+    file = folder / "manifest.parquet"
+    file.write_bytes(b"rows")
+    return recipe.build(file, rows, name=name, lerobot="tiny")
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run's data folder with a LeRobot dataset and what the recipe stage writes."""
+    data = tmp_path_factory.mktemp("data")
+    write_lerobot(data)
+    (data / "lerobot").rename(data / "tiny")
+    (data / "lerobot").mkdir()
+    (data / "tiny").rename(data / "lerobot" / "tiny")
+    recipe.write(build(data), data / "lerobot" / "tiny", data / "finetune")
+    return data
+
+
+def test_manifest_counts_what_was_kept(tmp_path: Path) -> None:
+    made = build(tmp_path)
+    dataset = {name: field["value"] for name, field in made["dataset"].items()}
+    assert (dataset["episodes"], dataset["steps"]) == (4, 400)
+    assert dataset["episodes_by_suite_and_axis"] == {
+        "libero_spatial": {"clean": 1, "camera": 2},
+        "libero_10": {"light": 1},
+    }
+    assert dataset["suites"] == SUITES
+    assert dataset["mixtures"] == {NAME: dict.fromkeys(sorted(SUITES.values()), 1.0)}
+    values = {name: field["value"] for name, field in made["recipe"].items()}
+    assert values["effective_batch_size"] == values["gpus"] * values["batch_size_per_gpu"]
+    assert all(field["source"] for field in (*made["dataset"].values(), *made["recipe"].values()))
+
+
+def test_manifest_changes_with_the_dataset(tmp_path: Path) -> None:
+    (tmp_path / "other.parquet").write_bytes(b"other rows")
+    other = recipe.build(tmp_path / "other.parquet", ROWS, name=NAME, lerobot="tiny")
+    assert other["dataset"]["sha256"] != build(tmp_path)["dataset"]["sha256"]
+
+
+@pytest.mark.parametrize("name", ["my_set", "libero_aloha"])
+def test_names_that_openvla_oft_takes_for_another_robot_are_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match=r"export\.rlds\.name"):
+        build(tmp_path, name=name)
+
+
+def test_nothing_kept_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="no episode was kept"):
+        build(tmp_path, rows=[row("libero_10", "camera", kept=False)])
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value"),
+    [
+        ("recipe", "learning_rate", {"value": 0, "source": "x"}),
+        ("recipe", "weight_decay", {"value": 0.1}),
+        ("recipe", "schedule", {"value": "step", "source": "x"}),
+        ("dataset", "sha256", {"value": "short", "source": "x"}),
+        ("dataset", "extra", {"value": 1, "source": "x"}),
+    ],
+)
+def test_schema_refuses(section: str, field: str, value: object, tmp_path: Path) -> None:
+    made = build(tmp_path)
+    made[section] = made[section] | {field: value}
+    with pytest.raises(PipelineError, match=field):
+        recipe.check(made, "finetune.yaml")
+
+
+def test_written_manifest_is_read_back_and_its_commands_can_be_copied(data: Path) -> None:
+    text = (data / "finetune" / "finetune.yaml").read_text()
+    manifest = yaml.safe_load(text)
+    assert manifest == build(data)
+    assert all(client["command"] in text for client in manifest["clients"].values())
+
+
+def run(folder: Path, script: Path, *arguments: str) -> dict[str, Any]:
+    """Run a client's script in a stand-in checkout; returns what its training script wrote down."""
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    command = [sys.executable, str(script), *arguments]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    seen: dict[str, Any] = json.loads((folder / "seen.json").read_text())
+    return seen
+
+
+def stand_in(folder: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    return folder
+
+
+OFT_DATA = "prismatic/vla/datasets/rlds"
+OFT = {
+    f"{OFT_DATA}/oxe/configs.py": """
+from enum import IntEnum
+StateEncoding = IntEnum("StateEncoding", {"POS_EULER": 1})
+ActionEncoding = IntEnum("ActionEncoding", {"EEF_POS": 1})
+OXE_DATASET_CONFIGS = {}
+""",
+    f"{OFT_DATA}/oxe/transforms.py": """
+def libero_dataset_transform(trajectory): ...
+OXE_STANDARDIZATION_TRANSFORMS = {}
+""",
+    f"{OFT_DATA}/oxe/mixtures.py": "OXE_NAMED_MIXTURES = {'bridge': [('bridge_orig', 1.0)]}",
+    f"{OFT_DATA}/utils/data_utils.py": """
+import json
+def save_dataset_statistics(statistics, folder):
+    (folder / "dataset_statistics.json").write_text(json.dumps(statistics))
+""",
+    "vla-scripts/finetune.py": f"""
+import json, sys
+from pathlib import Path
+import torch
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import MultiStepLR
+from {OFT_DATA.replace("/", ".")}.oxe import configs, mixtures, transforms
+from {OFT_DATA.replace("/", ".")}.utils.data_utils import save_dataset_statistics
+
+if __name__ == "__main__":
+    optimizer = AdamW([torch.nn.Parameter(torch.zeros(1))], lr=5e-4)
+    scheduler = MultiStepLR(optimizer, milestones=[100000], gamma=0.1)
+    rates = []
+    for _ in range(500):
+        rates.append(optimizer.param_groups[0]["lr"])
+        scheduler.step()
+    save_dataset_statistics({{"{NAME}_spatial": 1, "{NAME}_10": 2}}, Path("."))
+    Path("seen.json").write_text(json.dumps({{
+        "arguments": dict(zip(sys.argv[1::2], sys.argv[2::2])),
+        "weight_decay": optimizer.param_groups[0]["weight_decay"],
+        "rates": rates,
+        "configs": configs.OXE_DATASET_CONFIGS,
+        "transforms": {{k: v.__name__ for k, v in transforms.OXE_STANDARDIZATION_TRANSFORMS.items()}},
+        "mixtures": mixtures.OXE_NAMED_MIXTURES,
+    }}))
+""",
+}
+
+
+def test_openvla_oft_is_given_datasets_recipe_and_schedule(data: Path, tmp_path: Path) -> None:
+    checkout = stand_in(tmp_path / "oft", OFT)
+    folder = tmp_path / "data" / "finetune"
+    shutil.copytree(data / "finetune", folder)
+    shorter = yaml.safe_load((folder / "finetune.yaml").read_text())
+    shorter["recipe"]["steps"]["value"], shorter["recipe"]["warmup_steps"]["value"] = 500, 100
+    (folder / "finetune.yaml").write_text(yaml.safe_dump(shorter))
+    seen = run(checkout, folder / "run_openvla_oft.py", "--dataset_name", f"{NAME}_spatial")
+    assert seen["mixtures"] == {
+        "bridge": [["bridge_orig", 1.0]],
+        NAME: [[f"{NAME}_10", 1.0], [f"{NAME}_spatial", 1.0]],
+        f"{NAME}_10": [[f"{NAME}_10", 1.0]],
+        f"{NAME}_spatial": [[f"{NAME}_spatial", 1.0]],
+    }
+    assert set(seen["transforms"]) == set(seen["configs"]) == set(SUITES.values())
+    assert set(seen["transforms"].values()) == {"libero_dataset_transform"}
+    config = seen["configs"][f"{NAME}_10"]
+    assert config["image_obs_keys"] == {"primary": "image", "secondary": None, "wrist": "wrist_image"}
+    assert config["state_obs_keys"] == ["EEF_state", "gripper_state"]
+    arguments = seen["arguments"]
+    assert arguments["--data_root_dir"] == str(tmp_path / "data" / "rlds")
+    assert arguments["--dataset_name"] == f"{NAME}_spatial", "a user's argument wins"
+    given = {"--batch_size": "2", "--use_proprio": "True", "--num_images_in_input": "2", "--max_steps": "500"}
+    assert given.items() <= arguments.items()
+    assert arguments["--lr_warmup_steps"] == "0", "OFT's own warm-up would undo the cosine"
+    assert seen["weight_decay"] == 0.1
+    rates = np.array(seen["rates"])
+    assert np.allclose(rates[[0, 49, 99, 300]], [5e-6, 2.5e-4, 5e-4, 2.5e-4])
+    assert rates[-1] < 1e-8
+    assert (np.diff(rates[100:]) <= 0).all()
+    statistics = json.loads((checkout / "dataset_statistics.json").read_text())
+    # OFT's evaluation asks for the suite's name.
+    assert (statistics["libero_spatial"], statistics["libero_10"]) == (1, 2)
+
+
+def test_scripts_say_where_to_call_them(data: Path, tmp_path: Path) -> None:
+    for script, where in (("run_openvla_oft.py", "a checkout of OpenVLA-OFT"), ("run_openpi.py", "scripts/train.py")):
+        command = [sys.executable, str(data / "finetune" / script)]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 1
+        assert where in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+OPENPI = {
+    "openpi/__init__.py": "",
+    "openpi/training/config.py": """
+import dataclasses
+@dataclasses.dataclass(frozen=True)
+class AssetsConfig:
+    assets_dir: str | None = None
+    asset_id: str | None = None
+@dataclasses.dataclass(frozen=True)
+class LeRobotLiberoDataConfig:
+    repo_id: str
+    assets: AssetsConfig = AssetsConfig()
+    extra_delta_transform: bool = False
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    name: str
+    data: LeRobotLiberoDataConfig
+    batch_size: int = 256
+_CONFIGS_DICT = {"pi05_libero": TrainConfig("pi05_libero", LeRobotLiberoDataConfig("physical-intelligence/libero"))}
+def get_config(name):
+    return _CONFIGS_DICT[name]
+""",
+    "openpi/training/data_loader.py": """
+def create_torch_dataset(data_config, action_horizon, model_config):
+    return "openpi's own"
+def create_data_loader(config, action_horizon):
+    return create_torch_dataset(config.data, action_horizon, None)
+""",
+    "scripts/train.py": """
+import json, multiprocessing, pathlib, sys
+import numpy as np
+import openpi.training.config as config
+import openpi.training.data_loader as loader
+if __name__ == "__main__":
+    chosen = config.get_config(sys.argv[1])
+    dataset = loader.create_data_loader(chosen, 10)
+    # As PyTorch's workers do, under openpi's start method.
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        item = pool.map(dataset.__getitem__, [3])[0]
+    assets = chosen.data.assets
+    file = pathlib.Path(assets.assets_dir) / assets.asset_id / "norm_stats.json"
+    pathlib.Path("seen.json").write_text(json.dumps({
+        "arguments": sys.argv[2:],
+        "batch_size": chosen.batch_size,
+        "shapes": {name: np.shape(value) for name, value in item.items()},
+        "statistics": sorted(json.loads(file.read_text())["norm_stats"]),
+        "other": loader.create_data_loader(config.get_config("pi05_libero"), 10),
+    }))
+""",
+}
+
+
+def test_openpi_is_given_configuration_dataset_and_statistics(data: Path, tmp_path: Path) -> None:
+    script = data / "finetune" / "run_openpi.py"
+    seen = run(stand_in(tmp_path, OPENPI), script, "scripts/train.py", "pi05_tiny", "--exp-name=first")
+    assert seen == {
+        "arguments": ["--exp-name=first"],
+        "batch_size": 256,
+        "shapes": {
+            "image": [256, 256, 3],
+            "wrist_image": [256, 256, 3],
+            "state": [8],
+            "actions": [10, 7],
+            "prompt": [],
+        },
+        "statistics": ["actions", "state"],
+        "other": "openpi's own",
+    }
+
+
+def test_openpis_reader_returns_what_lerobots_does(data: Path) -> None:
+    root = data / "lerobot" / "tiny"
+    horizon = 5
+    found = LeRobotV3(root, horizon)
+    ahead = {"action": [step / 20 for step in range(horizon)]}
+    expected = LeRobotDataset(REPO, root=root, video_backend="pyav", delta_timestamps=ahead)
+    assert len(found) == len(expected)
+    for index in [*range(0, len(found), 7), len(found) - 1]:
+        item, reference = found[index], expected[index]
+        assert item["prompt"] == reference["task"]
+        assert np.array_equal(item["state"], reference["observation.state"].numpy())
+        assert np.array_equal(item["actions"], reference["action"].numpy())
+        for view, key in (("image", "image"), ("wrist_image", "image2")):
+            shown = reference[f"observation.images.{key}"].numpy().transpose(1, 2, 0) * 255
+            assert np.array_equal(item[view], np.rint(shown))
+    with pytest.raises(IndexError):
+        found[len(found)]
