@@ -101,10 +101,11 @@ def counts_table(manifest: Sequence[Mapping[str, Any]]) -> Table:
         "axis", *(suite.removeprefix("libero_") for suite in suites), "all", title="planned/replayed/kept episodes"
     )
     for column in table.columns[1:]:
-        column.justify = "right"
+        column.justify, column.no_wrap = "right", True
     for axis, by_suite in cells.items():
         shown = [by_suite.get(suite, {}) for suite in suites]
-        table.add_row(axis, *map(_cell, shown), _cell(_sum(shown)))
+        # A combination's name may break behind a +.
+        table.add_row(axis.replace("+", "+ "), *map(_cell, shown), _cell(_sum(shown)))
     columns = [_sum([by_suite.get(suite, {}) for by_suite in cells.values()]) for suite in suites]
     table.add_section()
     table.add_row("all", *map(_cell, columns), _cell(_sum(columns)))

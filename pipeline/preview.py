@@ -188,7 +188,7 @@ def draw(stage: Stage, name: str, config: Config) -> Image.Image:
 
 
 def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
-    """Draw every configured axis on the first task of each suite that the run is about.
+    """Draw every configured axis that applies on the first task of each suite that the run is about.
 
     Returns:
         Suite to the folder of its sheets, ``<folder>/<suite>/<axis>.png``.
@@ -207,5 +207,6 @@ def _draw_all(job: tuple[list[Task], Config, Path]) -> None:
     folder.mkdir(parents=True)
     with staged(tasks, config) as stage:
         for name in Axes.model_fields:
-            if getattr(config.plan.axes, name) is not None:
+            axis: AnyAxis | None = getattr(config.plan.axes, name)
+            if axis is not None and axis.applies(stage.demo.task):
                 draw(stage, name, config).save(folder / f"{name}.png")

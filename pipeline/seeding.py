@@ -9,10 +9,12 @@ import numpy as np
 
 Key = str | int
 
+_CANONICAL = json.JSONEncoder(sort_keys=True, separators=(",", ":"))
+
 
 def digest(*key: object) -> str:
     """SHA-256 (64 hex digits) of a JSON-serialisable key, in canonical form."""
-    return hashlib.sha256(json.dumps(key, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return hashlib.sha256(_CANONICAL.encode(key).encode()).hexdigest()
 
 
 def rng(*key: Key) -> np.random.Generator:

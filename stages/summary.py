@@ -17,15 +17,16 @@ def run(config: Config) -> None:
         previews = preview.for_run(config, config.data / "previews", workers)
     console = Console()
     console.print(manifest.counts_table(rows))
-    for name, path in {
-        "RLDS": config.data / "rlds",
+    made = {
+        "RLDS": config.data / "rlds" / config.export.rlds.name / "1.0.0",
         "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
-        "fine-tuning": config.data / "finetune" / "finetune.yaml",
         "manifest": config.data / "manifest.parquet",
         **{f"{axis} sheet": path for axis, path in drawn.items()},
         **{f"{suite} previews": path for suite, path in previews.items()},
-    }.items():
-        console.print(f"{name:>23}  {path}", soft_wrap=True, highlight=False)
+    }
+    width = max(map(len, made))
+    for name, path in made.items():
+        console.print(f"{name:>{width}}  {path}", soft_wrap=True, highlight=False)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from pydantic import Field
 from pipeline import textures
 from pipeline.axes.base import Axis, Frozen, Nearest, RenderPerturbation
 from pipeline.errors import PipelineError
-from pipeline.texture_sources import Source
+from pipeline.texture_sources import Source, Texture
 from pipeline.types import Frame, Task
 
 if TYPE_CHECKING:
@@ -139,9 +139,7 @@ class BackgroundAxis(Axis):
         )
 
     def _draw_covering(self, rng: np.random.Generator, part: Part) -> Covering:
-        offered = textures.catalogue(self.sources).values()
-        procedural = [texture for texture in offered if texture.source == "procedural"]
-        images = [texture for texture in offered if texture.source != "procedural"]
+        procedural, images = _offered(self.sources)
         choices = images if images and (rng.random() < self.image_share or not procedural) else procedural
         texture = choices[rng.integers(len(choices))]
         return Covering(
@@ -151,6 +149,14 @@ class BackgroundAxis(Axis):
             sha256=texture.sha256,
             quarter_turns=int(rng.integers(4)),
         )
+
+
+@cache
+def _offered(sources: tuple[Source, ...]) -> tuple[list[Texture], list[Texture]]:
+    """The textures of some sources: procedural ones, and images."""
+    offered = textures.catalogue(sources).values()
+    procedural = [texture for texture in offered if texture.source == "procedural"]
+    return procedural, [texture for texture in offered if texture.source != "procedural"]
 
 
 @cache

@@ -121,7 +121,7 @@ def load_bank(file: Path = BANK_FILE) -> Bank:
         PipelineError: when the file does not have the bank's form.
     """
     try:
-        return TypeAdapter(Bank).validate_python(yaml.safe_load(file.read_text(encoding="ascii")))
+        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), yaml.CSafeLoader))
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         raise PipelineError(
             f"the bank of rewrites cannot be read ({error})",
@@ -211,8 +211,14 @@ def _edits(one: NDArray[np.uint8], two: NDArray[np.uint8]) -> int:
 
 @cache
 def _nearest(text: str, test: TestSet, task: Task) -> Nearest:
-    wordings = [str(tested.parameters["text"]) for tested in test.on(task, "language")]
-    return Nearest(min((distance(text, wording) for wording in wordings), default=math.inf), len(wordings))
+    own, wordings = _characters(text), _test_wordings(test, task)
+    distances = (int(_edits(own, wording)) / max(len(own), len(wording), 1) for wording in wordings)
+    return Nearest(min(distances, default=math.inf), len(wordings))
+
+
+@cache
+def _test_wordings(test: TestSet, task: Task) -> tuple[NDArray[np.uint8], ...]:
+    return tuple(_characters(str(tested.parameters["text"])) for tested in test.on(task, "language"))
 
 
 def lint(text: str, task: Task, component: Component) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
@@ -10,6 +11,7 @@ from pydantic import Field
 
 from pipeline.axes.base import Axis, Frozen, Nearest, PhysicsPerturbation
 from pipeline.errors import PipelineError
+from pipeline.object_model import ObjectModel
 from pipeline.object_sources import Source
 from pipeline.objects import find, goes_with, models, taken
 from pipeline.types import Demo, Scene, Task
@@ -83,8 +85,7 @@ class LayoutAxis(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LayoutPerturbation:
         level = self.draw_level(rng)
-        there = taken(task)
-        fitting = [model for model in models(self.sources).values() if goes_with(model, there)]
+        fitting = _fitting(self.sources, task)
         chosen: dict[str, AddedObject] = {}
         for index in rng.permutation(len(fitting)):
             model = fitting[index]
@@ -105,6 +106,13 @@ class LayoutAxis(Axis):
                 remedy="add sources, widen area_m2 or leave out the higher levels",
             )
         return LayoutPerturbation(level=level, objects=tuple(chosen.values()), seed=int(rng.integers(2**31)))
+
+
+@cache
+def _fitting(sources: tuple[Source, ...], task: Task) -> list[ObjectModel]:
+    """The objects that are of another category than everything in a task's scene."""
+    there = taken(task)
+    return [model for model in models(sources).values() if goes_with(model, there)]
 
 
 def _plain(categories: object) -> list[str]:
