@@ -18,7 +18,7 @@ def run(config: Config) -> None:
     console = Console()
     console.print(manifest.counts_table(rows))
     made = {
-        "RLDS": config.data / "rlds" / config.export.rlds.name / "1.0.0",
+        "RLDS": config.data / "rlds",
         "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
         "manifest": config.data / "manifest.parquet",
         **{f"{axis} sheet": path for axis, path in drawn.items()},
