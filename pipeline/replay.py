@@ -115,7 +115,7 @@ def replay(
 def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
     """The actions that follow a reference from where the restored environment stands."""
     poses = {name: environment.pose(name) for name in reference.poses}
-    return follow(Route.through(reference, environment.hand, poses), lambda: environment.hand)
+    return follow(Route.through(reference, environment.hand, poses), lambda: environment.hand, environment.pose)
 
 
 def _perturbed(

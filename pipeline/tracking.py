@@ -36,6 +36,12 @@ TOLERANCE_M, TOLERANCE_RAD = 0.03, 0.15
 PATIENCE = 80.0
 """Control steps (4 s) that the route waits in all; where the hand is held up for longer, it goes on without waiting."""
 
+REGRASP = 0.1
+"""Share, in each control step, by which the route closes in on what a grasp that fell out otherwise asks for."""
+
+LOST_M = 0.05
+"""An object that lies otherwise in the hand by more than this was not grasped, or was dropped."""
+
 BEND_SPEED = 0.6
 """Largest share of the hand's speed that returning to the demonstrated route may take by itself."""
 
@@ -112,19 +118,28 @@ class Route:
         return position, Rotation.from_rotvec(way * turn) * self.rotations[step]
 
 
-def follow(route: Route, hand: Callable[[], Hand]) -> Iterator[Floats]:
+def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]) -> Iterator[Floats]:
     """Actions (7,) in [-1, 1] that keep the hand on a route; each is made when it is asked for.
 
     The index along the route advances by one a step, so that grasp and release keep their timing, and more slowly while
-    the hand is far from where it should be.
+    the hand is far from where it should be. While something is carried, it is brought where it was in the reference
+    rather than the hand, as it may have been grasped a little otherwise.
+
+    Args:
+        route: where to go.
+        hand: where the hand is.
+        pose: object to where it is (7,).
     """
     reference = route.reference
     turns = (route.rotations * reference.rotations.inv()).as_rotvec()
     bend = np.hstack([route.positions_m - reference.positions_m, turns])
     steps = np.arange(len(route) + 1)
     index, patience = 0.0, PATIENCE
+    grasp: Floats = np.zeros(3)
     while index < len(route):
         (position, rotation), (wanted_position, wanted_rotation) = hand(), route.at(index)
+        grasp = grasp + REGRASP * (_otherwise_grasped(reference, int(index), (position, rotation), pose, grasp) - grasp)
+        wanted_position = wanted_position + wanted_rotation.apply(grasp)
         error = np.concatenate([wanted_position - position, (wanted_rotation * rotation.inv()).as_rotvec()])
         off = max(np.linalg.norm(error[:3]) / TOLERANCE_M, np.linalg.norm(error[3:]) / TOLERANCE_RAD)
         rate = float(np.clip(2 - 2 * off, 0.0, 1.0)) if patience > 0 else 1.0
@@ -137,6 +152,23 @@ def follow(route: Route, hand: Callable[[], Hand]) -> Iterator[Floats]:
         action[:6] = np.clip(rate * demonstrated[:6] + moved / STRIDE + GAIN * error / OUTPUT_MAX, -1.0, 1.0)
         yield action
         index = upcoming
+
+
+def _otherwise_grasped(
+    reference: Reference, step: int, hand: Hand, pose: Callable[[str], Floats], before: Floats
+) -> Floats:
+    """(3,) m, how far what is carried lies from where it lay in the reference's hand, in the hand's frame.
+
+    Zero when nothing is carried; as ``before`` while it is being put down, when contacts shift it in the hand.
+    """
+    held = [name for name, mask in reference.held.items() if mask[step]]
+    carried = [name for name in held if reference.carried[name][step]]
+    if not carried:
+        return before if held else np.zeros(3)
+    name, (position, rotation) = carried[0], hand
+    then = reference.rotations[step].inv().apply(reference.poses[name][step, :3] - reference.positions_m[step])
+    off: Floats = then - rotation.inv().apply(pose(name)[:3] - position)
+    return off if np.linalg.norm(off) < LOST_M else np.zeros(3)
 
 
 def _followed(reference: Reference, name: str) -> Floats:

@@ -42,6 +42,11 @@ def poses_of(reference: Reference, **moved: Floats) -> dict[str, Floats]:
     return {name: poses[0] for name, poses in reference.poses.items()} | moved
 
 
+def nowhere(name: str) -> Floats:
+    """The pose of what is not in the hand."""
+    return np.full(7, 9.0)
+
+
 def displaced(pose: Floats, dx_m: float, dy_m: float, yaw_rad: float) -> Floats:
     turned = Rotation.from_euler("z", yaw_rad) * Rotation.from_quat(pose[[4, 5, 6, 3]])
     return np.concatenate([pose[:3] + np.array([dx_m, dy_m, 0.0]), turned.as_quat()[[3, 0, 1, 2]]])
@@ -62,7 +67,7 @@ def test_an_unchanged_scene_leaves_the_reference_and_its_actions_as_they_are(mil
     route = Route.through(milk, start_of(milk), poses_of(milk))
     assert np.allclose(route.positions_m, milk.positions_m, rtol=0, atol=1e-12)
     places = iter(range(len(milk)))
-    actions = np.array(list(follow(route, lambda: route.at(next(places)))))
+    actions = np.array(list(follow(route, lambda: route.at(next(places)), nowhere)))
     assert np.allclose(actions, milk.actions, rtol=0, atol=1e-9)
 
 
@@ -115,7 +120,7 @@ def test_a_hand_that_starts_elsewhere_joins_the_demonstration_before_it_touches_
     been: list[Hand] = [(position + shift_m, Rotation.from_rotvec(turn_rad) * rotation)]
     route = Route.through(milk, been[0], poses_of(milk))
     actions = []
-    for action in follow(route, lambda: been[-1]):
+    for action in follow(route, lambda: been[-1], nowhere):
         assert (np.abs(action) <= 1).all()
         position, rotation = been[-1]
         been.append((position + STRIDE[:3] * action[:3], Rotation.from_rotvec(STRIDE[3:] * action[3:6]) * rotation))
@@ -127,9 +132,28 @@ def test_a_hand_that_starts_elsewhere_joins_the_demonstration_before_it_touches_
     assert np.diff(gripper).nonzero()[0].size == np.diff(milk.actions[:, 6]).nonzero()[0].size, "grasps once, as shown"
 
 
+@pytest.mark.parametrize("slip_m", [(0.02, 0.0, 0.0), (0.0, -0.02, 0.01), (-0.02, 0.02, -0.02)])
+def test_what_was_grasped_otherwise_is_carried_to_where_it_was(milk: Reference, slip_m: tuple[float, ...]) -> None:
+    """With an ideal hand, and the milk fixed in it at another place than in the human's."""
+    carried = np.flatnonzero(milk.carried["milk_1"])
+    middle = carried[len(carried) // 2]
+    lay = milk.rotations[middle].inv().apply(milk.poses["milk_1"][middle, :3] - milk.positions_m[middle])
+    been: list[Hand] = [start_of(milk)]
+
+    def pose(name: str) -> Floats:
+        position, rotation = been[-1]
+        return np.concatenate([position + rotation.apply(lay + slip_m), np.zeros(4)])
+
+    for action in follow(Route.through(milk, been[0], poses_of(milk)), lambda: been[-1], pose):
+        position, rotation = been[-1]
+        been.append((position + STRIDE[:3] * action[:3], Rotation.from_rotvec(STRIDE[3:] * action[3:6]) * rotation))
+    off = been[carried[-1]][0] + been[carried[-1]][1].apply(lay + slip_m) - milk.poses["milk_1"][carried[-1], :3]
+    assert np.linalg.norm(off) < 0.3 * np.linalg.norm(slip_m)
+
+
 def test_a_hand_that_is_stuck_does_not_wait_for_ever(milk: Reference) -> None:
     route = Route.through(milk, start_of(milk), poses_of(milk))
-    actions = list(follow(route, lambda: start_of(milk)))
+    actions = list(follow(route, lambda: start_of(milk), nowhere))
     assert len(actions) <= len(milk) + PATIENCE + 1
     assert 0 < GAIN <= 1, "beyond 1 the loop overshoots"
 
