@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from functools import cache
 
+from pipeline import bddl
 from pipeline.errors import PipelineError
 from pipeline.object_model import ObjectModel
 from pipeline.object_sources import Source, catalogue, converted, offered
@@ -18,6 +19,10 @@ TEST_CATEGORIES = frozenset(
     }
 )
 """What LIBERO-Plus's test tasks add (its ``<base>_add_<n>.bddl``, without the ``__1`` that some names end in)."""
+
+
+ALIKE = ({"bowl", "ramekin", "ashtray"}, {"mug", "glass", "measure", "creamer"}, {"pot", "teapot", "kettle"})
+"""Nouns of things that one may be taken for the other, from looking at the models."""
 
 
 @cache
@@ -67,14 +72,13 @@ def category_in(model_type: str) -> str:
 @cache
 def taken(task: Task) -> frozenset[str]:
     """Categories that are in a task's scene, and words that its scene and instruction use."""
-    text = task.bddl_file.read_text()
-    declared = re.findall(r"\(:(?:objects|fixtures)([^()]*)\)", text)
-    types = [name for section in declared for name in re.findall(r"-\s+(\w+)", section)]
+    scene = bddl.read(task.bddl_file)
+    types = [*scene.objects.values(), *scene.fixtures.values()]
     words = re.findall(r"[a-z]+", " ".join([*types, task.instruction.lower()]).replace("_", " "))
     return frozenset({*map(category_in, types), *words, *(word.removesuffix("s") for word in words)})
 
 
 def goes_with(model: ObjectModel, names: frozenset[str]) -> bool:
-    """Whether an object is of another category than everything in ``names``, and called by another noun."""
+    """Whether an object is of another category than everything in ``names``, and cannot be meant by another's noun."""
     noun = model.category.split("_of_")[0].split("_")[-1]
-    return not {model.category, noun} & names
+    return not {model.category, noun}.union(*(alike for alike in ALIKE if noun in alike)) & names

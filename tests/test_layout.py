@@ -25,8 +25,6 @@ from pipeline.tasks import tasks
 from pipeline.testset import TestSet, TestTask
 from pipeline.types import Demo, Scene
 
-SEED = 4
-"""LIBERO's reset under this seed lets the whole demonstration succeed."""
 ROBOT = ("robot0_", "gripper0_")
 
 
@@ -37,7 +35,7 @@ def environment() -> Environment:
 
 @pytest.fixture(scope="module")
 def demo(environment: Environment) -> Demo:
-    return replace(starter_demo(PLATE), model_xml=environment.place_fixtures(SEED))
+    return replace(starter_demo(PLATE), model_xml=environment.place_fixtures(ReplayConfig().fixture_seed))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +46,7 @@ def base(demo: Demo) -> Scene:
 
 @pytest.fixture(scope="module")
 def three() -> LayoutPerturbation:
-    return LayoutAxis(levels=(3,)).sample(seeding.rng(4, "layout"), PLATE, 0)
+    return LayoutAxis(levels=(3,)).sample(seeding.rng(0, "layout"), PLATE, 0)
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +158,7 @@ def test_objects_touch_the_table_only_and_the_demonstration_passes_them_by(
 def test_the_demonstration_still_succeeds_among_the_objects(
     environment: Environment, demo: Demo, three: LayoutPerturbation
 ) -> None:
+    # The plate is dragged by a finger on its rim, which slips off for about half of all draws.
     trajectory = replay(environment, demo, "layout", ReplayConfig(), (three,))
     assert trajectory.verdict.kept, trajectory.verdict.reason
     assert np.abs(trajectory.states[-1, -18:]).max() < 0.05, "nothing was knocked over"
