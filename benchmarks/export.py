@@ -1,10 +1,12 @@
-"""Rates of both writers on synthetic episodes; the last line printed is JSON."""
+"""Rates and peak memory of the writers on synthetic episodes; the last line printed is JSON."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
+import resource
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -20,7 +22,11 @@ import numpy as np
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.types import Episode
-from pipeline.writers import lerobot, rlds
+
+PER_PART = 150
+"""Episodes in a part of the large configurations."""
+
+WRITERS = ("rlds", "lerobot_video", "lerobot_images")
 
 
 def synthetic_episode(episode_id: str, steps: int) -> Episode:
@@ -58,33 +64,56 @@ def pool_map(pool: ProcessPoolExecutor, fn: Callable[[Any], Any], items: Sequenc
     return list(pool.map(fn, items))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=24)
-    parser.add_argument("--steps", type=int, default=120)
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    arguments = parser.parse_args()
-    ids = [f"synthetic-{k:05d}" for k in range(arguments.episodes)]
-    load = partial(replay, source=synthetic_episode(ids[0], arguments.steps))
-    result: dict[str, Any] = {**vars(arguments), "frame_bytes": len(load(ids[0]).frames["image"][0])}
-    with tempfile.TemporaryDirectory() as out, ProcessPoolExecutor(arguments.workers, get_context("spawn")) as pool:
-        run = partial(pool_map, pool)
-        writers: dict[str, Callable[[list[str]], Any]] = {
-            "rlds": lambda ids: rlds.write(ids, load, Path(out), name="benchmark", shards=arguments.workers, run=run),
-            "lerobot": lambda ids: lerobot.write(
-                ids, load, Path(out) / "lerobot", repo_id="local/benchmark", parts=arguments.workers, run=run
-            ),
-        }
-        for name, write in writers.items():
-            write(ids[: arguments.workers])  # imports, in every worker
+def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, float]:
+    """Rates and memory of one writer; peaks are those of a process's whole life, so each writer gets a new one."""
+    ids = [f"synthetic-{k:05d}" for k in range(episodes)]
+    load = partial(replay, source=synthetic_episode(ids[0], steps))
+    parts = max(workers, math.ceil(episodes / PER_PART))
+    with tempfile.TemporaryDirectory() as out:
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+            run = partial(pool_map, pool)
+
+            def write(ids: Sequence[str]) -> Any:
+                # Each writer's libraries count for that writer alone: lerobot's are most of its memory.
+                if writer == "rlds":
+                    from pipeline.writers import rlds
+
+                    return rlds.write(ids, load, Path(out), name="benchmark", shards=parts, run=run)
+                from pipeline.writers import lerobot
+
+                frames: lerobot.Frames = "video" if writer == "lerobot_video" else "images"
+                folder = Path(out) / "lerobot"
+                return lerobot.write(ids, load, folder, repo_id="local/benchmark", parts=parts, run=run, frames=frames)
+
+            write(ids[:workers])  # imports, in every worker
             start = time.perf_counter()
             report = write(ids)
             seconds = time.perf_counter() - start
-            result[name] = {
-                "episodes_per_s": round(len(ids) / seconds, 2),
-                "mb_per_s": round(report.bytes / 1e6 / seconds, 2),
-                "mb_per_episode": round(report.bytes / 1e6 / len(ids), 3),
-            }
+        # The largest of the children that have ended, in KiB.
+        worker, parent = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_CHILDREN, resource.RUSAGE_SELF))
+        return {
+            "episodes_per_s": round(episodes / seconds, 2),
+            "steps_per_s": round(report.steps / seconds, 1),
+            "mb_per_s": round(report.bytes / 1e6 / seconds, 2),
+            "mb_per_episode": round(report.bytes / 1e6 / episodes, 3),
+            "peak_worker_mb": round(worker * 1024 / 1e6),
+            "peak_parent_mb": round(parent * 1024 / 1e6),
+        }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--episodes", type=int, default=50)
+    parser.add_argument("--steps", type=int, default=120)
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    result: dict[str, Any] = {
+        **vars(arguments),
+        "frame_bytes": len(synthetic_episode("synthetic-00000", 1).frames["image"][0]),
+    }
+    for writer in WRITERS:
+        with ProcessPoolExecutor(1, get_context("spawn")) as fresh:
+            result[writer] = fresh.submit(measure, writer, *vars(arguments).values()).result()
     print(json.dumps(result))
 
 

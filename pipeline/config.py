@@ -54,7 +54,7 @@ class PlanConfig(Frozen):
         axes: the ranges each axis draws from.
         episodes: how many kept episodes are wanted, spread evenly over the tasks: for an axis of ``axes``, or for
             several that perturb each episode together, joined by + in any order, such as ``camera+light+language``.
-        reserve: share of further candidates to draw, used in order where an episode fails.
+        reserve: share of further candidates to draw of each task, rounded up, used in order where an episode fails.
     """
 
     seed: int
@@ -125,8 +125,17 @@ class RldsConfig(Frozen):
 
 
 class LeRobotConfig(Frozen):
+    """How the LeRobot dataset is written.
+
+    Attributes:
+        name: of the dataset.
+        parts: pieces written in parallel, then merged.
+        frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
+    """
+
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     parts: Count
+    frames: Literal["video", "images"] = "video"
 
 
 class ExportConfig(Frozen):

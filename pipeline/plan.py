@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from math import ceil
 from pathlib import Path
 
 import pyarrow as pa
@@ -33,6 +34,7 @@ class Row:
         trajectory_id: the physics it is rendered from; episodes that differ in render, pixels or text share it.
         role: ``twin`` or ``perturbed``.
         axis, component: what is perturbed, several joined by +; ``clean`` for a twin.
+        level: how strongly, 1 to 5, several joined by + in the order of ``component``; ``0`` for a twin.
         perturbations: canonical JSON with every parameter.
         instruction: the text the policy is prompted with.
         rank: place among the candidates of its (axis, task).
@@ -53,6 +55,7 @@ class Row:
     demo_steps: int
     axis: str
     component: str
+    level: str
     perturbations: str
     instruction: str
     rank: int
@@ -122,7 +125,7 @@ def _candidates(
     """
     first = {demo.demo_id: int(rng(plan.seed, name, demo.demo_id).integers(2**31)) for demo in group}
     seen: set[str] = set()
-    for rank in range(wanted + round(wanted * plan.reserve)):
+    for rank in range(wanted + ceil(wanted * plan.reserve)):
         demo, variant = group[rank % len(group)], rank // len(group)
         for attempt in range(_ATTEMPTS):
             key = rng(plan.seed, name, demo.demo_id, variant, attempt)
@@ -168,6 +171,7 @@ def _row(
         demo_steps=demo.steps,
         axis="+".join(p.axis for p in perturbations) or "clean",
         component="+".join(p.component for p in perturbations) or "clean",
+        level="+".join(str(p.level) for p in perturbations) or "0",
         perturbations=listed,
         instruction=instruction,
         rank=rank,

@@ -17,7 +17,9 @@ def run(config: Config) -> None:
     target = config.export.lerobot
     out = config.data / "lerobot" / target.name
     with runner(config.compute) as workers:
-        report = lerobot.write(ids, load, out, repo_id=target.name, parts=target.parts, run=workers)
+        report = lerobot.write(
+            ids, load, out, repo_id=target.name, parts=target.parts, run=workers, frames=target.frames
+        )
     (config.data / "lerobot.json").write_text(json.dumps(report.episode_index, indent=0) + "\n")
     print(f"wrote {len(ids)} episodes to {out}")
 

@@ -69,7 +69,7 @@ def repeated(tested: TestTask) -> AnyPerturbation:
 
 def row(task: Task, perturbations: Iterable[AnyPerturbation], name: str) -> Row:
     listed = to_json(perturbations)
-    changed = [(p.axis, p.component) for p in from_json(listed)]
+    changed = from_json(listed)
     return Row(
         episode_id=name,
         twin_id="twin",
@@ -82,8 +82,9 @@ def row(task: Task, perturbations: Iterable[AnyPerturbation], name: str) -> Row:
         demo_source="test",
         demo_origin="human",
         demo_steps=100,
-        axis="+".join(axis for axis, _ in changed),
-        component="+".join(component for _, component in changed),
+        axis="+".join(p.axis for p in changed),
+        component="+".join(p.component for p in changed),
+        level="+".join(str(p.level) for p in changed),
         perturbations=listed,
         instruction=task.instruction,
         rank=0,

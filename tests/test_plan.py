@@ -177,6 +177,7 @@ def test_a_combination_is_the_same_in_whatever_order_it_was_written() -> None:
         drawn = from_json(row.perturbations)
         assert row.axis == "camera+noise+language" == "+".join(p.axis for p in drawn)
         assert row.component == "+".join(p.component for p in drawn)
+        assert row.level == "+".join(str(p.level) for p in drawn)
         assert row.instruction in {p.text for p in drawn if p.axis == "language"}
     levels = {tuple(p.level for p in from_json(row.perturbations)) for row in rows}
     assert any(len(set(of_parts)) > 1 for of_parts in levels), "each part has a level of its own"
@@ -240,3 +241,4 @@ def test_perturbations_are_readable_and_complete() -> None:
         (changed,) = from_json(row.perturbations) or (None,)
         assert row.axis == (changed.axis if changed else "clean")
         assert row.component == (changed.component if changed else "clean")
+        assert row.level == (str(changed.level) if changed else "0")

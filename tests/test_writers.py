@@ -8,7 +8,7 @@ import socket
 import struct
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -103,19 +103,27 @@ def write_rlds(out: Path, load: Callable[[str], Episode] = episode, run: Any = l
     return rlds.write(IDS, load, out, name=NAME, shards=3, run=run)
 
 
-def write_lerobot(out: Path, load: Callable[[str], Episode] = episode, run: Any = loop) -> lerobot_writer.LeRobotReport:
-    return lerobot_writer.write(IDS, load, out / "lerobot", repo_id=REPO, parts=3, run=run)
+def write_lerobot(
+    out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, frames: lerobot_writer.Frames = "video"
+) -> lerobot_writer.LeRobotReport:
+    folder = out / ("lerobot" if frames == "video" else frames)
+    return lerobot_writer.write(IDS, load, folder, repo_id=REPO, parts=3, run=run, frames=frames)
 
 
 @dataclass(frozen=True)
 class Written:
     rlds: rlds.RldsReport
     lerobot: lerobot_writer.LeRobotReport
+    images: lerobot_writer.LeRobotReport
+
+
+def write_all(out: Path, run: Any = loop) -> Written:
+    return Written(write_rlds(out, run=run), write_lerobot(out, run=run), write_lerobot(out, run=run, frames="images"))
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Written]:
-    """Both sets, made without a network and without a trace in the cache of ``datasets``."""
+    """All sets, made without a network and without a trace in the cache of ``datasets``."""
     out, cache_folder = tmp_path_factory.mktemp("out"), tmp_path_factory.mktemp("cache") / "datasets"
 
     def refuse(*_: object) -> None:
@@ -125,10 +133,10 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Written]:
         patch.setattr(datasets.config, "HF_DATASETS_CACHE", cache_folder)
         with pytest.MonkeyPatch.context() as offline:
             offline.setattr(socket.socket, "connect", refuse)
-            both = Written(write_rlds(out), write_lerobot(out))
+            every = write_all(out)
         assert not cache_folder.exists()
-        assert sorted(path.name for path in out.iterdir()) == ["lerobot", NAME]
-        yield both
+        assert sorted(path.name for path in out.iterdir()) == ["images", "lerobot", NAME]
+        yield every
 
 
 def records(shard: Path) -> Iterator[bytes]:
@@ -232,7 +240,8 @@ def test_rlds_reads_with_tensorflow(written: Written, tmp_path: Path) -> None:
     )
 
 
-def assert_lerobot_episodes(folder: Path) -> None:
+def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
+    """What lerobot must hand out; frames the very pixels of the stored ones, or within ``MIN_PSNR_DB``."""
     dataset = LeRobotDataset(REPO, root=folder, video_backend="pyav")
     assert (dataset.num_episodes, dataset.fps, dataset.meta.robot_type) == (len(IDS), 20, "panda")
     assert dataset.num_frames == sum(len(episode(episode_id)) for episode_id in IDS)
@@ -250,7 +259,10 @@ def assert_lerobot_episodes(folder: Path) -> None:
         for key, view in (("image", "image"), ("image2", "wrist_image")):
             decoded = [item[f"observation.images.{key}"].numpy().transpose(1, 2, 0) * 255 for item in items]
             for shown, frame in zip(decoded, source.frames[view], strict=True):
-                assert psnr_db(shown, pixels(frame)) > MIN_PSNR_DB
+                if exact:
+                    np.testing.assert_array_equal(shown, pixels(frame))
+                else:
+                    assert psnr_db(shown, pixels(frame)) > MIN_PSNR_DB
 
 
 def test_lerobot_holds_the_episodes(written: Written) -> None:
@@ -260,35 +272,73 @@ def test_lerobot_holds_the_episodes(written: Written) -> None:
     assert info["codebase_version"] == "v3.0"
     assert info["features"]["action"]["names"] == list(SCHEMA.action.names)
     assert info["features"]["observation.images.image"]["info"]["video.codec"] == "h264"
+    assert info["splits"] == {"train": f"0:{len(IDS)}"}
+
+
+def test_lerobot_images_are_the_stored_frames(written: Written) -> None:
+    assert_lerobot_episodes(written.images.folder, exact=True)
+    assert written.images.episode_index == written.lerobot.episode_index
+    info = json.loads((written.images.folder / "meta" / "info.json").read_text())
+    assert info["features"]["observation.images.image"]["dtype"] == "image"
+    assert info["splits"] == {"train": f"0:{len(IDS)}"}
+    assert {path.suffix for path in written.images.folder.rglob("*") if path.is_file()} == {".parquet", ".json"}
+    table = pq.read_table(written.images.folder / "data", columns=["observation.images.image2"])
+    # Not a second encoding.
+    found = [row["bytes"] for row in table["observation.images.image2"].to_pylist()]
+    assert found == [frame for episode_id in IDS for frame in episode(episode_id).frames["wrist_image"]]
+
+
+def test_lerobot_images_read_when_they_spread_over_many_files(tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+        patch.setattr(lerobot_writer, "DATA_MB", 0.6)
+        patch.setattr(lerobot_writer, "EPISODES_MB", 0.001)
+        report = write_lerobot(tmp_path, frames="images")
+        assert len(list((report.folder / "data").rglob("*.parquet"))) > 2
+        assert_lerobot_episodes(report.folder, exact=True)
+        # Merging finds the files by what the rows of meta/episodes say.
+        assert len(list((report.folder / "meta" / "episodes").rglob("*.parquet"))) == 3
+        lerobot.datasets.aggregate.aggregate_datasets([REPO], REPO, roots=[report.folder], aggr_root=tmp_path / "again")
+        assert_lerobot_episodes(tmp_path / "again", exact=True)
 
 
 def test_lerobot_provenance_has_a_row_for_each_episode(written: Written) -> None:
-    rows = pq.read_table(written.lerobot.folder / "meta" / "provenance.parquet").to_pylist()
-    assert rows == [{"episode_index": k, **episode(episode_id).provenance} for k, episode_id in enumerate(IDS)]
+    for report in (written.lerobot, written.images):
+        rows = pq.read_table(report.folder / "meta" / "provenance.parquet").to_pylist()
+        assert rows == [{"episode_index": k, **episode(episode_id).provenance} for k, episode_id in enumerate(IDS)]
+    assert "level" in rows[0]
+
+
+def assert_statistics(found: Mapping[str, Any], values: NDArray[Any], axes: int | tuple[int, ...]) -> None:
+    """Of all ``values``, over ``axes``; quantiles as a level that occurs, or between two."""
+    for name, expected in (
+        ("min", values.min(axis=axes)),
+        ("max", values.max(axis=axes)),
+        ("mean", values.mean(axis=axes)),
+        ("std", values.std(axis=axes)),
+        ("q01", np.quantile(values, 0.01, axis=axes)),
+        ("q50", np.quantile(values, 0.50, axis=axes)),
+        ("q99", np.quantile(values, 0.99, axis=axes)),
+    ):
+        np.testing.assert_allclose(np.ravel(found[name]), expected, atol=1e-6, err_msg=name)
+    np.testing.assert_array_equal(np.ravel(found["count"]), [len(values)])
 
 
 def test_lerobot_statistics_are_exact(written: Written) -> None:
     stats = LeRobotDataset(REPO, root=written.lerobot.folder, video_backend="pyav").meta.stats
     sources = [episode(episode_id) for episode_id in IDS]
-    actions = np.concatenate([source.action for source in sources]).astype(np.float64)
-    frames = np.stack([pixels(frame) for source in sources for frame in source.frames["image"]]) / 255
-    for found, values, axes in (
-        (stats["action"], actions, 0),
-        (stats["observation.images.image"], frames, (0, 1, 2)),
-    ):
-        shape = (3, 1, 1) if values is frames else (7,)
-        for name, expected in (
-            ("min", values.min(axis=axes)),
-            ("max", values.max(axis=axes)),
-            ("mean", values.mean(axis=axes)),
-            ("std", values.std(axis=axes)),
-            ("q01", np.quantile(values, 0.01, axis=axes)),
-            ("q50", np.quantile(values, 0.50, axis=axes)),
-            ("q99", np.quantile(values, 0.99, axis=axes)),
-        ):
-            np.testing.assert_allclose(found[name], expected.reshape(shape), atol=1e-6, err_msg=name)
-        np.testing.assert_array_equal(found["count"], [len(actions)])
+    frames = [np.stack([pixels(frame) for frame in source.frames["image"]]) / 255 for source in sources]
+    assert_statistics(stats["action"], np.concatenate([source.action for source in sources]).astype(np.float64), 0)
+    assert_statistics(stats["observation.images.image"], np.concatenate(frames), (0, 1, 2))
+    assert stats["observation.images.image"]["mean"].shape == (3, 1, 1)
     assert set(stats) >= {"observation.state", "observation.joint_state", "observation.images.image2", "timestamp"}
+    for report in (written.lerobot, written.images):
+        assert json.loads((report.folder / "meta" / "stats.json").read_text()) == json.loads(
+            (written.lerobot.folder / "meta" / "stats.json").read_text()
+        )
+        for row, shown in zip(pq.read_table(report.folder / "meta" / "episodes").to_pylist(), frames, strict=True):
+            of_episode = {name.rpartition("/")[2]: value for name, value in row.items() if "image/" in name}
+            assert_statistics(of_episode, shown, (0, 1, 2))
 
 
 def test_lerobot_reads_when_videos_spread_over_many_files(written: Written, tmp_path: Path) -> None:
@@ -319,10 +369,10 @@ def test_formats_carry_the_same_numbers(written: Written) -> None:
 def test_bytes_do_not_depend_on_the_workers(written: Written, tmp_path: Path) -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as executor:
         run = partial(spread, executor)
-        again = Written(write_rlds(tmp_path, run=run), write_lerobot(tmp_path, run=run))
+        again = write_all(tmp_path, run=run)
         modules = executor.submit(loaded_packages).result()
-    for first, second in ((written.rlds.folder, again.rlds.folder), (written.lerobot.folder, again.lerobot.folder)):
-        one, two = files(first), files(second)
+    for first, second in zip(vars(written).values(), vars(again).values(), strict=True):
+        one, two = files(first.folder), files(second.folder)
         assert one.keys() == two.keys()
         assert [name for name in one if one[name] != two[name]] == []
         assert [name for name, data in two.items() if str(tmp_path).encode() in data] == []

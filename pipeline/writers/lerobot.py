@@ -1,8 +1,8 @@
 """LeRobotDataset v3.0, written by lerobot 0.4.4 itself: parts in parallel, then merged.
 
-Two things of lerobot's are replaced: its video encoder (see ``video``), and its statistics in ``meta/stats.json``,
-whose merged quantiles are averages of per-episode quantiles (huggingface/lerobot#3804). Beside lerobot's own files
-there is ``meta/provenance.parquet``, one row per episode.
+Two things of lerobot's are replaced: its video encoder (see ``video``), and its statistics, of frames (see ``levels``)
+and in ``meta/stats.json``, where merged quantiles are averages of per-episode quantiles (huggingface/lerobot#3804).
+Beside lerobot's own files there is ``meta/provenance.parquet``, one row per episode.
 """
 
 from __future__ import annotations
@@ -14,16 +14,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import av
 import cv2
 import datasets
 import huggingface_hub.constants
+import lerobot.datasets.aggregate
+import lerobot.datasets.lerobot_dataset
+import lerobot.utils.utils
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from lerobot.datasets.aggregate import aggregate_datasets
+from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import write_stats
 from numpy.typing import NDArray
@@ -34,13 +38,24 @@ from pipeline.files import replaced
 from pipeline.stats import describe
 from pipeline.types import Episode, Floats, Frame
 from pipeline.writers.base import Load, folder_bytes, split
-from pipeline.writers.video import QUANTILES, Counts, VideoEncoder, statistics
+from pipeline.writers.levels import QUANTILES, Counts, count, statistics
+from pipeline.writers.video import VideoEncoder
 
 if TYPE_CHECKING:  # export imports no simulator, and this would
     from pipeline.compute import Run
 
+Frames = Literal["video", "images"]
+"""``video`` is H.264 made from the stored frames; ``images`` are the stored JPEG files, three times as large."""
+
 PART_VIDEO_MB = 16
 """lerobot rewrites a video file for each episode that it appends: small files here, its own 200 MB after the merge."""
+
+DATA_MB = 25
+"""Size of the data files: lerobot's merge has one in memory over and over, 1.4 GB of images at its own 100 MB."""
+
+EPISODES_MB = 2
+"""Size of the files in ``meta/episodes``, which the merge rewrites for each part: an episode is 1 kB in the file and
+more than 100 in memory."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +88,16 @@ class _Written:
     counts: Mapping[str, Counts]
 
 
-def write(episode_ids: Sequence[str], load: Load, out: Path, *, repo_id: str, parts: int, run: Run) -> LeRobotReport:
+def write(
+    episode_ids: Sequence[str],
+    load: Load,
+    out: Path,
+    *,
+    repo_id: str,
+    parts: int,
+    run: Run,
+    frames: Frames = "video",
+) -> LeRobotReport:
     """Write a dataset whose root is ``out``, replacing what is there; episode i is ``episode_ids[i]``.
 
     The bytes, videos included, depend on the episodes, their order, ``parts`` and the encoder's version alone.
@@ -84,7 +108,8 @@ def write(episode_ids: Sequence[str], load: Load, out: Path, *, repo_id: str, pa
         out: the dataset's root.
         repo_id: its name on the hub, such as ``user/name``; nothing is sent or fetched.
         parts: pieces written in parallel and merged (fewer when there are fewer episodes).
-        run: spreads the work; one call per part.
+        run: spreads the work; one call per part, and in a process one at a time.
+        frames: how frames are stored.
 
     Raises:
         PipelineError: when an episode breaks the schema or the ids are unfit. Nothing is left behind.
@@ -93,9 +118,19 @@ def write(episode_ids: Sequence[str], load: Load, out: Path, *, repo_id: str, pa
     out.parent.mkdir(parents=True, exist_ok=True)
     with replaced(out) as root, tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as scratch:
         jobs = [_Part(Path(scratch) / f"part-{k:05d}", ids) for k, ids in enumerate(slices)]
-        written = run(partial(_write_part, load=load, repo_id=repo_id), jobs, "LeRobot parts")
-        with _local_only(Path(scratch) / "cache"):
-            aggregate_datasets([repo_id] * len(jobs), repo_id, roots=[job.root for job in jobs], aggr_root=root)
+        written = run(partial(_write_part, load=load, repo_id=repo_id, frames=frames), jobs, "LeRobot parts")
+        with (
+            local_only(Path(scratch) / "cache"),
+            _set(lerobot.datasets.aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_MB),
+        ):
+            aggregate_datasets(
+                [repo_id] * len(jobs),
+                repo_id,
+                roots=[job.root for job in jobs],
+                aggr_root=root,
+                data_files_size_in_mb=DATA_MB,
+            )
+        _number_episode_files(root)
         counts = {view: np.sum([part.counts[view] for part in written], axis=0) for view in SCHEMA.views}
         _write_statistics(root, counts)
         _write_provenance(root, [row for part in written for row in part.provenance])
@@ -107,58 +142,76 @@ def write(episode_ids: Sequence[str], load: Load, out: Path, *, repo_id: str, pa
     )
 
 
-def features() -> dict[str, dict[str, Any]]:
+def features(frames: Frames) -> dict[str, dict[str, Any]]:
     """lerobot's description of the columns."""
-    frame = {"dtype": "video", "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
+    dtype = {"video": "video", "images": "image"}[frames]
+    frame = {"dtype": dtype, "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
     columns = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
     for vector in (SCHEMA.state, SCHEMA.joint_state, SCHEMA.action):
         columns[vector.lerobot_key] = {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
     return columns
 
 
-def _write_part(part: _Part, load: Load, repo_id: str) -> _Written:
+def _write_part(part: _Part, load: Load, repo_id: str, frames: Frames) -> _Written:
     datasets.disable_progress_bars()
     av.logging.set_libav_level(av.logging.ERROR)  # lerobot restores FFmpeg's own log, which tells of every append
     shutil.rmtree(part.root, ignore_errors=True)  # of a worker that died
     dataset = LeRobotDataset.create(
         repo_id,
         SCHEMA.fps_hz,
-        features(),
+        features(frames),
         root=part.root,
         robot_type=SCHEMA.robot_type,
+        use_videos=frames == "video",
         video_backend="pyav",
         vcodec="h264",
     )
-    dataset.meta.update_chunk_settings(video_files_size_in_mb=PART_VIDEO_MB)
-    encoder = VideoEncoder()
+    dataset.meta.update_chunk_settings(data_files_size_in_mb=DATA_MB, video_files_size_in_mb=PART_VIDEO_MB)
     # The slot that streaming_encoding=True fills; it has no public name.
-    dataset._streaming_encoder = encoder
+    dataset._streaming_encoder = VideoEncoder() if frames == "video" else None
     steps = 0
     provenance = []
+    counts: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
     try:
         for episode_id in part.episode_ids:
             episode = load(episode_id)
             check(episode)
-            _add(dataset, episode)
+            for view, counted in _add(dataset, episode).items():
+                counts[view] += counted
             steps += len(episode)
             provenance.append(dict(episode.provenance))
     finally:
         dataset.finalize()
-    counts = {name: encoder.counts[view.lerobot_key] for name, view in SCHEMA.views.items()}
     return _Written(steps, provenance, counts)
 
 
-def _add(dataset: LeRobotDataset, episode: Episode) -> None:
-    for t in range(len(episode)):
-        frame: dict[str, Any] = {
-            SCHEMA.state.lerobot_key: episode.state[t],
-            SCHEMA.joint_state.lerobot_key: episode.joint_state[t],
-            SCHEMA.action.lerobot_key: episode.action[t],
-            "task": episode.instruction,
-        }
-        frame |= {view.lerobot_key: _pixels(episode, name, t) for name, view in SCHEMA.views.items()}
-        dataset.add_frame(frame)
-    dataset.save_episode()
+def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
+    """Save an episode, and return the levels of each view's frames."""
+    steps = len(episode)
+    columns = dataset.create_episode_buffer()
+    columns |= {"size": steps, "task": [episode.instruction] * steps}
+    columns |= {"frame_index": list(range(steps)), "timestamp": [t / SCHEMA.fps_hz for t in range(steps)]}
+    for name in ("state", "joint_state", "action"):
+        columns[getattr(SCHEMA, name).lerobot_key] = list(getattr(episode, name))
+    encoder = dataset._streaming_encoder
+    if encoder is None:
+        # ``datasets``, which lerobot hands the columns to, takes a whole image file for an image.
+        columns |= {view.lerobot_key: episode.frames[name] for name, view in SCHEMA.views.items()}
+    else:
+        encoder.start_episode([view.lerobot_key for view in SCHEMA.views.values()], dataset.root)
+    counts: dict[str, Counts] = {}
+    for name, view in SCHEMA.views.items():
+        counts[name] = np.zeros((3, 256), np.int64)
+        for t in range(steps):
+            pixels = _pixels(episode, name, t)
+            counts[name] += count(pixels)
+            if encoder is not None:
+                encoder.feed_frame(view.lerobot_key, pixels)
+    ours = {view.lerobot_key: statistics(counts[name]) for name, view in SCHEMA.views.items()}
+    described = partial(_episode_statistics, frames=ours)
+    with _set(lerobot.datasets.lerobot_dataset, "compute_episode_stats", described):
+        dataset.save_episode(columns)
+    return counts
 
 
 def _pixels(episode: Episode, view: str, t: int) -> Frame:
@@ -168,24 +221,37 @@ def _pixels(episode: Episode, view: str, t: int) -> Frame:
     return pixels.astype(np.uint8, copy=False)
 
 
+def _episode_statistics(
+    columns: dict[str, Any], features: dict[str, Any], *, frames: Mapping[str, Any]
+) -> dict[str, Any]:
+    """lerobot's statistics of an episode, with ``frames`` in place of its own for the cameras."""
+    vectors = {name: values for name, values in columns.items() if name not in frames}
+    return {**compute_episode_stats(vectors, features), **frames}
+
+
 def _column_statistics(values: Floats) -> dict[str, NDArray[Any]]:
     """lerobot's statistics of a (N, D) column, each (D,); ``count`` is (1,)."""
     return describe(values, QUANTILES) | {"count": np.array([len(values)])}
 
 
+def _number_episode_files(root: Path) -> None:
+    """Have each row of ``meta/episodes`` name its own file: lerobot 0.4.4 names the one before where it begins one."""
+    for file in (root / "meta" / "episodes").rglob("*.parquet"):
+        table = pq.read_table(file)
+        for name, part in (("chunk_index", file.parent.name), ("file_index", file.stem)):
+            column = f"meta/episodes/{name}"
+            number = pa.array([int(part.rpartition("-")[2])] * len(table), pa.int64())
+            table = table.set_column(table.schema.get_field_index(column), column, number)
+        pq.write_table(table, file)
+
+
 def _write_statistics(root: Path, counts: Mapping[str, Counts]) -> None:
     """Write ``meta/stats.json`` over lerobot's, from every row and every pixel."""
-    exact = {}
-    for name, view in SCHEMA.views.items():
-        # (3, 1, 1) in [0, 1], as lerobot hands out images.
-        exact[view.lerobot_key] = {
-            key: value if key == "count" else value.reshape(3, 1, 1) / 255
-            for key, value in statistics(counts[name]).items()
-        }
+    exact = {view.lerobot_key: statistics(counts[name]) for name, view in SCHEMA.views.items()}
     data = pq.ParquetDataset(root / "data")
-    for column in data.schema.names:
+    for column in [name for name in data.schema.names if name not in exact]:
         values = data.read(columns=[column])[column].combine_chunks()
-        flat = values.flatten() if pa.types.is_list(values.type) else values
+        flat = values.flatten() if pa.types.is_nested(values.type) else values
         exact[column] = _column_statistics(flat.to_numpy().astype(np.float64).reshape(len(values), -1))
     write_stats(exact, root)
 
@@ -198,11 +264,24 @@ def _write_provenance(root: Path, rows: Sequence[Mapping[str, str]]) -> None:
 
 
 @contextmanager
-def _local_only(cache: Path) -> Iterator[None]:
+def local_only(cache: Path) -> Iterator[None]:
     """Keep the copies that ``datasets`` makes of what lerobot reads out of the home folder, and lerobot off the hub."""
-    saved = datasets.config.HF_DATASETS_CACHE, huggingface_hub.constants.HF_HUB_OFFLINE
-    datasets.config.HF_DATASETS_CACHE, huggingface_hub.constants.HF_HUB_OFFLINE = cache, True
+    with (
+        _set(datasets.config, "HF_DATASETS_CACHE", cache),
+        _set(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
+        # lerobot would turn the bars of ``datasets`` on after each file that it reads.
+        _set(lerobot.utils.utils, "enable_progress_bar", datasets.disable_progress_bars),
+    ):
+        datasets.disable_progress_bars()
+        yield
+
+
+@contextmanager
+def _set(owner: object, name: str, value: object) -> Iterator[None]:
+    """Give an attribute another value for a while: where a library has no argument for it."""
+    saved = getattr(owner, name)
+    setattr(owner, name, value)
     try:
         yield
     finally:
-        datasets.config.HF_DATASETS_CACHE, huggingface_hub.constants.HF_HUB_OFFLINE = saved
+        setattr(owner, name, saved)

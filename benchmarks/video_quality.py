@@ -1,0 +1,124 @@
+"""How far the videos are from the stored frames and from the rendered ones, on one demonstration of each task given.
+
+    nice -n 10 python benchmarks/video_quality.py [--tasks SUITE/TASK ...]
+
+Both views as they are, and the agent view under each noise at its strongest. The last line is the result as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from pipeline import seeding
+from pipeline.axes.noise import NoiseAxis
+from pipeline.compute import runner
+from pipeline.config import ComputeConfig, DemosConfig, RenderConfig, ReplayConfig
+from pipeline.demos import DemoEntry
+from pipeline.episode_schema import SCHEMA
+from pipeline.frames import decode, encode, to_policy
+from pipeline.render import Renderer
+from pipeline.replay import ReplayJob
+from pipeline.store import TrajectoryStore
+from pipeline.types import Frame
+from pipeline.writers.video import VideoEncoder
+
+TASKS = (
+    "libero_spatial/pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate",
+    "libero_object/pick_up_the_orange_juice_and_place_it_in_the_basket",
+    "libero_goal/put_the_bowl_on_the_plate",
+    "libero_10/STUDY_SCENE1_pick_up_the_book_and_place_it_in_the_back_compartment_of_the_caddy",
+)
+COLUMNS = ("video to stored", "video to rendered", "stored to rendered")
+STRONGEST = 5
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--tasks", nargs="+", default=TASKS)
+    arguments = parser.parse_args()
+    measured: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
+    demos = DemosConfig(tasks=tuple(arguments.tasks), per_task=1)
+    with runner(ComputeConfig()) as run:
+        for rows in run(partial(_measured, demos=demos), demos.index().entries, "demonstrations"):
+            for name, of_demo in rows.items():
+                measured[name].append(of_demo)
+    result = {name: _summary(np.vstack(rows)) for name, rows in measured.items()}
+    table = Table("frames", "", *(f"{column} dB, mean (worst)" for column in COLUMNS), "video B", "stored B")
+    for name, found in result.items():
+        decibels = [f"{found[c]['mean']} ({found[c]['worst']})" for c in COLUMNS]
+        table.add_row(name, str(found["frames"]), *decibels, str(found["video_bytes"]), str(found["stored_bytes"]))
+    Console(width=150).print(table)
+    print(json.dumps(result))
+
+
+def _measured(entry: DemoEntry, demos: DemosConfig) -> dict[str, NDArray[np.float64]]:
+    return {name: _measure(frames) for name, frames in _shown(entry, demos)}
+
+
+def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Frame]]]:
+    """What is shown to the frames of an episode, as a policy sees them and before they are encoded."""
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        ReplayJob("measured", entry.demo_id, "[]", "measured", demos, ReplayConfig(), folder)()
+        trajectory = TrajectoryStore(folder).load("measured")
+    raw: dict[str, list[Frame]] = {view: [] for view in SCHEMA.views}
+    renderer = Renderer(trajectory.model_xml)
+    for state, alpha in zip(trajectory.states[:-1], trajectory.site_alpha[:-1], strict=True):
+        renderer.restore(state, alpha)
+        for view, spec in SCHEMA.views.items():
+            raw[view].append(renderer.frame(spec.camera))
+    renderer.close()
+    for view, frames in raw.items():
+        yield f"{entry.task.suite} {view}", [to_policy(frame) for frame in frames]
+    for component in ("motion", "gaussian", "zoom", "fog", "glass"):
+        effect = getattr(NoiseAxis(), component)[STRONGEST - 1]
+        noisy = [effect.apply(frame, seeding.rng("video_quality", t)) for t, frame in enumerate(raw["image"])]
+        yield f"image, {component} {STRONGEST}", [to_policy(frame) for frame in noisy]
+
+
+def _measure(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """The decibels of ``COLUMNS`` and the bytes in video and store, for each frame: (T, 5)."""
+    stored = [encode(frame, RenderConfig()) for frame in frames]
+    pixels = [decode(packed) for packed in stored]
+    with tempfile.TemporaryDirectory() as folder:
+        encoder = VideoEncoder()
+        encoder.start_episode(["shown"], Path(folder))
+        for frame in pixels:
+            encoder.feed_frame("shown", frame)
+        path, _ = encoder.finish_episode()["shown"]
+        with av.open(str(path)) as video:
+            played = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+        size = path.stat().st_size / len(frames)
+    return np.array(
+        [
+            (cv2.PSNR(shown, kept), cv2.PSNR(shown, raw), cv2.PSNR(kept, raw), size, len(packed))
+            for shown, kept, raw, packed in zip(played, pixels, frames, stored, strict=True)
+        ]
+    )
+
+
+def _summary(rows: NDArray[np.float64]) -> dict[str, Any]:
+    decibels = {
+        column: {"mean": round(float(values.mean()), 1), "worst": round(float(values.min()), 1)}
+        for column, values in zip(COLUMNS, rows.T, strict=False)
+    }
+    video_bytes, stored_bytes = (round(float(mean)) for mean in rows[:, 3:].mean(axis=0))
+    return {"frames": len(rows), **decibels, "video_bytes": video_bytes, "stored_bytes": stored_bytes}
+
+
+if __name__ == "__main__":
+    main()
