@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import ValidationError
 from rich.table import Table
 
+from pipeline.axes.base import Frozen
+from pipeline.config import Config, RenderConfig, ReplayConfig
+from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.plan import Row
 from pipeline.types import Verdict
@@ -21,6 +26,23 @@ SCHEMA_FILE = Path(__file__).parent.parent / "schemas" / "manifest.json"
 """Column names, types and meanings."""
 
 _TYPES = {"string": pa.string(), "int": pa.int64(), "bool": pa.bool_()}
+_SETTINGS = b"settings"
+
+
+class Settings(Frozen):
+    """What every episode of a run is made under, beside its own row: with both, it can be made again.
+
+    Attributes:
+        source: ``starter`` or ``hdf5``; where its files lie differs from machine to machine.
+    """
+
+    source: Literal["starter", "hdf5"]
+    replay: ReplayConfig
+    render: RenderConfig
+
+    @classmethod
+    def of(cls, config: Config) -> Settings:
+        return cls(source=config.demos.source, replay=config.replay, render=config.render)
 
 
 def build(
@@ -41,7 +63,7 @@ def build(
         rlds: episode id to its shard's file name and its place in it, for every kept episode.
         lerobot: episode id to its ``episode_index``, for every kept episode.
     """
-    shared = {f"{name.replace('-', '_')}_version": version for name, version in versions().items()}
+    shared = {version_column(name): version for name, version in versions().items()}
     table = []
     for row in rows:
         verdict = outcome[row.episode_id]
@@ -62,19 +84,66 @@ def build(
     return pa.Table.from_pylist(table, schema=schema())
 
 
+def version_column(name: str) -> str:
+    """The column that holds the version of a package."""
+    return f"{name.replace('-', '_')}_version"
+
+
 def schema() -> pa.Schema:
     """The manifest's columns, from ``schemas/manifest.json``."""
     columns = json.loads(SCHEMA_FILE.read_text())["columns"]
     return pa.schema([pa.field(c["name"], _TYPES[c["type"]], metadata={"meaning": c["meaning"]}) for c in columns])
 
 
-def write(table: pa.Table, path: Path) -> None:
+def write(table: pa.Table, path: Path, settings: Settings) -> None:
     with replaced(path) as temporary:
-        pq.write_table(table, temporary)
+        pq.write_table(table.replace_schema_metadata({_SETTINGS: settings.model_dump_json()}), temporary)
 
 
 def read(path: Path) -> list[dict[str, Any]]:
     return list(pq.read_table(path).to_pylist())
+
+
+def settings(path: Path) -> Settings:
+    """What the episodes of a manifest were made under.
+
+    Raises:
+        PipelineError: when the file does not say so, or has not the columns of this version.
+    """
+    try:
+        found = pq.read_schema(path)
+        if lacking := set(schema().names) - set(found.names):
+            raise KeyError(sorted(lacking))
+        return Settings.model_validate_json(found.metadata[_SETTINGS])
+    except (OSError, pa.ArrowException, TypeError, KeyError, ValidationError) as error:
+        raise PipelineError(
+            f"not a manifest of this version ({error})",
+            where=path,
+            expected="the columns of schemas/manifest.json, and the settings that its episodes were made under",
+            remedy="run `dvc repro manifest`",
+        ) from error
+
+
+def made_with(row: Mapping[str, Any]) -> dict[str, str]:
+    """Package to the version that a row was made with."""
+    return {
+        column.removesuffix("_version").replace("_", "-"): version
+        for column, version in row.items()
+        if column.endswith("_version")
+    }
+
+
+def asked(manifest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """The rows that were tried: all but the reserves that were not needed."""
+    return [row for row in manifest if row["reason"] != "reserve_not_needed"]
+
+
+def tally(manifest: Sequence[Mapping[str, Any]], column: str) -> dict[str, Counter[str]]:
+    """Axis to how often each value of a column occurs on it."""
+    found: dict[str, Counter[str]] = {}
+    for row in manifest:
+        found.setdefault(row["axis"], Counter())[row[column]] += 1
+    return found
 
 
 def counts(manifest: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, int]]]:
@@ -83,9 +152,7 @@ def counts(manifest: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[st
     A reserve counts as planned once it was needed, so that ``planned - kept`` is what was lost on the way.
     """
     table: dict[str, dict[str, dict[str, int]]] = {}
-    for row in manifest:
-        if row["reason"] == "reserve_not_needed":
-            continue
+    for row in asked(manifest):
         cell = table.setdefault(row["axis"], {}).setdefault(row["suite"], {"planned": 0, "replayed": 0, "kept": 0})
         cell["planned"] += 1
         cell["replayed"] += bool(row["steps"])

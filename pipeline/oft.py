@@ -8,14 +8,11 @@ left, so nothing is padded.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
 import tensorflow_datasets as tfds
 from numpy.lib.stride_tricks import sliding_window_view
@@ -23,6 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline import stats
 from pipeline.errors import PipelineError
+from pipeline.shards import METADATA, columns, records
 
 CHUNK = 8
 """Actions that OFT predicts at once on LIBERO: the current one and seven to come."""
@@ -91,11 +89,11 @@ def read(folder: Path) -> Iterator[Recorded]:
         PipelineError: naming the file and the record, when a checksum is wrong or a feature that OFT reads is missing.
     """
     features = tfds.builder_from_directory(folder).info.features
-    parser = tfds.core.example_parser.ExampleParserNp(features.get_serialized_info())
     for shard in sorted(folder.glob("*.tfrecord-*")):
-        for index, record in enumerate(_records(shard)):
+        for index, record in enumerate(records(shard)):
+            stored = columns(record, features)
             try:
-                yield _recorded(parser.parse_example(record))
+                yield _recorded(stored)
             except KeyError as error:
                 raise PipelineError(
                     f"record {index} has no feature {error}", where=shard, expected="the feature tree of OpenVLA's sets"
@@ -130,30 +128,11 @@ def normalise(values: NDArray[np.float32], figures: Mapping[str, Any]) -> NDArra
     return np.where(smallest == largest, 0.0, np.where(mask, scaled, values)).astype(np.float32)
 
 
-def _recorded(example: Mapping[str, Any]) -> Recorded:
-    steps, observation = example["steps"], example["steps"]["observation"]
+def _recorded(stored: Mapping[str, NDArray[Any]]) -> Recorded:
     return Recorded(
-        name=example["episode_metadata"]["episode_id"].decode(),
-        action=steps["action"],
-        state=observation["state"],
-        frames={view: list(observation[view]) for view in VIEWS.values()},
-        instructions=[text.decode() for text in steps["language_instruction"]],
+        name=stored[f"{METADATA}episode_id"][0].decode(),
+        action=stored["action"],
+        state=stored["observation/state"],
+        frames={view: stored[f"observation/{view}"].tolist() for view in VIEWS.values()},
+        instructions=[text.decode() for text in stored["language_instruction"]],
     )
-
-
-def _records(shard: Path) -> Iterator[bytes]:
-    """The records of a TFRecord file: length (8 bytes), its checksum (4), data, its checksum (4)."""
-    with shard.open("rb") as file:
-        for index, head in enumerate(iter(partial(file.read, 12), b"")):
-            data = file.read(struct.unpack("<Q", head[:8])[0]) if head[8:] == _checksum(head[:8]) else None
-            if data is None or file.read(4) != _checksum(data):
-                raise PipelineError(
-                    f"record {index} is damaged", where=shard, expected="its checksum", remedy="write the dataset again"
-                )
-            yield data
-
-
-def _checksum(data: bytes) -> bytes:
-    """TFRecord's masked CRC-32C."""
-    crc = google_crc32c.value(data)
-    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)

@@ -28,7 +28,7 @@ def run(config: Config) -> None:
         },
         lerobot=json.loads((data / "lerobot.json").read_text()),
     )
-    manifest.write(table, data / "manifest.parquet")
+    manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 
     load = EpisodeLoader(plan_file, data / "frames", config.render)
     ids = kept(rows, data, config.render)

@@ -1,0 +1,260 @@
+"""What must hold of an episode wherever it lies: small functions, each with a name, that yield what is off."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.axes import TextPerturbation, from_json, of_layer
+from pipeline.axes.language import LanguagePerturbation, deal
+from pipeline.episode_schema import SCHEMA
+from pipeline.frames import decode
+from pipeline.readback import Copy, sampled
+from pipeline.tasks import find_task
+from pipeline.types import Episode, Frame, Trajectory
+
+VIDEO_PSNR_DB = 32.0
+"""Least PSNR of a video's frame to the stored JPEG; the least of 294 frames under five axes was 35 dB."""
+
+STILL_LEVELS = 0.5
+"""Mean difference in grey levels up to which two frames count as the same; the least of 49 episodes was 1.4."""
+
+BLANK_LEVELS = 5.0
+"""Standard deviation in grey levels below which a frame shows nothing; the least was 27, in fog."""
+
+AGAINST_M = 0.01
+"""How far the fingers may move, in sum, against the command; 49 episodes moved 0.05 m and more with it."""
+
+DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|demo)", re.IGNORECASE)
+"""What an instruction has only when it was made from a file's name."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something off.
+
+    Attributes:
+        dataset: ``rlds``, ``lerobot``, ``manifest``, or ``frames`` for the store that both were made from.
+        episode: its id, or None when it is about the whole dataset.
+        what: the fault.
+        expected: what would have been right.
+    """
+
+    dataset: str
+    episode: str | None
+    what: str
+    expected: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One episode and everything known of it.
+
+    Attributes:
+        row: of the manifest.
+        made: as the episode store has it.
+        trajectory: the replay that it was rendered from.
+        copies: as RLDS and LeRobot have it, as far as they could be read.
+        encoded: view to the JPEG files that RLDS has.
+        bank: the run's own bank of rewrites.
+    """
+
+    row: Mapping[str, Any]
+    made: Episode
+    trajectory: Trajectory
+    copies: Sequence[Copy]
+    encoded: Mapping[str, Sequence[bytes]]
+    bank: Path | None
+
+    @property
+    def whole(self) -> list[Copy]:
+        """The copies of the right shapes: what else is wrong with the others follows from that."""
+        return [
+            copy
+            for copy in self.copies
+            if all(values.shape == getattr(self.made, name).shape for name, values in copy.motion.items())
+        ]
+
+    def finding(self, dataset: str, what: str, expected: object) -> Finding:
+        return Finding(dataset, self.made.episode_id, what, str(expected))
+
+
+def psnr_db(one: Frame, other: Frame) -> float:
+    """Peak signal-to-noise ratio of two frames, 361 dB when they are equal."""
+    return float(cv2.PSNR(one, other))
+
+
+def length(case: Case) -> Iterator[Finding]:
+    """As many steps in every place as the replay executed."""
+    steps = len(case.trajectory.actions)
+    places = [("manifest", case.row["steps"]), ("frames", len(case.made))]
+    for dataset, found in [*places, *((copy.dataset, len(copy)) for copy in case.copies)]:
+        if found != steps:
+            yield case.finding(dataset, f"has {found} steps", steps)
+
+
+def motion(case: Case) -> Iterator[Finding]:
+    """Actions, states and joint angles, bit for bit, and the actions those that the replay executed."""
+    if case.made.action.tobytes() != case.trajectory.actions.astype(np.float32).tobytes():
+        yield case.finding("frames", "has other actions", "those that the replay executed")
+    for copy in case.copies:
+        # Of another length, nothing can be compared.
+        for name, found in copy.motion.items() if len(copy) == len(case.made) else ():
+            made = getattr(case.made, name)
+            if (found.shape, found.dtype) != (made.shape, made.dtype):
+                what, expected = f"{found.shape} of {found.dtype}", f"{made.shape} of {made.dtype}"
+                yield case.finding(copy.dataset, f"{name} is {what}", expected)
+            elif found.tobytes() != made.tobytes():
+                step = next(t for t in range(len(made)) if found[t].tobytes() != made[t].tobytes())
+                yield case.finding(
+                    copy.dataset, f"{name} of step {step} is {found[step].tolist()}", made[step].tolist()
+                )
+
+
+def instruction(case: Case) -> Iterator[Finding]:
+    """The manifest's instruction at every step."""
+    for copy in case.whole:
+        if wrong := set(copy.instructions) - {case.row["instruction"]}:
+            yield case.finding(copy.dataset, f"instruction {min(wrong)!r}", repr(case.row["instruction"]))
+
+
+def wording(case: Case) -> Iterator[Finding]:
+    """The task's own instruction or the rewrite of the bank that was drawn, and nothing of a file's name in it."""
+    task, text = find_task(case.row["suite"], case.row["task"]), case.row["instruction"]
+    expected = task.instruction
+    for drawn in of_layer(from_json(case.row["perturbations"]), TextPerturbation):
+        expected = drawn.apply(expected)
+        if isinstance(drawn, LanguagePerturbation) and drawn not in deal(task, bank=case.bank):
+            yield case.finding("manifest", f"rewrite {drawn.text!r} is not in the bank", f"one for {task.name}")
+    if text != expected:
+        yield case.finding("manifest", f"instruction {text!r}", repr(expected))
+    if debris := DEBRIS.search(text):
+        yield case.finding("manifest", f"instruction {text!r}", f"a sentence without {debris[0]!r}")
+
+
+def provenance(case: Case) -> Iterator[Finding]:
+    """The manifest's provenance."""
+    for copy in case.copies:
+        for column in SCHEMA.provenance:
+            found, expected = copy.provenance.get(column), str(case.row[column])
+            if found != expected:
+                yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
+
+
+def jpeg(case: Case) -> Iterator[Finding]:
+    """In RLDS, the very bytes of every stored frame."""
+    for view, frames in case.made.frames.items():
+        wrong = [t for t, (one, other) in enumerate(zip(case.encoded[view], frames, strict=False)) if one != other]
+        if wrong:
+            yield case.finding("rlds", f"{view} differs at {len(wrong)} steps, first at {wrong[0]}", "the stored JPEG")
+
+
+def video(case: Case) -> Iterator[Finding]:
+    """In LeRobot, frames within ``VIDEO_PSNR_DB`` of the stored ones."""
+    for copy, view, step, shown in _shown(case, "lerobot"):
+        if (reached := psnr_db(copy.frames[view, step], shown[view])) < VIDEO_PSNR_DB:
+            yield case.finding("lerobot", f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} dB or more")
+
+
+def cameras(case: Case) -> Iterator[Finding]:
+    """No view that shows what another camera saw."""
+    for copy, view, step, shown in _shown(case, "rlds", "lerobot"):
+        for other in shown.keys() - {view}:
+            if psnr_db(copy.frames[view, step], shown[other]) > VIDEO_PSNR_DB:
+                yield case.finding(copy.dataset, f"{view} of step {step} shows {other}", "its own camera")
+
+
+def alive(case: Case) -> Iterator[Finding]:
+    """No view that shows nothing, or the same all along."""
+    for copy in case.whole:
+        for view in SCHEMA.views:
+            frames = [copy.frames[view, step].astype(np.int16) for step in sampled(len(copy))]
+            if min(frame.std() for frame in frames) < BLANK_LEVELS:
+                yield case.finding(copy.dataset, f"{view} has a blank frame", f"more than {BLANK_LEVELS} grey levels")
+            elif max(np.abs(frame - frames[0]).mean() for frame in frames) < STILL_LEVELS:
+                yield case.finding(copy.dataset, f"{view} is constant", "a camera that sees the robot move")
+
+
+def gripper(case: Case) -> Iterator[Finding]:
+    """Commands of -1 and +1, and fingers that part on the one and close on the other."""
+    told = SCHEMA.action.gripper
+    for copy in case.whole:
+        command, state = copy.motion["action"][:, 6], copy.motion["state"]
+        if other := set(np.unique(command).tolist()) - {told.open, told.close}:
+            yield case.finding(copy.dataset, f"gripper command {min(other)}", f"{told.open} or {told.close}")
+        gap = state[:, 6] - state[:, 7]
+        opened = float((np.sign(command[:-1] * told.open) * np.diff(gap)).sum())
+        if opened < -AGAINST_M:
+            what = f"fingers move {-opened:.3f} m against the gripper's command"
+            yield case.finding(copy.dataset, what, f"{told.open} opens, {told.close} closes")
+
+
+def flags(case: Case) -> Iterator[Finding]:
+    """In RLDS, the first and the last step marked as such, and a reward for the last alone."""
+    for copy in case.copies:
+        if copy.dataset == "rlds":
+            step = np.arange(len(copy))
+            first, last = step == 0, step == len(step) - 1
+            yield from _marked(
+                case,
+                copy,
+                {"is_first": first, "is_last": last, "is_terminal": last, "reward": last, "discount": step >= 0},
+            )
+
+
+def clock(case: Case) -> Iterator[Finding]:
+    """Steps at the frame rate: of the physics, and in LeRobot counted from 0 and timed."""
+    taken = np.diff(case.trajectory.states[:, 0])
+    if not np.allclose(taken, 1 / SCHEMA.fps_hz, rtol=0, atol=1e-6):
+        yield case.finding("frames", f"steps take {taken.min():g} to {taken.max():g} s", f"{1 / SCHEMA.fps_hz:g} s")
+    for copy in case.copies:
+        if copy.dataset == "lerobot":
+            step = np.arange(len(copy))
+            yield from _marked(case, copy, {"frame_index": step, "timestamp": step / SCHEMA.fps_hz})
+
+
+def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
+    for name, expected in wanted.items():
+        found = copy.marks[name]
+        for step in np.flatnonzero(~np.isclose(found, expected, rtol=0, atol=1e-4))[:1]:
+            what = f"{name} of step {step} is {float(found[step]):g}"
+            yield case.finding(copy.dataset, what, f"{float(expected[step]):g}")
+
+
+def _shown(case: Case, *datasets: str) -> Iterator[tuple[Copy, str, int, Mapping[str, Frame]]]:
+    """Copy, view, step, and what the store has in every view there, for the sampled steps."""
+    for step in sampled(len(case.made)):
+        shown = {view: decode(frames[step]) for view, frames in case.made.frames.items()}
+        for copy in case.whole:
+            if copy.dataset in datasets:
+                for view in SCHEMA.views:
+                    yield copy, view, step, shown
+
+
+Check = Callable[[Case], Iterable[Finding]]
+
+CHECKS: Mapping[str, Check] = {
+    check.__name__: check
+    for check in (
+        length,
+        motion,
+        instruction,
+        wording,
+        provenance,
+        jpeg,
+        video,
+        cameras,
+        alive,
+        gripper,
+        flags,
+        clock,
+    )
+}
+"""Name to check."""

@@ -1,0 +1,171 @@
+"""Rebuild one episode from its row of the manifest and the demonstration, and say where it differs from the dataset's.
+
+`python -m pipeline regenerate EPISODE_ID --manifest data/<run>/manifest.parquet --out FOLDER`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tensorflow_datasets as tfds
+from numpy.typing import NDArray
+
+from pipeline import manifest, plan
+from pipeline.compute import loop
+from pipeline.config import DemosConfig
+from pipeline.episodes import EpisodeLoader
+from pipeline.errors import PipelineError
+from pipeline.frames import streams_of
+from pipeline.render import GL, RenderJob
+from pipeline.replay import ReplayJob
+from pipeline.shards import METADATA, columns, records
+from pipeline.store import FrameStore
+from pipeline.types import Verdict
+from pipeline.versions import versions
+from pipeline.writers import rlds
+
+Row = Mapping[str, Any]
+"""A row of the manifest."""
+
+
+def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | None = None) -> dict[str, Any]:
+    """Replay, render and serialise one kept episode again, and compare it with the dataset that lies by the manifest.
+
+    Args:
+        episode_id: which.
+        manifest_file: of the run; its ``rlds`` folder is looked for beside it.
+        out: a new folder, which gets the replay, the frames, and the episode as an RLDS set of its own.
+        root: folder of LIBERO's HDF5 demonstrations, where the run started from those.
+
+    Returns:
+        JSON-serialisable: ``identical`` (None when no dataset lies there), ``reason`` (``kept``, or what the replay or
+        the rendering came to this time), ``versions`` and ``gl_device`` where the manifest's are not those here, and
+        ``differs``, column to the steps or values that are not the same.
+
+    Raises:
+        PipelineError: when the manifest has no such kept episode, or its demonstration is not there or another.
+    """
+    rows = {row["episode_id"]: row for row in manifest.read(manifest_file)}
+    row = rows.get(episode_id)
+    if row is None or not row["kept"]:
+        raise PipelineError(
+            f"no kept episode {episode_id!r}" if row is None else f"episode {episode_id} was dropped: {row['reason']}",
+            where=manifest_file,
+            expected="an episode_id whose row has kept = true",
+        )
+    if out.exists() and any(out.iterdir()):
+        raise PipelineError("is not empty", where=out, remedy="name a new folder with --out")
+    rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), out, root)
+    dataset = next(manifest_file.parent.glob(f"rlds/*/*/{row['rlds_shard']}"), None)
+    stored = None if dataset is None else _Record.read(dataset, row["rlds_index"])
+    return {
+        "episode_id": episode_id,
+        "identical": None if stored is None else rebuilt is not None and rebuilt.data == stored.data,
+        "reason": reason,
+        "versions": {
+            name: {"manifest": row[column], "here": here}
+            for name, here in versions().items()
+            if row[column := manifest.version_column(name)] != here
+        },
+        "gl_device": {} if row["gl_device"] == GL.device else {"manifest": row["gl_device"], "here": GL.device},
+        "differs": _differences(stored.columns, rebuilt.columns) if stored and rebuilt else {},
+    }
+
+
+@dataclass(frozen=True)
+class _Record:
+    """An episode as it lies in a shard.
+
+    Attributes:
+        data: the serialised example.
+        features: the feature tree of its dataset.
+    """
+
+    data: bytes
+    features: Any
+
+    @classmethod
+    def read(cls, shard: Path, index: int) -> _Record:
+        data = next(islice(records(shard), index, None), None)
+        if data is None:
+            raise PipelineError(f"has no record {index}", where=shard, expected="as many as the manifest says")
+        return cls(data, tfds.builder_from_directory(shard.parent).info.features)
+
+    @property
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return columns(self.data, self.features)
+
+
+def _rebuild(
+    row: Row, twin: Row, settings: manifest.Settings, out: Path, root: Path | None
+) -> tuple[_Record | None, str]:
+    """The episode made again below ``out``, or None and the reason when it does not come to be kept this time."""
+    demos = DemosConfig(source=settings.source, root=_root(settings, root))
+    if demos.open().load(row["demo_id"]).sha256 != row["demo_sha256"]:
+        raise PipelineError(
+            "not the demonstration that the episode was made from",
+            where=row["demo_id"],
+            expected=f"content with the hash {row['demo_sha256']}",
+        )
+    plan_file, trajectories, frames = out / "plan.parquet", out / "trajectories", out / "frames"
+    plan.write([plan.Row(**{column.name: row[column.name] for column in fields(plan.Row)})], plan_file)
+
+    def replay(planned: Row) -> Verdict:
+        job = ReplayJob(
+            trajectory_id=planned["trajectory_id"],
+            demo_id=planned["demo_id"],
+            perturbations=planned["perturbations"],
+            twin=twin["trajectory_id"],
+            demos=demos,
+            config=settings.replay,
+            folder=trajectories,
+        )
+        return job()
+
+    trajectory_id, streams = row["trajectory_id"], tuple(streams_of(row["perturbations"]).values())
+    if settings.replay.mode != "open_loop" and twin["trajectory_id"] != trajectory_id:
+        # Tracking follows what the twin did.
+        replay(twin)
+    verdict = replay(row)
+    if not verdict.kept:
+        return None, verdict.reason
+    RenderJob(trajectory_id, streams, trajectories, frames, settings.render)()
+    if rejected := FrameStore(frames, settings.render).rejected(trajectory_id):
+        return None, next(iter(rejected.values()))
+    load = EpisodeLoader(plan_file, frames, settings.render)
+    made = rlds.write([row["episode_id"]], load, out / "rlds", name="regenerated", shards=1, run=loop)
+    return _Record.read(made.folder / made.locations[row["episode_id"]].shard, 0), "kept"
+
+
+def _root(settings: manifest.Settings, root: Path | None) -> Path | None:
+    if (settings.source == "hdf5") != (root is not None):
+        raise PipelineError(
+            f"the run's demonstrations are of the source {settings.source}",
+            where="--demos",
+            expected="the folder with <suite>/<task>_demo.hdf5 for hdf5, nothing for starter",
+        )
+    return root
+
+
+def _differences(stored: Mapping[str, NDArray[Any]], rebuilt: Mapping[str, NDArray[Any]]) -> dict[str, str]:
+    """Column to what is not the same in it."""
+    found = {}
+    for name in sorted({*stored, *rebuilt}):
+        if name not in stored or name not in rebuilt:
+            found[name] = "only in the dataset" if name in stored else "only in what was rebuilt"
+            continue
+        there, here = stored[name], rebuilt[name]
+        if len(there) != len(here):
+            found[name] = f"{len(there)} steps in the dataset, {len(here)} rebuilt"
+        elif off := [step for step in range(len(here)) if not np.array_equal(there[step], here[step])]:
+            found[name] = (
+                f"{there[0].decode()!r} in the dataset, {here[0].decode()!r} rebuilt"
+                if name.startswith(METADATA)
+                else f"{len(off)} of {len(here)} steps, the first at step {off[0]}"
+            )
+    return found

@@ -1,0 +1,30 @@
+"""Stage validate: reopen both datasets and the manifest, and stop where anything is off."""
+
+import json
+
+from pipeline.compute import runner
+from pipeline.config import Config
+from pipeline.errors import PipelineError
+from pipeline.stage import main
+from pipeline.validate import validate
+
+
+def run(config: Config) -> None:
+    with runner(config.compute) as workers:
+        report = validate(config, workers)
+    file = config.data / "validation.json"
+    file.write_text(json.dumps(report, indent=1) + "\n")
+    off = {check: found["findings"] for check, found in report.items() if found["findings"]}
+    if off:
+        first = next(iter(off.values()))[0]
+        raise PipelineError(
+            f"{first['what']}; findings in all: {', '.join(f'{check} {len(found)}' for check, found in off.items())}",
+            where=f"{first['dataset']} {first['episode'] or ''}".strip(),
+            expected=first["expected"],
+            remedy=f"read {file}, mend the cause, and run `dvc repro` again",
+        )
+    print(f"{len(report)} checks found nothing off, see {file}")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

@@ -1,0 +1,260 @@
+"""The validator passes a good run, and names every planted fault by check, dataset and episode."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from conftest import MILK, PLATE, STOVE, run_stages, tiny_config
+
+from pipeline import manifest
+from pipeline.checks import CHECKS, Case, Finding
+from pipeline.compute import loop
+from pipeline.config import RenderConfig, load
+from pipeline.episode_schema import SCHEMA
+from pipeline.episodes import EpisodeLoader
+from pipeline.frames import decode, encode
+from pipeline.readback import Copy
+from pipeline.shards import METADATA, columns, records
+from pipeline.types import Episode, Task, Trajectory
+from pipeline.validate import validate
+from pipeline.writers import rlds, video
+
+Tree = dict[str, Any]
+Rows = list[dict[str, Any]]
+
+
+def swap_cameras(tree: Tree) -> None:
+    for step in tree["steps"]:
+        shown = step["observation"]
+        shown["image"], shown["wrist_image"] = shown["wrist_image"], shown["image"]
+
+
+def flip_gripper(tree: Tree) -> None:
+    for step in tree["steps"]:
+        step["action"] = step["action"] * np.array([1, 1, 1, 1, 1, 1, -1], np.float32)
+
+
+def turn_back(tree: Tree) -> None:
+    for step in tree["steps"]:
+        frame = decode(step["observation"]["image"])
+        step["observation"]["image"] = encode(np.ascontiguousarray(frame[::-1, ::-1]), RenderConfig())
+
+
+def freeze(tree: Tree) -> None:
+    for step in tree["steps"]:
+        step["observation"]["wrist_image"] = tree["steps"][0]["observation"]["wrist_image"]
+
+
+def change_text(tree: Tree) -> None:
+    for step in tree["steps"]:
+        step["language_instruction"] = "turn on the microwave"
+
+
+def truncate(tree: Tree) -> None:
+    del tree["steps"][-3:]
+
+
+def end_early(tree: Tree) -> None:
+    tree["steps"][-2]["reward"] = 1.0
+
+
+def take_credit(tree: Tree) -> None:
+    tree["episode_metadata"]["demo_origin"] = "expanded"
+
+
+IN_RLDS: dict[tuple[str, Task], Callable[[Tree], None]] = {
+    ("camera", STOVE): swap_cameras,
+    ("camera", MILK): flip_gripper,
+    ("clean", PLATE): turn_back,
+    ("noise", PLATE): freeze,
+    ("language", STOVE): change_text,
+    ("noise", MILK): truncate,
+    ("language", PLATE): end_early,
+    ("clean", MILK): take_credit,
+}
+"""Axis and task to what is done to the episode's example."""
+
+
+BLACK, CHANGED, LATE = ("noise", STOVE), ("clean", STOVE), ("camera", PLATE)
+"""In LeRobot black from one camera, with another action, and timed late."""
+
+EXPECTED = {
+    ("jpeg", "rlds", ("camera", STOVE)),
+    ("cameras", "rlds", ("camera", STOVE)),
+    ("rendered", "rlds", ("camera", STOVE)),  # The one of its axis that is rendered anew.
+    ("motion", "rlds", ("camera", MILK)),
+    ("jpeg", "rlds", ("clean", PLATE)),
+    ("rendered", "rlds", ("clean", PLATE)),
+    ("jpeg", "rlds", ("noise", PLATE)),
+    ("alive", "rlds", ("noise", PLATE)),
+    ("instruction", "rlds", ("language", STOVE)),
+    ("length", "rlds", ("noise", MILK)),
+    ("flags", "rlds", ("noise", MILK)),
+    ("flags", "rlds", ("language", PLATE)),
+    ("provenance", "rlds", ("clean", MILK)),
+    ("video", "lerobot", BLACK),
+    ("alive", "lerobot", BLACK),
+    ("rendered", "lerobot", BLACK),
+    ("motion", "lerobot", CHANGED),
+    ("clock", "lerobot", LATE),
+    ("video", "lerobot", LATE),  # Read by the time of the step, the frame is the next step's.
+    ("openvla_oft", "rlds", None),  # Its statistics are not those of the changed actions.
+    ("format", "lerobot", None),  # 10 frames a second, says info.json.
+    ("place", "manifest", "other"),
+    ("wording", "manifest", "other"),
+    ("instruction", "rlds", "other"),
+    ("instruction", "lerobot", "other"),
+    ("counts", "manifest", None),  # counts.json has one camera episode more.
+}
+"""Check, dataset and episode of all that is to be found."""
+
+
+def named(rows: Rows) -> dict[str, tuple[str, Task] | str]:
+    """Kept episode to its axis and task; where there is a second one of both, it is called ``other``."""
+    names: dict[str, tuple[str, Task] | str] = {}
+    for row in rows:
+        if row["kept"]:
+            name = (row["axis"], next(task for task in (STOVE, PLATE, MILK) if task.name == row["task"]))
+            names[row["episode_id"]] = "other" if name in names.values() else name
+    return names
+
+
+def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
+    """Write every shard again, with faults in the examples."""
+    load = EpisodeLoader(data / "plan.parquet", data / "frames", RenderConfig())
+    for shard in (data / "rlds").rglob("*.tfrecord-*"):
+        ids = [columns(record, rlds.features())[f"{METADATA}episode_id"][0].decode() for record in records(shard)]
+        with shard.open("wb") as file:
+            for episode_id in ids:
+                name = names[episode_id]
+                tree = rlds._tree(load(episode_id))
+                if isinstance(name, tuple) and name in IN_RLDS:
+                    IN_RLDS[name](tree)
+                example = rlds._serializer().get_tf_example(rlds.features().encode_example(tree))
+                file.write(rlds._record(example.SerializeToString()))
+
+
+def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
+    (table_file,) = (root / "data").rglob("*.parquet")
+    table = pq.read_table(table_file)
+    found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp")}
+    of = np.array(table["episode_index"])
+    found["action"][np.flatnonzero(of == index[CHANGED])[3], 0] += 0.001
+    found["timestamp"][of == index[LATE]] += np.float32(1 / SCHEMA.fps_hz)
+    for name, values in found.items():
+        place = table.schema.get_field_index(name)
+        table = table.set_column(place, table.schema.field(name), pa.array(list(values), table.schema.field(name).type))
+    pq.write_table(table, table_file)
+    (episodes_file,) = (root / "meta" / "episodes").rglob("*.parquet")
+    key = SCHEMA.views["image"].lerobot_key
+    (row,) = (row for row in pq.read_table(episodes_file).to_pylist() if row["episode_index"] == index[BLACK])
+    begin, end = (round(row[f"videos/{key}/{name}_timestamp"] * SCHEMA.fps_hz) for name in ("from", "to"))
+    (video_file,) = (root / "videos" / key).rglob("*.mp4")
+    with av.open(str(video_file)) as shown:
+        frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
+    made = video._Video(video_file)
+    for step, frame in enumerate(frames):
+        made.add(np.zeros_like(frame) if begin <= step < end else frame)
+    made.finish()
+    info = json.loads((root / "meta" / "info.json").read_text())
+    (root / "meta" / "info.json").write_text(json.dumps(info | {"fps": 10}))
+
+
+def spoil_manifest(data: Path, rows: Rows, other: str) -> None:
+    for row in rows:
+        if row["episode_id"] == other:
+            row["rlds_shard"] = next(r["rlds_shard"] for r in rows if r["kept"] and r["task"] == STOVE.name)
+            row["instruction"] = "STUDY_SCENE1_" + row["instruction"]
+    file = data / "manifest.parquet"
+    manifest.write(pa.Table.from_pylist(rows, schema=manifest.schema()), file, manifest.settings(file))
+    counts = json.loads((data / "counts.json").read_text())
+    counts["camera"]["libero_goal"]["kept"] += 1
+    (data / "counts.json").write_text(json.dumps(counts))
+
+
+def test_a_good_run_passes(finished: Path) -> None:
+    report = json.loads((finished / "validation.json").read_text())
+    assert {check: found["findings"] for check, found in report.items()} == {check: [] for check in report}
+    kept = sum(row["kept"] for row in manifest.read(finished / "manifest.parquet"))
+    assert {report[check]["checked"] for check in ("motion", "video", "gripper", "place", "provenance")} == {kept}
+    # The clean episode of each of three tasks, and one of each of three axes.
+    assert report["rendered"]["checked"] == 6
+    assert not list(finished.glob(".validate.*"))
+
+
+def test_planted_faults_stop_the_run_and_nothing_else_is_found(
+    finished: Path, short_demos: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    rows = manifest.read(data / "manifest.parquet")
+    names = named(rows)
+    (other,) = (episode_id for episode_id, name in names.items() if name == "other")
+    spoil_rlds(data, names)
+    index = {names[row["episode_id"]]: row["lerobot_episode_index"] for row in rows if row["kept"]}
+    spoil_lerobot(data / "lerobot" / "tiny", index)
+    spoil_manifest(data, rows, other)
+    with pytest.raises(AssertionError, match=r"(?s)findings in all: counts 1, .*try: read data/tiny/validation\.json"):
+        run_stages(tmp_path, tiny_config(short_demos) | {"compute": {"cluster": "loop"}}, ["validate"])
+    report = json.loads((data / "validation.json").read_text())
+    found = {
+        (check, finding["dataset"], names.get(finding["episode"]))
+        for check, result in report.items()
+        for finding in result["findings"]
+    }
+    assert found == EXPECTED
+
+
+def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory]) -> None:
+    """On a whole demonstration: in the last second of one, fingers hardly move."""
+    trajectory = whole[MILK]
+    action = trajectory.actions.astype(np.float32)
+    state = np.zeros((len(action), 8), np.float32)
+    state[:, 6:] = trajectory.states[:-1, 8:10]
+    joints = np.zeros((len(action), 7), np.float32)
+    made = Episode("milk", {}, state, joints, action, "", {})
+
+    def found(sign: float) -> list[Finding]:
+        commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
+        copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {})
+        return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], {}, None)))
+
+    assert found(1.0) == []
+    (flipped,) = found(-1.0)
+    assert "against the gripper's command" in flipped.what
+    assert "gripper command" in found(0.5)[0].what
+
+
+def test_what_is_missing_or_cannot_be_read_is_a_finding(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    (data / "lerobot" / "tiny" / "meta" / "info.json").unlink()
+    cut, short = sorted((data / "rlds").rglob("*.tfrecord-*"))
+    cut.write_bytes(cut.read_bytes()[:-1])
+    *others, _ = records(short)
+    short.write_bytes(b"".join(map(rlds._record, others)))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pipeline.validate.witnesses", lambda rows: [])  # Tested above, and slow.
+    report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
+    told = [(finding["dataset"], finding["what"]) for finding in report["readable"]["findings"]]
+    assert [dataset for dataset, _ in told] == ["lerobot", "rlds", "rlds"]
+    assert re.search(rf"{cut.name}: record \d+ is damaged", told[1][1])
+    assert told[2][1] == f"{short.name} has {len(others)} records"
+    rows = [row for row in manifest.read(data / "manifest.parquet") if row["kept"]]
+    gone = {
+        max((row["rlds_index"], row["episode_id"]) for row in rows if row["rlds_shard"] == shard.name)[1]
+        for shard in (cut, short)
+    }
+    assert {finding["episode"] for finding in report["ids"]["findings"]} == gone
