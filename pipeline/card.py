@@ -1,0 +1,248 @@
+"""The dataset card: what a run's folder holds, told to whoever finds it on the hub."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+import shutil
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import jinja2
+import yaml
+from huggingface_hub import DatasetCardData
+
+from pipeline import manifest
+from pipeline.axes import from_json
+from pipeline.axes.base import Layer, Level, Perturbation
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.inventory import attributions
+from pipeline.writers.rlds import VERSION
+
+Format = Literal["rlds", "lerobot"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+
+LEVELS: tuple[Level, ...] = get_args(Level)
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
+"""What the card tells from, beside the manifest; in the run's folder."""
+
+REPOSITORY = "OWNER/NAME"
+"""Stands in a card for the repository, which is not known before the upload."""
+
+FREE = re.compile(r"(MIT|Apache-2\.0|CC0-1\.0|CC-BY-\d)")
+"""How the licences begin under which a derived work may be CC BY 4.0."""
+
+
+def write(data: Path, lerobot: str) -> None:
+    """Write ``<data>/card/<format>/``: what goes to the root of a repository beside that format's files.
+
+    Args:
+        data: the run's folder, with manifest, reports, ``sheets`` and ``finetune``.
+        lerobot: name of the LeRobot dataset.
+
+    Raises:
+        PipelineError: when something it tells of is missing, or nothing was kept.
+    """
+    missing = [name for name in (*REPORTS, "manifest.parquet", "finetune/finetune.yaml") if not (data / name).is_file()]
+    if missing:
+        raise PipelineError(f"{', '.join(missing)} not there", where=data, remedy="dvc repro")
+    rows = manifest.read(data / "manifest.parquet")
+    if not any(row["kept"] for row in rows):
+        raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
+    reports = {name: json.loads((data / name).read_text()) for name in REPORTS}
+    clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
+    axes = dict.fromkeys(row["axis"] for row in rows)
+    sheets = [axis for axis in axes if (data / "sheets" / f"{axis}.png").is_file()]
+    with replaced(data / "card") as folder:
+        for kind in FORMATS:
+            (folder / kind / "pictures").mkdir(parents=True)
+            for axis in sheets:
+                shutil.copyfile(data / "sheets" / f"{axis}.png", folder / kind / "pictures" / f"{axis}.png")
+            text = render(kind, rows, reports, clients, sheets=sheets, lerobot=lerobot)
+            (folder / kind / "README.md").write_text(text)
+
+
+def render(
+    kind: Format,
+    rows: Sequence[Mapping[str, Any]],
+    reports: Mapping[str, Mapping[str, Any]],
+    clients: Mapping[str, Mapping[str, str]],
+    *,
+    sheets: Sequence[str],
+    lerobot: str,
+) -> str:
+    """The card of one format, with the hub's metadata in front.
+
+    Args:
+        kind: the format.
+        rows: the manifest.
+        reports: what the files of ``REPORTS`` hold.
+        clients: the section of that name in ``finetune.yaml``: where and how each policy's code is called.
+        sheets: the axes that have a picture.
+        lerobot: name of the LeRobot dataset.
+    """
+    leakage, validation, statistics = (reports[name] for name in REPORTS)
+    kept = [row for row in rows if row["kept"]]
+    owed = attributions(row["perturbations"] for row in kept)
+    free = all(FREE.match(one.licence) for one in owed)
+    axes = _axes(kept, kind)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(TEMPLATES),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    return environment.get_template("card.md.j2").render(
+        metadata=_metadata(kind, lerobot, free).to_yaml(),
+        rlds=kind == "rlds",
+        name=lerobot,
+        repository=REPOSITORY,
+        kept=kept,
+        origins=Counter({row["demo_id"]: row["demo_origin"] for row in kept}.values()),
+        steps=sum(row["steps"] for row in kept),
+        # Shards begin with the name of their dataset; there is one for each suite, or one for all.
+        datasets=sorted({row["rlds_shard"].partition("-")[0] for row in kept}),
+        version=VERSION,
+        episodes=_episodes(rows),
+        levels=table(
+            ["axis", *(f"level {level}" for level in LEVELS)],
+            [[axis, *(facts["levels"][level] for level in LEVELS)] for axis, facts in axes.items()],
+        ),
+        axes=axes,
+        sheets=sheets,
+        yields=_yields(rows),
+        leakage=leakage,
+        distances=_distances(leakage),
+        schema=SCHEMA,
+        statistics=[_statistics(name, figures["action"]) for name, figures in statistics.items()],
+        validation=table(
+            ["check", "checked", "result"],
+            [[name, found["checked"], _result(found["findings"])] for name, found in validation.items()],
+        ),
+        failed=[name for name, found in validation.items() if found["findings"]],
+        clients={name: client for name, client in clients.items() if (name == "openvla_oft") == (kind == "rlds")},
+        # Any will do: whoever has the dataset can try the command as it stands.
+        example=min(row["episode_id"] for row in kept),
+        versions=manifest.made_with(kept[0]),
+        devices=sorted({row["gl_device"] for row in kept}),
+        free=free,
+        owed=table(["name", "kind", "licence", "attribution", "episodes"], owed),
+    )
+
+
+def _metadata(kind: Format, name: str, free: bool) -> DatasetCardData:
+    """What the hub files a dataset under, and what its viewer shows: frames' data, and the manifest."""
+    configs = [{"config_name": "manifest", "data_files": "manifest.parquet"}]
+    if kind == "lerobot":  # as lerobot's own upload has it
+        configs.insert(0, {"config_name": "default", "data_files": "data/*/*.parquet"})
+    return DatasetCardData(
+        language="en",
+        license="cc-by-4.0" if free else "other",
+        pretty_name=name,
+        task_categories=["robotics"],
+        source_datasets=["yifengzhu-hf/LIBERO-datasets"],
+        tags=["LeRobot" if kind == "lerobot" else "RLDS", "LIBERO", "LIBERO-Plus", "panda", "simulation"],
+        configs=configs,
+    )
+
+
+def _axes(kept: Iterable[Mapping[str, Any]], kind: Format) -> dict[str, dict[str, Any]]:
+    """Axis to what it is, and how many episodes show each of its components and levels, combinations included."""
+    found: dict[str, dict[str, Any]] = {}
+    for row in kept:
+        for change in from_json(row["perturbations"]):
+            axis = found.setdefault(
+                change.axis,
+                {
+                    "what": (inspect.getdoc(type(change)) or "").partition("\n")[0],
+                    "changes": _changes(change, kind),
+                    "components": Counter(),
+                    "levels": Counter(),
+                },
+            )
+            axis["components"][change.component] += 1
+            axis["levels"][change.level] += 1
+    return found
+
+
+def _changes(change: Perturbation, kind: Format) -> str:
+    """What differs between an episode and its twin."""
+    if change.layer == Layer.TEXT:
+        return "the instruction"
+    views = " and ".join(
+        f"`{view if kind == 'rlds' else spec.lerobot_key}`"
+        for view, spec in SCHEMA.views.items()
+        if view in change.views
+    )
+    return f"{views}, state and length" if change.layer == Layer.PHYSICS else views
+
+
+def _episodes(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Kept episodes by axis and suite, with totals."""
+    suites = list(dict.fromkeys(row["suite"] for row in rows))
+    body = [
+        [axis, *(cells.get(suite, {}).get("kept", 0) for suite in suites)]
+        for axis, cells in manifest.counts(rows).items()
+    ]
+    totals = ["**all**", *(sum(column) for column in zip(*(line[1:] for line in body), strict=True))]
+    return table(["axis", *suites, "all"], [[*line, sum(line[1:])] for line in (*body, totals)])
+
+
+def _yields(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What became of the planned episodes of each axis."""
+    lost = manifest.tally([row for row in manifest.asked(rows) if not row["kept"]], "reason")
+    modes = manifest.tally([row for row in rows if row["kept"]], "replay_mode")
+    body = []
+    for axis, cells in manifest.counts(rows).items():
+        planned, replayed, kept = (
+            sum(cell[name] for cell in cells.values()) for name in ("planned", "replayed", "kept")
+        )
+        told = (_listed(found.get(axis, {})) for found in (lost, modes))
+        body.append([axis, planned, replayed, kept, f"{kept / planned:.0%}", *told])
+    return table(["axis", "planned", "replayed", "kept", "yield", "dropped for", "replayed"], body)
+
+
+def _distances(leakage: Mapping[str, Mapping[str, Any]]) -> str:
+    columns = ("rows", "test_tasks", "comparisons", "overlaps", "clearance", "smallest", "verdict")
+    return table(["axis", *columns], [[axis, *(found[name] for name in columns)] for axis, found in leakage.items()])
+
+
+def _statistics(dataset: str, action: Mapping[str, Sequence[float]]) -> str:
+    columns = ("mean", "std", "min", "q01", "q99", "max")
+    body = [[name, *(action[column][k] for column in columns)] for k, name in enumerate(SCHEMA.action.names)]
+    return table([dataset, *columns], body)
+
+
+def _result(findings: Sequence[object]) -> str:
+    return f"{len(findings)} findings, such as: {findings[0]}" if findings else "passed"
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "-"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """A table in Markdown; columns whose first cell is a number are set to the right. No rows, no table."""
+    if not rows:
+        return ""
+    rule = ["---:" if isinstance(cell, int | float) else "---" for cell in rows[0]]
+    return "\n".join(f"| {' | '.join(map(_cell, row))} |" for row in (head, rule, *rows))
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    if isinstance(value, int):
+        return f"{value:,}"
+    return str(value).replace("|", "\\|").replace("\n", " ")

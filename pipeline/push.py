@@ -1,0 +1,233 @@
+"""Upload a dataset to the Hugging Face hub: its files, its card, and what it was made and checked with.
+
+Everything goes into one commit, so that a reader finds all of a dataset or none of it. Large files are sent before that
+and stay there if the upload is cut off: run again, only the rest is sent. (``upload_large_folder`` of huggingface_hub
+leaves notes among the files, shows half a dataset meanwhile, and tries for ever where a token may not write.)
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
+from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError, XetError
+
+from pipeline import manifest
+from pipeline.card import REPORTS, REPOSITORY, Format
+from pipeline.errors import PipelineError
+from pipeline.writers.rlds import VERSION
+
+SCRIPTS = {".py", ".yaml", ".json"}
+"""What of ``finetune/`` is uploaded; trying it leaves compiled Python there."""
+
+
+@dataclass(frozen=True)
+class Upload:
+    """What would be sent.
+
+    Attributes:
+        files: path in the repository to file here.
+        tag: what the commit is tagged, as LeRobot's loader wants it; None for RLDS.
+    """
+
+    files: Mapping[str, Path]
+    tag: str | None
+
+    def summary(self) -> str:
+        """Files and megabytes of each folder, the total, and the tag."""
+        folders: dict[str, list[int]] = {}
+        for path, file in self.files.items():
+            folders.setdefault(f"{Path(path).parent}/", []).append(file.stat().st_size)
+        folders["in all"] = [size for sizes in folders.values() for size in sizes]
+        lines = [f"{len(sizes):6,} files {sum(sizes) / 1e6:10,.1f} MB  {name}" for name, sizes in folders.items()]
+        return "\n".join([*lines, f"tag: {self.tag or 'none'}"])
+
+
+def prepare(data: Path, kind: Format, lerobot: str) -> Upload:
+    """Gather what belongs to a dataset; nothing is sent.
+
+    Args:
+        data: the run's folder.
+        kind: which of the two datasets.
+        lerobot: name of the LeRobot dataset.
+
+    Raises:
+        PipelineError: when files are missing, foreign, not validated, or failed validation.
+    """
+    files, tag = _rlds(data) if kind == "rlds" else _lerobot(data / "lerobot" / lerobot)
+    _refuse_unvalidated(data, files, kind)
+    card = data / "card" / kind
+    files |= {file.relative_to(card).as_posix(): file for file in card.rglob("*") if file.is_file()}
+    files |= {name: data / name for name in ("manifest.parquet", *REPORTS)}
+    scripts = (file for file in (data / "finetune").rglob("*") if file.suffix in SCRIPTS)
+    files |= {file.relative_to(data).as_posix(): file for file in scripts}
+    return Upload(dict(sorted(files.items())), tag)
+
+
+def send(upload: Upload, repository: str, *, private: bool = False, endpoint: str | None = None) -> str:
+    """Create the repository if need be, send what it does not have, and tag it.
+
+    Files of an earlier upload that the dataset no longer has are deleted by the same commit.
+
+    Args:
+        upload: what ``prepare`` gathered.
+        repository: ``owner/name``, or ``name`` for one of your own.
+        private: whether a new repository is private; one that exists stays as it is.
+        endpoint: address of the hub, when not the usual one.
+
+    Returns:
+        The address of the commit.
+
+    Raises:
+        PipelineError: without a token, without the right to write, or when the network or the hub fails.
+    """
+    api = HfApi(endpoint=endpoint)
+    try:
+        if get_token() is None:
+            raise PipelineError(
+                f"no token for {api.endpoint}", remedy="hf auth login, or HF_TOKEN=..., with a token that may write"
+            )
+        # With the owner in front, where it was left out.
+        repository = api.create_repo(repository, repo_type="dataset", private=private, exist_ok=True).repo_id
+        there = api.list_repo_files(repository, repo_type="dataset")
+        ours = {path.partition("/")[0] for path in upload.files if "/" in path}
+        stale = [path for path in there if path.partition("/")[0] in ours and path not in upload.files]
+        operations: list[CommitOperationAdd | CommitOperationDelete] = [
+            *(CommitOperationAdd(path, _content(path, file, repository)) for path, file in upload.files.items()),
+            *(CommitOperationDelete(path, is_folder=False) for path in stale),
+        ]
+        with _addresses_of(api.endpoint):
+            commit = api.create_commit(
+                repository, operations, repo_type="dataset", commit_message=f"Upload {len(upload.files)} files"
+            )
+        if upload.tag is not None:  # moved, where it stands on an earlier upload
+            with suppress(RevisionNotFoundError):
+                api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
+            api.create_tag(repository, tag=upload.tag, repo_type="dataset")
+    except (OSError, RuntimeError, ValueError, XetError) as error:
+        raise _explained(error, repository, api.endpoint) from error
+    return commit.commit_url
+
+
+@contextmanager
+def _addresses_of(endpoint: str) -> Iterator[None]:
+    """Have huggingface_hub understand the address of its own commit: it knows no hub but the one of ``HF_ENDPOINT``."""
+    saved = constants.ENDPOINT
+    constants.ENDPOINT = endpoint
+    try:
+        yield
+    finally:
+        constants.ENDPOINT = saved
+
+
+def _content(path: str, file: Path, repository: str) -> Path | bytes:
+    """The file, or the card with the repository's name in the commands that load it."""
+    return file.read_text().replace(REPOSITORY, repository).encode() if path == "README.md" else file
+
+
+def _rlds(data: Path) -> tuple[dict[str, Path], None]:
+    """The shards that the manifest names and what TFDS needs beside them, at the place where ``finetune/`` looks."""
+    shards = {row["rlds_shard"] for row in manifest.read(_there(data / "manifest.parquet")) if row["kept"]}
+    folders = {f"{shard.partition('-')[0]}/{VERSION}" for shard in shards}
+    wanted = {f"{shard.partition('-')[0]}/{VERSION}/{shard}" for shard in shards}
+    wanted |= {f"{folder}/{name}" for folder in folders for name in ("dataset_info.json", "features.json")}
+    return {f"rlds/{path}": file for path, file in _exactly(data / "rlds", wanted).items()}, None
+
+
+def _lerobot(root: Path) -> tuple[dict[str, Path], str]:
+    """The files that ``meta/`` names, at the root of the repository, where lerobot looks for them."""
+    info: dict[str, Any] = json.loads(_there(root / "meta" / "info.json").read_text())
+    wanted = {f"meta/{name}" for name in ("info.json", "stats.json", "tasks.parquet", "provenance.parquet")}
+    for index in sorted((root / "meta" / "episodes").rglob("*.parquet")):
+        wanted.add(index.relative_to(root).as_posix())
+        wanted |= set(_named(info, pq.read_table(index).to_pylist()))
+    return _exactly(root, wanted), info["codebase_version"]
+
+
+def _named(info: Mapping[str, Any], episodes: list[dict[str, Any]]) -> Iterator[str]:
+    videos = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
+    for row in episodes:
+        data = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
+        yield info["data_path"].format(**data)
+        for key in videos:
+            video = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
+            yield info["video_path"].format(video_key=key, **video)
+
+
+def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
+    """The wanted files under ``root``, when there is nothing else, and nothing that leads elsewhere."""
+    found = {file.relative_to(root).as_posix(): file for file in root.rglob("*") if file.is_symlink() or file.is_file()}
+    linked = sorted(path for path, file in found.items() if root.resolve() not in file.resolve().parents)
+    foreign = sorted(found.keys() - wanted)
+    if foreign or linked:
+        raise PipelineError(
+            f"{len(foreign)} files that are not of the dataset, {len(linked)} that lie elsewhere, such as "
+            f"{(foreign + linked)[0]}",
+            where=root,
+            remedy="move them away (training leaves statistics and caches), or dvc repro to write the dataset anew",
+        )
+    if missing := sorted(wanted - found.keys()):
+        raise PipelineError(f"lacks {len(missing)} files, such as {missing[0]}", where=root, remedy="dvc repro")
+    return found
+
+
+def _refuse_unvalidated(data: Path, files: Mapping[str, Path], kind: Format) -> None:
+    """Stop unless these very files passed validation, and the card tells of it."""
+    report = _there(data / "validation.json")
+    checks = json.loads(report.read_text())
+    failed = [f"{check} ({found['findings'][0]})" for check, found in checks.items() if found["findings"]]
+    if failed or not checks:
+        raise PipelineError(
+            f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}",
+            where=report,
+            expected="at least one check, and no findings",
+            remedy="mend what it finds, and dvc repro",
+        )
+    steps = [
+        max(*files.values(), data / "manifest.parquet", key=_written),
+        report,
+        _there(data / "card" / kind / "README.md"),
+    ]
+    for before, after in pairwise(steps):
+        if _written(after) < _written(before):
+            raise PipelineError(
+                f"older than {before}, which it is about",
+                where=after,
+                # Forced: where a file was written anew with the same content, DVC sees nothing to do.
+                remedy="dvc repro --force --single-item validate card",
+            )
+
+
+def _written(file: Path) -> int:
+    return file.stat().st_mtime_ns
+
+
+def _there(file: Path) -> Path:
+    if not file.is_file():
+        raise PipelineError("not there", where=file, remedy="dvc repro")
+    return file
+
+
+def _explained(error: Exception, repository: str, endpoint: str) -> PipelineError:
+    """What the hub's library raised, with what to do about it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, HfHubHTTPError):
+        cause = cause.__cause__
+    response = None if cause is None else cause.response
+    status = 0 if response is None else response.status_code
+    if status in (401, 403, 404):
+        what = f"{repository} does not let you write"
+        remedy = "hf auth login with a token that has the right to, and mind the owner's name"
+    elif 400 <= status < 500 or not isinstance(error, OSError | RuntimeError):
+        what, remedy = f"the upload to {repository} is refused", "mend what the hub says"
+    else:
+        what = f"the upload to {repository} stopped"
+        remedy = "check the network (or HF_ENDPOINT) and run it again: what was sent is not sent again"
+    return PipelineError(f"{what} ({' '.join(str(error).split())})", where=endpoint, remedy=remedy)

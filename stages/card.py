@@ -1,0 +1,14 @@
+"""Stage card: the dataset card of each format, from the manifest and the reports."""
+
+from pipeline import card
+from pipeline.config import Config
+from pipeline.stage import main
+
+
+def run(config: Config) -> None:
+    card.write(config.data, config.export.lerobot.name)
+    print(f"{config.data / 'card'} has a README.md for each format; `python -m pipeline push` uploads it with the data")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

@@ -1,0 +1,209 @@
+"""The card says what the run's files say, its pictures are beside it, and the hub can read its metadata."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import yaml
+from conftest import MILK, STOVE
+from huggingface_hub import DatasetCard
+
+from pipeline import card
+from pipeline.axes import to_json
+from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
+from pipeline.axes.base import Perturbation
+from pipeline.axes.camera import CameraAxis
+from pipeline.axes.layout import LayoutAxis
+from pipeline.card import FORMATS, Format
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.seeding import rng
+from pipeline.types import Task
+
+NAME = "libero_tiny"
+CAMERA = CameraAxis(levels=(4,)).sample(rng("card"), MILK, 0)
+BACKGROUND = BackgroundAxis(levels=(2,)).sample(rng("card"), MILK, 0)
+LAYOUT = LayoutAxis(levels=(1,)).sample(rng("card"), MILK, 0)
+
+
+def row(axis: str, *changes: Perturbation, task: Task = MILK, reason: str = "kept", **other: Any) -> dict[str, Any]:
+    kept = reason == "kept"
+    number = f"{axis}{len(changes)}{task.name}{reason}"
+    return {
+        "episode_id": number,
+        "role": "perturbed" if changes else "twin",
+        "suite": task.suite,
+        "task": task.name,
+        "demo_id": f"{task.suite}/{task.name}/demo_0",
+        "demo_origin": "human",
+        "axis": axis,
+        "perturbations": to_json(list(changes)),
+        "kept": kept,
+        "reason": reason,
+        "replay_mode": "open_loop",
+        "steps": 100,
+        "gl_device": "llvmpipe" if kept else None,
+        "rlds_shard": f"{NAME}-train.tfrecord-00000-of-00001" if kept else None,
+        "mujoco_version": "3.2.7",
+        **other,
+    }
+
+
+ROWS = [
+    row("clean"),
+    row("clean", task=STOVE),
+    row("camera", CAMERA),
+    row("camera", CAMERA, task=STOVE),
+    row("background", BACKGROUND),
+    row("layout", LAYOUT, replay_mode="tracked"),
+    row("layout", LAYOUT, task=STOVE, reason="goal_not_reached"),
+    row("layout", LAYOUT, task=STOVE, reason="reserve_not_needed", steps=None),
+    row("camera+background", CAMERA, BACKGROUND),
+]
+FINDING = {"rows": 3, "test_tasks": 1599, "comparisons": 4797, "smallest": 5.379, "closest": "e", "clearance": 5.0}
+VALIDATION: dict[str, dict[str, Any]] = {"gripper": {"checked": 7, "findings": []}}
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    """The folder of a run, as far as the card reads it."""
+    pq.write_table(pa.Table.from_pylist(ROWS), tmp_path / "manifest.parquet")
+    column = list(range(1, 8))
+    for name, report in {
+        "leakage.json": {"camera": FINDING | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint"}},
+        "validation.json": VALIDATION,
+        "dataset_statistics.json": {
+            NAME: {"action": dict.fromkeys(("mean", "std", "min", "max", "q01", "q99"), column)}
+        },
+    }.items():
+        (tmp_path / name).write_text(json.dumps(report))
+    (tmp_path / "sheets").mkdir()
+    for axis in ("camera", "camera+background"):
+        (tmp_path / "sheets" / f"{axis}.png").write_bytes(axis.encode())
+    (tmp_path / "finetune").mkdir()
+    clients = {name: {"where": "there", "command": f"train --with {name}"} for name in ("openvla_oft", "openpi")}
+    (tmp_path / "finetune" / "finetune.yaml").write_text(yaml.safe_dump({"clients": clients}))
+    return tmp_path
+
+
+def written(data: Path, kind: Format) -> str:
+    card.write(data, NAME)
+    return (data / "card" / kind / "README.md").read_text()
+
+
+def metadata_of(text: str) -> dict[str, Any]:
+    return dict(yaml.safe_load(DatasetCard(text).data.to_yaml()))
+
+
+def cells(text: str, first: str, under: str) -> list[str]:
+    """The row that begins with ``first`` in the section ``under``."""
+    section = text.partition(f"## {under}\n")[2]
+    found = re.search(rf"^\| {re.escape(first)} \|(.*)\|$", section, re.MULTILINE)
+    assert found, f"no {first} under {under}"
+    return [cell.strip() for cell in found[1].split(" | ")]
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_the_hub_reads_the_metadata(data: Path, kind: Format) -> None:
+    metadata = metadata_of(written(data, kind))
+    assert metadata["license"] == "cc-by-4.0"
+    assert metadata["task_categories"] == ["robotics"]
+    assert ("LeRobot" in metadata["tags"]) == (kind == "lerobot")
+    first = metadata["configs"][0]
+    assert first["data_files"] == ("data/*/*.parquet" if kind == "lerobot" else "manifest.parquet")
+
+
+def test_tables_say_what_the_manifest_says(data: Path) -> None:
+    text = written(data, "rlds")
+    assert "7 episodes (700 steps" in text
+    assert cells(text, "axis", "Episodes") == ["libero_object", "libero_goal", "all"]
+    assert cells(text, "camera", "Episodes") == ["1", "1", "2"]
+    assert cells(text, "layout", "Episodes") == ["1", "0", "1"]
+    assert cells(text, "**all**", "Episodes") == ["5", "2", "7"]
+    levels = text.partition("By strength")[2]
+    assert "| camera | 0 | 0 | 0 | 3 | 0 |" in levels
+    assert "| background | 0 | 2 | 0 | 0 | 0 |" in levels
+    assert f"{CAMERA.component} (3)" in text
+    assert cells(text, "layout", "Yield") == ["2", "2", "1", "50%", "goal_not_reached 1", "tracked 1"]
+    assert cells(text, "camera", "Yield") == ["2", "2", "2", "100%", "-", "open_loop 2"]
+    assert cells(text, "camera", "Distance to the LIBERO-Plus test set")[-2:] == ["5.38", "disjoint"]
+    assert "hf download OWNER/NAME" in text
+    assert re.search(rf"regenerate ({'|'.join(row['episode_id'] for row in ROWS if row['kept'])}) --manifest", text)
+
+
+def test_pictures_are_beside_the_card_and_only_those_that_exist(data: Path) -> None:
+    text = written(data, "lerobot")
+    shown = re.findall(r"!\[.*?\]\((.*?)\)", text)
+    assert shown == ["pictures/camera.png", "pictures/camera+background.png"]
+    for picture in shown:
+        axis = Path(picture).stem
+        assert (data / "card" / "lerobot" / picture).read_bytes() == axis.encode()
+
+
+@pytest.mark.parametrize(
+    ("kind", "state", "client", "other"),
+    [("rlds", "`state`", "openvla_oft", "openpi"), ("lerobot", "`observation.state`", "openpi", "openvla_oft")],
+)
+def test_conventions_and_commands_are_the_formats_own(
+    data: Path, kind: Format, state: str, client: str, other: str
+) -> None:
+    text = written(data, kind)
+    assert f"**State**, {state} (8)" in text
+    for names in (SCHEMA.state.names, SCHEMA.action.names):
+        assert ", ".join(names) in text
+    view = "`image`" if kind == "rlds" else "`observation.images.image`"
+    assert f"relative to the scene's own. Changes {view}." in text
+    assert "-1 opens and +1 closes" in text
+    assert f"train --with {client}" in text
+    assert f"train --with {other}" not in text
+
+
+def test_a_failed_check_is_not_hidden(data: Path) -> None:
+    assert "opened again and checked, and passed" in written(data, "rlds")
+    failed = VALIDATION | {"rotation": {"checked": 7, "findings": ["episode 3 stands upside down"]}}
+    (data / "validation.json").write_text(json.dumps(failed))
+    text = written(data, "rlds")
+    assert "**rotation failed**" in text
+    assert cells(text, "rotation", "Conventions") == ["7", "1 findings, such as: episode 3 stands upside down"]
+    assert "and passed" not in text
+
+
+def test_everything_shown_is_attributed(data: Path) -> None:
+    text = written(data, "rlds")
+    assert isinstance(BACKGROUND, BackgroundPerturbation)
+    for covering in BACKGROUND.coverings:
+        assert cells(text, covering.texture, "Licences and attributions")[1] == covering.licence
+    for added in LAYOUT.objects:
+        assert cells(text, added.name, "Licences and attributions")[2] == added.attribution
+
+
+@pytest.mark.parametrize(
+    ("licence", "free"),
+    [("CC-BY-3.0-US", True), ("CC0-1.0", True), ("CC-BY-NC-4.0", False), ("CC-BY-SA-4.0", False), ("mine", False)],
+)
+def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, free: bool) -> None:
+    coverings = tuple(covering.model_copy(update={"licence": licence}) for covering in BACKGROUND.coverings)
+    rows = [*ROWS[:2], row("background", BACKGROUND.model_copy(update={"coverings": coverings}))]
+    pq.write_table(pa.Table.from_pylist(rows), data / "manifest.parquet")
+    text = written(data, "rlds")
+    assert metadata_of(text)["license"] == ("cc-by-4.0" if free else "other")
+    assert ("licensed under [CC BY 4.0]" in text) == free
+
+
+@pytest.mark.parametrize("name", ["validation.json", "finetune/finetune.yaml"])
+def test_says_what_is_missing(data: Path, name: str) -> None:
+    (data / name).unlink()
+    with pytest.raises(PipelineError, match=f"{name} not there"):
+        card.write(data, NAME)
+
+
+def test_nothing_kept_is_refused(data: Path) -> None:
+    pq.write_table(pa.Table.from_pylist([ROWS[6]]), data / "manifest.parquet")
+    with pytest.raises(PipelineError, match="no episode was kept"):
+        card.write(data, NAME)
