@@ -14,7 +14,6 @@ from pipeline.chat import Chat
 from pipeline.compute import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
-from pipeline.expand import expand
 from pipeline.fetch import fetch
 from pipeline.files import replaced
 from pipeline.rewrite import extend
@@ -63,6 +62,9 @@ def _sources(arguments: argparse.Namespace) -> int:
 
 
 def _expand(arguments: argparse.Namespace) -> int:
+    # The simulator reads when it is imported what renders, which commands that render find out first.
+    from pipeline.expand import expand
+
     demos = DemosConfig(tasks=tuple(arguments.tasks))
     with runner(ComputeConfig()) as run:
         made = expand(arguments.out, demos, arguments.per_task, arguments.seed, testset.load(), run)
@@ -80,6 +82,28 @@ def _check_oft(arguments: argparse.Namespace) -> int:
     found = oft_check.check_run(arguments.data)
     print(json.dumps(found))
     return int(any(dataset["violations"] for dataset in found.values()))
+
+
+def _regenerate(arguments: argparse.Namespace) -> int:
+    # Rendering starts OpenGL on import.
+    from pipeline.regenerate import regenerate
+
+    found = regenerate(arguments.episode_id, arguments.manifest, arguments.out, arguments.demos)
+    print(json.dumps(found))
+    return int(found["identical"] is False or found["reason"] != "kept")
+
+
+def _push(arguments: argparse.Namespace) -> int:
+    from pipeline import push
+
+    config = load(arguments.config)
+    upload = push.prepare(config.data, arguments.format, config.export.lerobot.name)
+    print(upload.summary())
+    if not arguments.really:
+        print(f"nothing was sent: with --really this goes to {arguments.repository}")
+        return 0
+    print(push.send(upload, arguments.repository, private=arguments.private, endpoint=arguments.endpoint))
+    return 0
 
 
 def _schema(arguments: argparse.Namespace) -> int:
@@ -200,6 +224,37 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("data", type=Path, metavar="DIR", help="the run's data folder, such as data/starter")
     command.set_defaults(run=_check_oft)
+
+    command = commands.add_parser(
+        "regenerate",
+        help="rebuild one episode from the manifest and its demonstration, and say whether it is the dataset's, byte "
+        "for byte",
+        description="Replays, renders and serialises one kept episode again. The last line is JSON: whether it equals "
+        "the record in the RLDS set beside the manifest, which columns differ, and which versions and OpenGL device "
+        "are not those of the manifest. Ends with 1 when it is not identical.",
+    )
+    command.add_argument("episode_id", metavar="EPISODE_ID", help="as in the manifest and in both datasets")
+    command.add_argument("--manifest", type=Path, required=True, metavar="FILE", help="data/<run>/manifest.parquet")
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for what is rebuilt")
+    command.add_argument(
+        "--demos", type=Path, metavar="DIR", help="folder of the HDF5 demonstrations, where the run was made from those"
+    )
+    command.set_defaults(run=_regenerate)
+
+    command = commands.add_parser(
+        "push",
+        help="upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go",
+        description="Sends one of the two datasets of a finished and validated run: its files, the card, the manifest "
+        "and the recipe, in one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or "
+        "`hf auth login`.",
+    )
+    command.add_argument("config", type=Path, metavar="CONFIG", help="of the run, such as configs/starter.yaml")
+    command.add_argument("format", choices=("rlds", "lerobot"), metavar="FORMAT", help="rlds or lerobot")
+    command.add_argument("repository", metavar="REPOSITORY", help="owner/name on the hub")
+    command.add_argument("--really", action="store_true", help="send it")
+    command.add_argument("--private", action="store_true", help="make a new repository private")
+    command.add_argument("--endpoint", metavar="URL", help="address of the hub, when not the usual one")
+    command.set_defaults(run=_push)
 
     command = commands.add_parser("schema", help="write schemas/config.schema.json from the code")
     command.set_defaults(run=_schema)

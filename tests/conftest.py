@@ -98,7 +98,10 @@ def tiny_config(demos: Path) -> dict[str, object]:
     }
 
 
-STAGES = ("plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest", "recipe", "summary")
+STAGES = (
+    *("plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest"),
+    *("validate", "recipe", "summary", "card", "report"),
+)
 
 
 def link_testset(folder: Path) -> None:

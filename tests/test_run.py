@@ -164,6 +164,31 @@ def test_openvla_oft_would_train_on_all_of_it(finished: Path, rows: list[dict[st
     assert recipe["dataset"]["mixtures"]["value"] == {"libero_tiny": dict.fromkeys(found, 1.0)}
 
 
+def test_lerobots_own_training_runs_on_it(finished: Path, tmp_path: Path) -> None:
+    """Two steps of a small ACT policy, by the command that the recipe gives with a smaller model."""
+    command = yaml.safe_load((finished / "finetune" / "finetune.yaml").read_text())["clients"]["lerobot_act"]["command"]
+    program, *options = command.replace("$DATA", str(finished)).split()
+    small = ["dim_model=64", "n_heads=2", "dim_feedforward=64", "device=cpu", "pretrained_backbone_weights=null"]
+    here = ["steps=2", "batch_size=1", "num_workers=0", "log_freq=1", "save_checkpoint=false"]
+    done = subprocess.run(
+        [
+            str(Path(sys.executable).parent / program),
+            *options,
+            *(f"--policy.{option}" for option in small),
+            *(f"--{option}" for option in here),
+            "--dataset.video_backend=pyav",
+            f"--output_dir={tmp_path / 'trained'}",
+        ],
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "step:2" in done.stderr
+    assert "loss:nan" not in done.stderr
+
+
 def hashes(data: Path) -> dict[str, str]:
     files = (path for path in sorted(data.rglob("*")) if path.is_file() and path.name != ".gitignore")
     return {str(path.relative_to(data)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
@@ -223,11 +248,12 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path) 
     file = clone / "configs" / "tiny.yaml"
     original = file.read_text()
     cases: list[tuple[tuple[str, ...], Any, set[str]]] = [
-        (("export", "rlds", "shards"), 3, {"export_rlds"}),
-        (("export", "lerobot", "parts"), 3, {"export_lerobot"}),
-        (("render", "jpeg_quality"), 90, {"render"}),
+        # The report quotes the whole configuration, but for where it ran.
+        (("export", "rlds", "shards"), 3, {"export_rlds", "report"}),
+        (("export", "lerobot", "parts"), 3, {"export_lerobot", "report"}),
+        (("render", "jpeg_quality"), 90, {"render", "report"}),
         (("compute", "workers"), 5, set()),
-        (("plan", "seed"), 8, {"plan", "summary"}),
+        (("plan", "seed"), 8, {"plan", "summary", "report"}),
     ]
     try:
         for keys, value, expected in cases:

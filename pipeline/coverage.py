@@ -1,0 +1,219 @@
+"""Where a run's draws lie, and where the benchmark's test parameters lie, axis by axis, as panels."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pipeline import bddl
+from pipeline.axes import AnyPerturbation
+from pipeline.axes.background import BackgroundPerturbation
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.language import CLASSES, LanguagePerturbation, distance
+from pipeline.axes.layout import LayoutPerturbation
+from pipeline.axes.light import LightPerturbation
+from pipeline.axes.noise import NoisePerturbation
+from pipeline.axes.pose import PosePerturbation
+from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
+from pipeline.figures import Panel, bars, histogram, scatter, strips
+from pipeline.tasks import find_task
+from pipeline.testset import TestSet
+from pipeline.types import Floats, Task
+
+STUDY_TABLE_M = np.array([-0.2, 0.0])
+"""Where the study's table stands; all other arenas' surfaces are centred (LIBERO's ``study_table_offset``)."""
+
+
+class Draw(NamedTuple):
+    """One perturbation of a kept episode.
+
+    Attributes:
+        task: the episode's.
+        made: what was drawn.
+        resolved: what it came to in the scene, None where nothing was recorded.
+    """
+
+    task: Task
+    made: AnyPerturbation
+    resolved: Any
+
+
+class Coverage(NamedTuple):
+    """What is shown of one axis: what there is to say of the test set, and the plots."""
+
+    note: str
+    panels: list[Panel]
+
+
+def of(axis: str, draws: Sequence[Draw], test: TestSet) -> Coverage:
+    """The coverage of one axis by the draws on it."""
+    made = [draw.made for draw in draws]
+    match axis:
+        case "camera":
+            return _camera([p for p in made if isinstance(p, CameraPerturbation)], test)
+        case "light":
+            return _light([p for p in made if isinstance(p, LightPerturbation)], test)
+        case "background":
+            return _background([p for p in made if isinstance(p, BackgroundPerturbation)], test)
+        case "noise":
+            return _noise([p for p in made if isinstance(p, NoisePerturbation)], test)
+        case "language":
+            return _language([(d.task, d.made) for d in draws if isinstance(d.made, LanguagePerturbation)], test)
+        case "layout":
+            return _layout(draws, test)
+        case "pose":
+            return _pose([p for p in made if isinstance(p, PosePerturbation)], test)
+        case "robot":
+            return _robot([p for p in made if isinstance(p, RobotPerturbation)], test)
+    return Coverage("Nothing is plotted of this axis.", [])
+
+
+def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> Coverage:
+    tested = [task.parameters for task in test.of("camera")]
+
+    def points(*names: str) -> dict[str, Floats]:
+        """Distinct points, as many test tasks share one camera."""
+        shown = np.array([[float(known[name]) for name in names] for known in tested]).reshape(-1, len(names))
+        own = np.array([[getattr(p, name) for name in names] for p in draws]).reshape(-1, len(names))
+        return {"benchmark": np.unique(shown, axis=0), "camera": own}
+
+    scales = {name: values.ravel() for name, values in points("distance_scale").items()}
+    return Coverage(
+        f"{len(tested):,} test cameras. A draw is a point in each plot; what it leaves alone stays LIBERO's.",
+        [
+            scatter("where it stands", points("azimuth_deg", "elevation_deg"), "azimuth (°)", "elevation (°)"),
+            strips("how far away", {"scale": scales}, "multiple of the distance"),
+            scatter("how it is turned in place", points("yaw_deg", "pitch_deg"), "yaw (°)", "pitch (°)"),
+        ],
+    )
+
+
+def _light(draws: Sequence[LightPerturbation], test: TestSet) -> Coverage:
+    columns = {
+        "brightness": ("multiple of the diffuse light", [float(np.mean(p.diffuse_scale_rgb)) for p in draws]),
+        "tint": ("saturation", [1 - min(p.diffuse_scale_rgb) / max(*p.diffuse_scale_rgb, 1e-9) for p in draws]),
+        "gloss": ("multiple of the specular light", [p.specular_scale for p in draws]),
+        "direction": ("lamps carried round by (°)", [p.orbit_deg for p in draws]),
+        "tilt": ("lamps tilted by (°)", [p.tilt_deg for p in draws]),
+    }
+    shown = [strips(name, {"draws": {"light": np.array(values)}}, label) for name, (label, values) in columns.items()]
+    return Coverage(
+        f"{len(test.of('light')):,} test tasks, whose values are unknown offline: they are published only within the "
+        f"benchmark's asset archive. {sum(p.shadows for p in draws)} of {len(draws)} draws cast shadows.",
+        shown,
+    )
+
+
+def _background(draws: Sequence[BackgroundPerturbation], test: TestSet) -> Coverage:
+    names = [covering.texture for p in draws for covering in p.coverings]
+    tested = test.of("background")
+    images = {task.parameters[part] for task in tested for part in ("surface", "wall") if part in task.parameters}
+    # Such as procedural:brick/028 or metaworld:floor2.png.
+    sources = Counter(name.rpartition("/" if "/" in name else ":")[0] for name in names)
+    return Coverage(
+        f"{len(set(names))} different images in {len(draws)} draws. The {len(tested):,} test tasks show {len(images)}; "
+        "a run stops where one of them is shared, by name or by content.",
+        [bars("images by source and family", sources, "background", "uses")],
+    )
+
+
+def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> Coverage:
+    rows = {}
+    for component in dict.fromkeys(task.component for task in test.of("noise")):
+        own = [p for p in draws if p.component == component]
+        tested = [task.parameters for task in test.of("noise") if task.component == component]
+        severities: Floats = np.unique([float(known["severity"]) for known in tested])
+        at = np.array([])
+        if own:
+            name, clean = own[0].effect.strength
+            ladder = sorted({(float(known["severity"]), float(known[name])) for known in tested})
+            steps, values = np.array([(0.0, float(clean)), *ladder]).T
+            at = np.interp([float(getattr(p.effect, name)) for p in own], values, steps)
+        rows[component] = {"benchmark": severities, "noise": at}
+    return Coverage(
+        f"{len(test.of('noise')):,} test tasks at ten severities of each kind; a draw stands where its strength would, "
+        "on the benchmark's scale.",
+        [strips("strength by kind", rows, "severity")],
+    )
+
+
+def _language(draws: Sequence[tuple[Task, LanguagePerturbation]], test: TestSet) -> Coverage:
+    tested = test.of("language")
+    original = {(t.suite, t.base): find_task(t.suite, t.base).instruction for t in tested}
+    far = np.array([distance(str(t.parameters["text"]), original[t.suite, t.base]) for t in tested])
+    own = [(p.component, distance(p.text, task.instruction)) for task, p in draws]
+    rows = {
+        name.replace("_", " "): {"language": np.array([away for component, away in own if component == name])}
+        for name in CLASSES
+    }
+    return Coverage(
+        f"{len(tested):,} test instructions, of no stated class. The distance is the share of characters to edit.",
+        [
+            histogram(
+                "distance to the original wording",
+                {"benchmark": far, "language": np.array([away for _, away in own])},
+                np.linspace(0, 1, 21),
+                "share of characters edited",
+            ),
+            strips("the same by class", rows, "share of characters edited"),
+        ],
+    )
+
+
+def _layout(draws: Sequence[Draw], test: TestSet) -> Coverage:
+    tested = [task.parameters for task in test.of("layout")]
+    places = [pair.split(",") for known in tested for pair in str(known["positions"]).split(";") if pair]
+    own, counts = [], []
+    for draw in draws:
+        if isinstance(draw.made, LayoutPerturbation):
+            counts.append(len(draw.made.objects))
+            centre = STUDY_TABLE_M if "study" in bddl.read(draw.task.bddl_file).problem else np.zeros(2)
+            placed = draw.resolved["objects"] if draw.resolved else ()
+            own += [np.array(thing["position_m"][:2]) - centre for thing in placed]
+    categories = {
+        added.category for draw in draws if isinstance(draw.made, LayoutPerturbation) for added in draw.made.objects
+    }
+    groups = {"benchmark": np.unique(np.array(places, float).reshape(-1, 2), axis=0), "layout": np.array(own)}
+    number = {"benchmark": np.array([float(known["count"]) for known in tested]), "layout": np.array(counts, float)}
+    return Coverage(
+        f"{len(tested):,} test tasks. Objects of {len(categories)} categories were added; a run stops where a test "
+        "task of the same LIBERO task adds one of these.",
+        [
+            scatter("where objects stand", groups, "x from the surface's centre (m)", "y (m)", equal=True),
+            histogram("objects added", number, np.arange(0.5, 7.0), "objects"),
+        ],
+    )
+
+
+def _pose(draws: Sequence[PosePerturbation], test: TestSet) -> Coverage:
+    tested = [task.parameters for task in test.of("pose") if "dx_m" in task.parameters]
+    moves = np.array([[float(known["dx_m"]), float(known["dy_m"])] for known in tested]).reshape(-1, 2)
+    own = np.array([[p.dx_m, p.dy_m] for p in draws]).reshape(-1, 2)
+    return Coverage(
+        f"{len(test.of('pose')):,} test tasks, of which {len(tested):,} move the target, and all of which move "
+        "everything else as well. The turn is this project's own.",
+        [
+            scatter(
+                "where the moved object goes", {"benchmark": 100 * moves, "pose": 100 * own}, "dx (cm)", "dy (cm)", True
+            ),
+            strips("how far it turns", {"yaw": {"pose": np.array([p.dyaw_deg for p in draws])}}, "degrees"),
+        ],
+    )
+
+
+def _robot(draws: Sequence[RobotPerturbation], test: TestSet) -> Coverage:
+    ids = [int(task.parameters["id"]) - 1 for task in test.of("robot")]
+    tested = benchmark_offsets_rad()[ids].reshape(-1, 7)
+    own = np.array([p.joint_offsets_rad for p in draws]).reshape(-1, 7)
+    joints = {f"joint {n + 1}": {"benchmark": np.unique(tested[:, n]), "robot": own[:, n]} for n in range(7)}
+    norms = {"benchmark": np.linalg.norm(tested, axis=1), "robot": np.linalg.norm(own, axis=1)}
+    return Coverage(
+        f"{len(ids):,} test tasks with {len(set(ids))} different offsets.",
+        [
+            histogram("size of the offset", norms, np.arange(0.025, 0.6, 0.05), "norm (rad)"),
+            strips("offset by joint, base to wrist", joints, "rad"),
+        ],
+    )

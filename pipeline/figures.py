@@ -1,0 +1,175 @@
+"""Small plots as inline SVG: one panel each, as wide as a phone, in the ink of the page around them.
+
+A page lays panels out as its width allows. Text stays text, and whatever is drawn in ``INK`` takes the page's own
+colour, so that one figure reads in light and in dark.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
+
+Values = NDArray[Any]
+Groups = Mapping[str, Values]
+"""What is drawn in one colour, by name; those of ``REFERENCES`` lie behind the others, in grey."""
+
+REFERENCES = ("clean", "benchmark")
+GREY = "#8c8c8c"
+COLOURS = {
+    "layout": "#7d9a1f",
+    "pose": "#d463b0",
+    "robot": "#129fc0",
+    "camera": "#4285f4",
+    "light": "#e59a00",
+    "background": "#1f9e82",
+    "noise": "#9467d6",
+    "language": "#e4572e",
+}
+COMBINED = "#b0794a"
+"""For episodes that are perturbed on several axes."""
+
+INK = "#010203"
+"""A colour that nothing else has; it becomes the page's."""
+
+STYLE: Any = {
+    "font.size": 9,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "figures",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": GREY,
+    "grid.alpha": 0.25,
+    "grid.linewidth": 0.5,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
+    **dict.fromkeys(("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), INK),
+}
+WIDTH_IN, HEIGHT_IN = 3.4, 2.3
+SMALLEST_SHARE = 1e-4
+"""Where a logarithmic scale of shares begins, in all figures alike."""
+
+DOTS_DPI = 220
+"""Clouds of points are pictures within the SVG: a thousand circles would be a hundred times the bytes."""
+
+
+class Panel(NamedTuple):
+    title: str
+    svg: str
+
+
+def colour(group: str) -> str:
+    return GREY if group in REFERENCES else COLOURS.get(group, COMBINED)
+
+
+def panel(title: str, draw: Callable[[Axes], None], height_in: float = HEIGHT_IN) -> Panel:
+    """One pair of axes, drawn on by ``draw``."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+        draw(figure.add_subplot())
+        written = io.StringIO()
+        # Without a date the same data give the same bytes.
+        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+        figure.savefig(written, format="svg", metadata=nothing, dpi=DOTS_DPI)
+    drawn = written.getvalue()
+    drawn = drawn[drawn.index("<svg") :].replace(INK, "currentColor")
+    # HTML knows the namespaces, and numbered names would clash between the figures of a page.
+    drawn = re.sub(r' xmlns(:xlink)?="[^"]*"| id="[a-z0-9_.]+_\d+"', "", drawn)
+    return Panel(title, drawn.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1))
+
+
+def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = False) -> Panel:
+    """Share of each group's values in each bin: references filled, the others as lines; empty groups are left out."""
+
+    def draw(axes: Axes) -> None:
+        for name, values in _references_first(groups):
+            if not len(values):
+                continue
+            counts, _ = np.histogram(np.clip(values, bins[0], bins[-1]), bins)
+            share = counts / len(values)
+            if name in REFERENCES:
+                axes.stairs(share, bins, fill=True, color=GREY, alpha=0.45)
+            else:
+                axes.stairs(share, bins, color=colour(name), linewidth=1.3)
+        margin = 0.02 * (bins[-1] - bins[0])
+        axes.set(xlabel=label, ylabel="share", xlim=(bins[0] - margin, bins[-1] + margin))
+        if log:
+            axes.set(yscale="log", ylim=(SMALLEST_SHARE, 1.2))
+
+    return panel(title, draw)
+
+
+def scatter(title: str, groups: Groups, x_label: str, y_label: str, equal: bool = False) -> Panel:
+    """Points (N, 2) in a plane; ``equal`` keeps both scales the same."""
+
+    def draw(axes: Axes) -> None:
+        for name, points in _references_first(groups):
+            at = np.asarray(points, float).reshape(-1, 2)
+            _dots(axes, at[:, 0], at[:, 1], name, behind=name in REFERENCES)
+        axes.set(xlabel=x_label, ylabel=y_label)
+        if equal:
+            axes.set_aspect("equal", adjustable="datalim")
+
+    return panel(title, draw, HEIGHT_IN * 1.15)
+
+
+def _dots(axes: Axes, x: Values, y: Values, group: str, behind: bool) -> None:
+    # Of many points the density is to be seen.
+    opacity = (0.4 if behind else 0.85) * min(1.0, max(0.1, 500 / max(1, len(x))))
+    size_pt2 = 9 if behind else 15
+    axes.scatter(x, y, s=size_pt2, color=colour(group), alpha=opacity, linewidths=0, rasterized=True)
+
+
+def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
+    """A line for each row with its groups' values along it, references below what is compared with them."""
+
+    def draw(axes: Axes) -> None:
+        for height, groups in enumerate(rows.values()):
+            for name, values in groups.items():
+                alone = len(groups) == 1
+                behind = name in REFERENCES and not alone
+                middle = height + (0.0 if alone else 0.2 if behind else -0.2)
+                # Equal values stand beside each other.
+                ordered = np.sort(values)
+                spread = 0.16 * np.sin(2.4 * (np.arange(len(ordered)) - np.searchsorted(ordered, ordered)))
+                _dots(axes, ordered, middle + spread, name, behind)
+        # A combination's name may break behind a +.
+        axes.set_yticks(range(len(rows)), [name.replace("+", "+\n") for name in rows])
+        axes.set(xlabel=label, ylim=(len(rows) - 0.5, -0.5))
+        axes.grid(visible=False, axis="y")
+        drawn = np.concatenate([values for groups in rows.values() for values in groups.values()])
+        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((drawn == drawn.round()).all())))
+        if len(drawn) and drawn.min() == drawn.max():
+            # A scale about one value would run in thousandths.
+            axes.set_xlim(drawn[0] - 1, drawn[0] + 1)
+
+    lines = max(1 + name.count("+") for name in rows)
+    return panel(title, draw, 0.8 + max(0.32, 0.15 * lines) * len(rows))
+
+
+def bars(title: str, counts: Mapping[str, int], group: str, label: str) -> Panel:
+    """A bar for each name, largest first."""
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+
+    def draw(axes: Axes) -> None:
+        names, lengths = [name for name, _ in ordered], [count for _, count in ordered]
+        axes.barh(names, lengths, color=colour(group), height=0.7)
+        axes.invert_yaxis()
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set(xlabel=label)
+        axes.grid(visible=False, axis="y")
+
+    return panel(title, draw, 0.8 + 0.2 * len(ordered))
+
+
+def _references_first(groups: Groups) -> list[tuple[str, Values]]:
+    return sorted(groups.items(), key=lambda item: item[0] not in REFERENCES)

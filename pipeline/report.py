@@ -1,0 +1,244 @@
+"""The report of a run: one HTML page with its counts, plots, pictures and videos, that needs nothing beside itself."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from pipeline import clips, coverage, figures, manifest, yields
+from pipeline.axes import from_json
+from pipeline.clips import Clip
+from pipeline.config import Config
+from pipeline.coverage import Coverage, Draw
+from pipeline.episode_schema import SCHEMA
+from pipeline.episodes import EpisodeLoader
+from pipeline.errors import PipelineError
+from pipeline.figures import Panel
+from pipeline.files import replaced
+from pipeline.frames import streams_of
+from pipeline.sheets import describe
+from pipeline.tasks import find_task
+from pipeline.testset import TestSet
+from pipeline.types import Floats
+from pipeline.yields import Rows, Table
+
+FILE = "report.html"
+REWRITES = 12
+"""So many are quoted."""
+
+
+class Video(NamedTuple):
+    """An episode beside its twin, and what was changed."""
+
+    axis: str
+    caption: str
+    instruction: str
+    clip: Clip
+
+
+def page(config: Config, test: TestSet) -> str:
+    """The report of a finished run.
+
+    Raises:
+        PipelineError: when the run's folder lacks what an earlier stage makes, or nothing was kept.
+    """
+    data = config.data
+    try:
+        rows: Rows = manifest.read(data / "manifest.parquet")
+        leakage = json.loads((data / "leakage.json").read_text())
+    except OSError as error:
+        raise PipelineError(
+            f"the run is not finished ({error})", where=data, remedy="run `dvc repro`, which makes it"
+        ) from error
+    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    asked = manifest.asked(rows)
+    kept = [row for row in asked if row["kept"]]
+    if not kept:
+        raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
+    actions = _actions(kept, load)
+    axes = list(dict.fromkeys(row["axis"] for row in kept))
+    sheets = _pictures(data / "sheets")
+    environment = Environment(
+        loader=PackageLoader("pipeline"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["colour"] = figures.colour
+    return environment.get_template("report.html.j2").render(
+        name=config.name,
+        headline=_headline(asked, kept),
+        yields=yields.tables(asked),
+        axes=axes,
+        overall=_overall(kept, actions),
+        by_axis=_own_motion(kept, actions),
+        lengths=_lengths(rows, kept),
+        coverage=_coverage(asked, test),
+        rewrites=_rewrites(kept),
+        leakage=leakage,
+        videos=_videos(kept, load),
+        sheets={axis: sheets[axis] for axis in axes if axis in sheets},
+        previews={folder.name: _pictures(folder) for folder in sorted((data / "previews").glob("*"))},
+        versions=_versions(rows),
+        example=min(row["episode_id"] for row in kept),
+        settings=_settings(config),
+    )
+
+
+def write(html: str, path: Path) -> None:
+    with replaced(path) as temporary:
+        temporary.write_text(html)
+
+
+def _headline(asked: Rows, kept: Rows) -> dict[str, str]:
+    steps = sum(row["steps"] for row in kept)
+    counts = {
+        "planned": len(asked),
+        "replayed": sum(bool(row["steps"]) for row in asked),
+        "kept": len(kept),
+        "twins among them": sum(row["role"] == "twin" for row in kept),
+        "tasks": len({(row["suite"], row["task"]) for row in kept}),
+        "steps": steps,
+        f"minutes at {SCHEMA.fps_hz} Hz": round(steps / SCHEMA.fps_hz / 60),
+    }
+    return {name: f"{count:,}" for name, count in counts.items()}
+
+
+def _actions(kept: Rows, load: EpisodeLoader) -> dict[str, Floats]:
+    """Episode id to its actions (T, 7); episodes of one trajectory share the array."""
+    read: dict[str, Floats] = {}
+    for row in kept:
+        if row["trajectory_id"] not in read:
+            read[row["trajectory_id"]] = load.motion(row["episode_id"])[0].astype(np.float64)
+    return {row["episode_id"]: read[row["trajectory_id"]] for row in kept}
+
+
+def _histograms(groups: Mapping[str, Floats]) -> list[Panel]:
+    """One panel for each entry of an action, from actions (N, 7) by group."""
+    low, high = SCHEMA.action.range
+    bins = np.linspace(low, high, 42)  # an odd number, so that zero has a bin of its own
+    return [
+        figures.histogram(name, {group: rows[:, entry] for group, rows in groups.items()}, bins, "action", log=True)
+        for entry, name in enumerate(SCHEMA.action.names)
+    ]
+
+
+def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id") -> Floats:
+    return np.concatenate([actions[row[key]] for row in rows])
+
+
+def _overall(kept: Rows, actions: Mapping[str, Floats]) -> list[Panel]:
+    return _histograms({axis: _stacked(rows, actions) for axis, rows in _by_axis(kept).items()})
+
+
+def _own_motion(kept: Rows, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:
+    """Axis to its actions beside those of its episodes' twins, for axes with replays of their own."""
+    by_id = {row["episode_id"]: row for row in kept}
+    shown = {}
+    for axis, rows in _by_axis(kept).items():
+        paired = [row for row in rows if row["twin_id"] in by_id]
+        if any(row["trajectory_id"] != by_id[row["twin_id"]]["trajectory_id"] for row in paired):
+            twins = _stacked(paired, actions, "twin_id")
+            shown[axis] = _histograms({"clean": twins, axis: _stacked(paired, actions)})
+    return shown
+
+
+def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
+    """Episode lengths by suite, and against the twins', whether these were kept or not."""
+    panels = []
+    for suite in dict.fromkeys(row["suite"] for row in kept):
+        of_axis = _by_axis(yields.where(kept, suite=suite)).items()
+        lengths = {axis: {axis: np.array([float(row["steps"]) for row in group])} for axis, group in of_axis}
+        panels.append(figures.strips(suite, lengths, "steps"))
+    steps = {row["episode_id"]: row["steps"] for row in rows}
+    longer = {
+        axis: {axis: np.array([row["steps"] - steps[row["twin_id"]] for row in group if steps[row["twin_id"]]])}
+        for axis, group in _by_axis(kept).items()
+        if axis != "clean"
+    }
+    return [*panels, figures.strips("longer than the twin by", longer, "steps")] if longer else panels
+
+
+def _by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault(row["axis"], []).append(row)
+    return groups
+
+
+def _coverage(asked: Rows, test: TestSet) -> dict[str, tuple[Coverage, Table]]:
+    """Axis to its coverage by kept episodes, and its yields by component and level."""
+    draws: dict[str, list[Draw]] = {}
+    rows: dict[str, list[Mapping[str, Any]]] = {}
+    for row in asked:
+        for made in from_json(row["perturbations"]):
+            rows.setdefault(made.axis, []).append(row)
+            of_axis = draws.setdefault(made.axis, [])
+            if row["kept"]:
+                resolved = json.loads(row["resolved"]).get(made.axis)
+                of_axis.append(Draw(find_task(row["suite"], row["task"]), made, resolved))
+    return {
+        axis: (coverage.of(axis, made, test), yields.by_level("kept of planned, by component", rows[axis], axis))
+        for axis, made in draws.items()
+    }
+
+
+def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
+    """Class and level, original wording and rewrite; spread over the classes."""
+    quoted: dict[str, list[tuple[str, str, str]]] = {}
+    for row in kept:
+        for made in from_json(row["perturbations"]):
+            if made.axis == "language":
+                original = find_task(row["suite"], row["task"]).instruction
+                label = f"{made.component.replace('_', ' ')}, level {made.level}"
+                quoted.setdefault(made.component, []).append((label, original, row["instruction"]))
+    dealt = [quote for together in zip_longest(*quoted.values()) for quote in together if quote is not None]
+    return dealt[:REWRITES]
+
+
+def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
+    """The strongest episode of each axis that shows it in the agent view, the shortest of several, beside its twin."""
+    by_id = {row["episode_id"]: row for row in kept}
+    videos = []
+    for axis, rows in _by_axis(kept).items():
+        seen = [row for row in rows if row["twin_id"] in by_id and _looks_different(row, by_id[row["twin_id"]])]
+        if seen:
+            row = min(seen, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
+            twin, episode = load(row["twin_id"]), load(row["episode_id"])
+            caption = "; ".join(describe(made) for made in from_json(row["perturbations"]))
+            clip = clips.beside(twin.frames["image"], episode.frames["image"])
+            videos.append(Video(axis, caption, row["instruction"], clip))
+    return videos
+
+
+def _looks_different(row: Mapping[str, Any], twin: Mapping[str, Any]) -> bool:
+    shown, clean = streams_of(row["perturbations"])["image"], streams_of(twin["perturbations"])["image"]
+    return bool(shown != clean or row["trajectory_id"] != twin["trajectory_id"])
+
+
+def _level(row: Mapping[str, Any]) -> int:
+    return max(made.level for made in from_json(row["perturbations"]))
+
+
+def _pictures(folder: Path) -> dict[str, str]:
+    return {file.stem: clips.picture_of(file) for file in sorted(folder.glob("*.png"))}
+
+
+def _versions(rows: Rows) -> dict[str, str]:
+    devices = sorted({row["gl_device"] for row in rows if row["gl_device"]})
+    seeds = sorted({str(row["seed"]) for row in rows})
+    return {**manifest.made_with(rows[0]), "rendered by": "; ".join(devices), "seed": ", ".join(seeds)}
+
+
+def _settings(config: Config) -> str:
+    # Where it is computed changes nothing, and would make the page differ.
+    chosen = config.model_dump(mode="json", exclude_defaults=True, exclude={"compute"})
+    return yaml.safe_dump(chosen, sort_keys=False)

@@ -1,0 +1,15 @@
+"""Stage report: one HTML page about the run, with its counts, plots, pictures and videos in it."""
+
+from pipeline import report, testset
+from pipeline.config import Config
+from pipeline.stage import main
+
+
+def run(config: Config) -> None:
+    file = config.data / report.FILE
+    report.write(report.page(config, testset.load()), file)
+    print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB), which opens in any browser")
+
+
+if __name__ == "__main__":
+    main(run, __doc__)

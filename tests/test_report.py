@@ -1,0 +1,252 @@
+"""The report of a run that was really made: complete, true to the manifest, in need of nothing beside itself."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import get_args
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from conftest import REPOSITORY, tiny_config
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline import clips, coverage, figures, manifest, report, testset, yields
+from pipeline.axes import AnyPerturbation, Axes, to_json
+from pipeline.config import Config, RenderConfig
+from pipeline.coverage import Draw
+from pipeline.errors import PipelineError
+from pipeline.frames import encode
+from pipeline.seeding import rng
+from pipeline.tasks import find_task
+
+LOADED = {"src", "poster", "srcset", "xlink:href", "data"}
+"""Attributes that a browser follows by itself."""
+
+LIMIT_BYTES = 15_000_000
+
+
+class Page(HTMLParser):
+    """What a page consists of."""
+
+    def __init__(self, html: str):
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.unclosed: list[str] = []
+        self.text = ""
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in ("meta", "link", "img", "br", "input"):
+            self.unclosed.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.unclosed.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += f"{data} "
+
+    def of(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+@pytest.fixture(scope="module")
+def config(finished: Path, short_demos: Path) -> Iterator[Config]:
+    """The finished run's configuration, from the folder that it was made in."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(finished.parent.parent)
+        yield Config.model_validate(tiny_config(short_demos))
+
+
+@pytest.fixture(scope="module")
+def html(config: Config) -> str:
+    return report.page(config, testset.load(REPOSITORY / testset.FOLDER))
+
+
+@pytest.fixture(scope="module")
+def page(html: str) -> Page:
+    return Page(html)
+
+
+def test_needs_nothing_beside_itself(html: str, page: Page) -> None:
+    assert not page.unclosed
+    assert not page.of("script")
+    assert not page.of("link")
+    loaded = [value for _, attributes in page.tags for name, value in attributes.items() if name in LOADED]
+    assert {value.split(":")[0] for value in loaded if not value.startswith("#")} == {"data"}
+    assert "http" not in re.sub(r"data:[a-z0-9/]+;base64,[A-Za-z0-9+/=\s]+", "", html)
+    assert not re.search(r"@import|url\((?!#)", html)
+    assert len(html) < LIMIT_BYTES
+
+
+def test_links_lead_to_sections_and_to_files_of_the_run(page: Page, finished: Path) -> None:
+    ids = {attributes["id"] for _, attributes in page.tags if "id" in attributes}
+    links = [attributes["href"] for attributes in page.of("a")]
+    assert len(links) > 8
+    for link in links:
+        assert link[1:] in ids if link.startswith("#") else (finished / link).is_file()
+
+
+def test_numbers_are_those_of_the_manifest(page: Page, finished: Path) -> None:
+    rows = manifest.read(finished / "manifest.parquet")
+    counts = json.loads((finished / "counts.json").read_text())
+    words = " ".join(page.text.split())
+    for name in ("planned", "replayed", "kept"):
+        total = sum(cell[name] for by_suite in counts.values() for cell in by_suite.values())
+        assert f" {total} {name} " in words
+    assert f" {sum(row['steps'] for row in rows if row['kept']):,} steps " in words
+    for axis, by_suite in counts.items():
+        cells = [by_suite[suite] for suite in dict.fromkeys(row["suite"] for row in rows) if suite in by_suite]
+        total = {name: sum(cell[name] for cell in cells) for name in ("planned", "kept")}
+        shown = " ".join(f"{cell['kept']}/{cell['planned']}" for cell in (*cells, total))
+        assert f"{axis} {shown}" in words
+    assert words.count("goal_not_reached") == 1
+    for finding in json.loads((finished / "leakage.json").read_text()).values():
+        assert finding["measure"] in words
+
+
+def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Page, finished: Path) -> None:
+    pictures = page.of("img")
+    assert len(pictures) == len([*finished.glob("sheets/*.png"), *finished.glob("previews/*/*.png")]) > 6
+    assert all(picture["alt"] for picture in pictures)
+    for picture in pictures:
+        assert np.std(np.asarray(Image.open(io.BytesIO(_content(picture["src"]))))) > 20
+    videos = [_content(video["src"]) for video in page.of("video")]
+    assert len(videos) == 2  # camera and noise; a rewritten instruction shows in no frame
+    assert max(map(len, videos)) <= clips.VIDEO_BYTES
+
+
+def test_a_combination_counts_with_each_of_its_axes() -> None:
+    camera, light = _draw("camera", 0), _draw("light", 0)
+    lost = {"axis": "camera", "perturbations": to_json([camera]), "kept": False}
+    kept = {"axis": "camera+light", "perturbations": to_json([camera, light]), "kept": True}
+    table = yields.by_level("", [lost, kept, kept])
+    shown = {name.text: cells for name, *cells in table.rows}
+    assert shown["camera"][camera.level - 1] == ("2/3", 2 / 3)
+    assert shown["light"][light.level - 1] == ("2/2", 1.0)
+    assert all(cell == ("-", None) for at, cell in enumerate(shown["light"], 1) if at != light.level)
+
+
+def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
+    light, dark = (_still(np.full((256, 256, 3), grey, np.uint8)) for grey in (200, 60))
+    clip = clips.beside([light] * 20, [dark] * 24 + [light] * 6)
+    frames = _video(clip)
+    assert frames.shape == (30, 256, 512, 3)
+    assert np.abs(frames[:, :, :250] - 200.0).max() < 8
+    assert np.abs(frames[:24, :, 262:] - 60.0).max() < 8
+    assert np.abs(frames[26:, :, 262:] - 200.0).max() < 8
+
+
+def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
+    noise = [_still(rng(1, frame).integers(0, 256, (256, 256, 3)).astype(np.uint8)) for frame in range(60)]
+    assert len(_content(clips.beside(noise, noise).video)) <= clips.VIDEO_BYTES
+
+
+@pytest.mark.parametrize("name", sorted(Axes.model_fields))
+def test_every_axis_has_a_picture_of_where_its_draws_lie(name: str) -> None:
+    task = find_task("libero_goal", "put_the_bowl_on_the_plate")
+    draws = [Draw(task, _draw(name, variant), None) for variant in range(30)]
+    shown = coverage.of(name, draws, testset.load(REPOSITORY / testset.FOLDER))
+    assert shown.panels
+    assert f"{len(testset.load(REPOSITORY / testset.FOLDER).of(name)):,}" in shown.note
+    for panel in shown.panels:
+        assert panel.svg.startswith("<svg")
+        assert figures.colour(name) in panel.svg or "data:image/png" in panel.svg
+        assert figures.INK not in panel.svg
+    # One with nothing kept, as of an axis whose replays all fail, is drawn as well.
+    assert len(coverage.of(name, [], testset.load(REPOSITORY / testset.FOLDER)).panels) == len(shown.panels)
+
+
+def test_noise_stands_between_the_benchmarks_severities() -> None:
+    seen: dict[str, NDArray[np.float64]] = {}
+
+    def strips(title: str, rows: dict[str, dict[str, NDArray[np.float64]]], label: str) -> figures.Panel:
+        seen.update({kind: groups["noise"] for kind, groups in rows.items()})
+        return figures.Panel(title, "")
+
+    draws = [Draw(find_task("libero_goal", "put_the_bowl_on_the_plate"), _draw("noise", n), None) for n in range(100)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(coverage, "strips", strips)
+        coverage.of("noise", draws, testset.load(REPOSITORY / testset.FOLDER))
+    assert set(seen) == {"motion", "gaussian", "zoom", "fog", "glass"}
+    for kind, severities in seen.items():
+        assert len(severities), kind
+        assert np.abs(severities - severities.round()).min() >= 0.25, kind
+
+
+def test_the_same_data_give_the_same_figure() -> None:
+    groups = {"clean": np.arange(9.0), "camera": np.arange(4.0)}
+    one, other = (figures.strips("x", {"row": groups}, "m").svg for _ in range(2))
+    assert one == other
+
+
+def test_an_unfinished_run_says_what_to_run(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PipelineError, match="dvc repro"):
+        report.page(config, testset.load(REPOSITORY / testset.FOLDER))
+
+
+def test_a_run_that_kept_nothing_is_refused(
+    config: Config, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / config.data).mkdir(parents=True)
+    table = pq.read_table(finished / "manifest.parquet")
+    lost = pa.array([False] * len(table))
+    column = table.schema.get_field_index("kept")
+    pq.write_table(table.set_column(column, "kept", lost), tmp_path / config.data / "manifest.parquet")
+    shutil.copy(finished / "leakage.json", tmp_path / config.data)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PipelineError, match="no episode was kept"):
+        report.page(config, testset.load(REPOSITORY / testset.FOLDER))
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+@pytest.mark.parametrize("width_px", [360, 1200])
+def test_a_browser_shows_it(html: str, width_px: int, tmp_path: Path) -> None:
+    report.write(html, tmp_path / "report.html")
+    picture = tmp_path / "shown.png"
+    options = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars")
+    quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
+    target = (f"--screenshot={picture}", f"--window-size={width_px},3000", f"--user-data-dir={tmp_path / 'profile'}")
+    command = ["chromium", *options, *quiet, *target, (tmp_path / "report.html").as_uri()]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    shown = np.asarray(Image.open(picture).convert("L"), float)
+    assert shown.shape == (3000, width_px)
+    # Something on every screenful, and a margin that nothing runs into.
+    assert all(screenful.std() > 5 for screenful in np.split(shown, 5))
+    assert shown[400:, -6:].std() < 25
+
+
+def _draw(name: str, variant: int) -> AnyPerturbation:
+    task = find_task("libero_goal", "put_the_bowl_on_the_plate")
+    kind = next(kind for kind in get_args(Axes.model_fields[name].annotation) if kind is not type(None))
+    perturbation: AnyPerturbation = kind().sample(rng(3, name, variant), task, variant)
+    return perturbation
+
+
+def _content(address: str) -> bytes:
+    return base64.b64decode(address.partition(",")[2])
+
+
+def _still(frame: NDArray[np.uint8]) -> bytes:
+    return encode(frame, RenderConfig())
+
+
+def _video(clip: clips.Clip) -> NDArray[np.float64]:
+    with av.open(io.BytesIO(_content(clip.video))) as file:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]).astype(float)
