@@ -26,8 +26,8 @@ from pipeline import plan, testset
 from pipeline.axes import from_json
 from pipeline.compute import runner
 from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
-from pipeline.reference import Reference
-from pipeline.replay import replay_plan
+from pipeline.physics.reference import Reference
+from pipeline.physics.replay import replay_plan
 from pipeline.store import TrajectoryStore
 from pipeline.tasks import SUITES
 from pipeline.types import Verdict

@@ -16,7 +16,7 @@ from statistics import median
 import numpy as np
 
 from pipeline.demos import StarterSource
-from pipeline.environment import Environment
+from pipeline.physics.environment import Environment
 from pipeline.tasks import select_tasks
 from pipeline.types import Demo, Floats
 

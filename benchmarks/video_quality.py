@@ -30,8 +30,8 @@ from pipeline.config import ComputeConfig, DemosConfig, RenderConfig, ReplayConf
 from pipeline.demos import DemoEntry
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import decode, encode, to_policy
+from pipeline.physics.replay import ReplayJob
 from pipeline.render import Renderer
-from pipeline.replay import ReplayJob
 from pipeline.store import TrajectoryStore
 from pipeline.types import Frame
 from pipeline.writers.video import VideoEncoder

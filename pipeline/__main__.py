@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline import doctor, inventory, testset
+from pipeline import doctor, testset
 from pipeline.axes import Axes
+from pipeline.catalogue import inventory
 from pipeline.chat import Chat
 from pipeline.compute import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
@@ -63,7 +64,7 @@ def _sources(arguments: argparse.Namespace) -> int:
 
 def _expand(arguments: argparse.Namespace) -> int:
     # The simulator reads when it is imported what renders, which commands that render find out first.
-    from pipeline.expand import expand
+    from pipeline.physics.expand import expand
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
     with runner(ComputeConfig()) as run:
@@ -77,7 +78,7 @@ def _expand(arguments: argparse.Namespace) -> int:
 
 def _check_oft(arguments: argparse.Namespace) -> int:
     # TFDS takes seconds to import, which the other commands can do without.
-    from pipeline import oft_check
+    from pipeline.validation import oft_check
 
     found = oft_check.check_run(arguments.data)
     print(json.dumps(found))
@@ -86,7 +87,7 @@ def _check_oft(arguments: argparse.Namespace) -> int:
 
 def _regenerate(arguments: argparse.Namespace) -> int:
     # Rendering starts OpenGL on import.
-    from pipeline.regenerate import regenerate
+    from pipeline.validation.regenerate import regenerate
 
     found = regenerate(arguments.episode_id, arguments.manifest, arguments.out, arguments.demos)
     print(json.dumps(found))
@@ -94,7 +95,7 @@ def _regenerate(arguments: argparse.Namespace) -> int:
 
 
 def _push(arguments: argparse.Namespace) -> int:
-    from pipeline import push
+    from pipeline.publish import push
 
     config = load(arguments.config)
     upload = push.prepare(config.data, arguments.format, config.export.lerobot.name)

@@ -17,7 +17,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline import gl, object_sources, sweethome3d, testset, texture_sources, wheels
+from pipeline import gl, testset
+from pipeline.catalogue import object_sources, sweethome3d, texture_sources, wheels
 from pipeline.errors import PipelineError
 
 REINSTALL = "rm -rf .venv && bash setup.sh"

@@ -28,11 +28,11 @@ from pipeline.axes import (
 from pipeline.compute import Run
 from pipeline.config import Config
 from pipeline.demos import Problem
-from pipeline.environment import Environment
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.frames import to_policy
+from pipeline.physics.environment import Environment
 from pipeline.render import Renderer
 from pipeline.seeding import rng
 from pipeline.sheets import Tile, describe, sheet, side_by_side

@@ -27,7 +27,7 @@ GL = gl.choose()
 
 import mujoco  # noqa: E402
 
-from pipeline.scene import proprioception  # noqa: E402
+from pipeline.physics.scene import proprioception  # noqa: E402
 
 
 class Renderer:

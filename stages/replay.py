@@ -6,7 +6,7 @@ from pipeline import plan
 from pipeline.compute import runner
 from pipeline.config import Config
 from pipeline.files import keep_only
-from pipeline.replay import replay_plan
+from pipeline.physics.replay import replay_plan
 from pipeline.stage import main
 
 

@@ -1,7 +1,8 @@
 """Stage report: one HTML page about the run, with its counts, plots, pictures and videos in it."""
 
-from pipeline import report, testset
+from pipeline import testset
 from pipeline.config import Config
+from pipeline.publish import report
 from pipeline.stage import main
 
 

@@ -6,7 +6,7 @@ from pipeline.compute import runner
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.stage import main
-from pipeline.validate import validate
+from pipeline.validation.validate import validate
 
 
 def run(config: Config) -> None:

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from conftest import MILK, STOVE, starter_demo
 
-from pipeline.environment import Environment
+from pipeline.physics.environment import Environment
 from pipeline.render import Renderer
 from pipeline.tasks import find_task
 from pipeline.types import Floats, Frame

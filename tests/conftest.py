@@ -21,8 +21,8 @@ gl.choose()
 from pipeline import hdf5, testset  # noqa: E402
 from pipeline.config import ReplayConfig  # noqa: E402
 from pipeline.demos import StarterSource  # noqa: E402
-from pipeline.environment import Environment  # noqa: E402
-from pipeline.replay import replay  # noqa: E402
+from pipeline.physics.environment import Environment  # noqa: E402
+from pipeline.physics.replay import replay  # noqa: E402
 from pipeline.tasks import find_task  # noqa: E402
 from pipeline.testset import fetch_testset  # noqa: E402
 from pipeline.types import Demo, Task, Trajectory  # noqa: E402

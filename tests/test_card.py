@@ -14,15 +14,15 @@ import yaml
 from conftest import MILK, STOVE
 from huggingface_hub import DatasetCard
 
-from pipeline import card
 from pipeline.axes import to_json
 from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
 from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
-from pipeline.card import FORMATS, Format
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.publish import card
+from pipeline.publish.card import FORMATS, Format
 from pipeline.seeding import rng
 from pipeline.types import Task
 

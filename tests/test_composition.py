@@ -15,8 +15,8 @@ from pipeline.axes.base import RefusedError
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
-from pipeline.environment import Environment
-from pipeline.scene import Compiled
+from pipeline.physics.environment import Environment
+from pipeline.physics.scene import Compiled
 from pipeline.types import Demo, Floats, Scene
 
 MOVED = PosePerturbation(component="target", level=2, moved="plate_1", dx_m=0.01, dy_m=-0.02, dyaw_deg=5)

@@ -13,10 +13,11 @@ import h5py
 import numpy as np
 import pytest
 
-from pipeline import assets, hdf5
-from pipeline.assets import relocate
+from pipeline import hdf5
 from pipeline.demos import HDF5Source, StarterSource
 from pipeline.errors import PipelineError
+from pipeline.physics import assets
+from pipeline.physics.assets import relocate
 from pipeline.tasks import find_task, select_tasks, tasks
 from pipeline.types import Floats, Task
 
@@ -32,7 +33,7 @@ FLOOR = "textures/light-gray-floor-tile.png"
 # robosuite picks its GL back end on import, once for a process: leave the choice to the tests that render.
 MAKE_SCENE = """
 import sys
-from pipeline.environment import Environment
+from pipeline.physics.environment import Environment
 from pipeline.tasks import find_task
 print(Environment(find_task(*sys.argv[1:])).place_fixtures(seed=0))
 """
@@ -147,7 +148,7 @@ def test_starter_set_refuses_unknown_ids(demo_id: str, what: str) -> None:
 
 
 def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.assets.find_spec", lambda _: None)
+    monkeypatch.setattr("pipeline.physics.assets.find_spec", lambda _: None)
     with pytest.raises(PipelineError, match="pip install robouse"):
         StarterSource().index([TASK])
 

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import doctor, gl, testset, wheels
+from pipeline import doctor, gl, testset
+from pipeline.catalogue import wheels
 from pipeline.errors import PipelineError
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import STOVE
 
-from pipeline.environment import Environment
+from pipeline.physics.environment import Environment
 from pipeline.tasks import find_task
 from pipeline.types import Task, Trajectory
 

@@ -14,9 +14,9 @@ from pipeline import testset
 from pipeline.compute import loop
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.demos import HDF5Source
-from pipeline.environment import Environment
-from pipeline.expand import APART_RAD, Expansion, expand
-from pipeline.replay import replay
+from pipeline.physics.environment import Environment
+from pipeline.physics.expand import APART_RAD, Expansion, expand
+from pipeline.physics.replay import replay
 
 TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from conftest import MILK
 
-from pipeline import inventory
 from pipeline.axes import Axes, to_json
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
-from pipeline.inventory import Attribution, attributions
+from pipeline.catalogue import inventory
+from pipeline.catalogue.inventory import Attribution, attributions
 from pipeline.seeding import rng
 
 

@@ -14,13 +14,13 @@ from conftest import PLATE, STOVE, starter_demo
 from pipeline import seeding
 from pipeline.axes.base import RefusedError
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
+from pipeline.catalogue.object_model import ObjectModel
+from pipeline.catalogue.objects import TEST_CATEGORIES, goes_with, models, taken
 from pipeline.config import ReplayConfig
-from pipeline.environment import Environment
 from pipeline.errors import PipelineError
-from pipeline.object_model import ObjectModel
-from pipeline.objects import TEST_CATEGORIES, goes_with, models, taken
-from pipeline.placement import CLEARANCE_M, path, place
-from pipeline.replay import replay
+from pipeline.physics.environment import Environment
+from pipeline.physics.placement import CLEARANCE_M, path, place
+from pipeline.physics.replay import replay
 from pipeline.tasks import tasks
 from pipeline.testset import TestSet, TestTask
 from pipeline.types import Demo, Scene

@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import object_sources, sweethome3d
 from pipeline.axes.layout import LayoutAxis
+from pipeline.catalogue import object_sources, sweethome3d
+from pipeline.catalogue.meshes import convert
+from pipeline.catalogue.object_model import ObjectModel
+from pipeline.catalogue.object_sources import Package, catalogue
+from pipeline.catalogue.objects import TEST_CATEGORIES, find, goes_with, models, taken
+from pipeline.catalogue.sources import Folder
 from pipeline.errors import PipelineError
-from pipeline.meshes import convert
-from pipeline.object_model import ObjectModel
-from pipeline.object_sources import Package, catalogue
-from pipeline.objects import TEST_CATEGORIES, find, goes_with, models, taken
 from pipeline.seeding import rng
-from pipeline.sources import Folder
 from pipeline.tasks import find_task, tasks
 
 INSTALLED = models(("libero", "robosuite"))

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import oft, oft_check, seeding, stats
+from pipeline import seeding, stats
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.types import Episode
+from pipeline.validation import oft, oft_check
 from pipeline.writers import rlds
 
 NAME = "libero_tiny"

@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes.base import RefusedError
 from pipeline.axes.pose import PoseAxis, PosePerturbation
 from pipeline.config import ReplayConfig
-from pipeline.environment import Environment
 from pipeline.errors import PipelineError
-from pipeline.replay import replay
-from pipeline.scene import Compiled
+from pipeline.physics.environment import Environment
+from pipeline.physics.replay import replay
+from pipeline.physics.scene import Compiled
 from pipeline.seeding import rng
 from pipeline.tasks import find_task, select_tasks
 from pipeline.testset import TestSet, TestTask

@@ -20,9 +20,9 @@ from pipeline.axes.base import Axis
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute import loop
 from pipeline.config import load
-from pipeline.environment import Environment
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import decode, streams_of
+from pipeline.physics.environment import Environment
 from pipeline.render import render
 from pipeline.types import Demo, Frame, Scene, Task, Trajectory, Verdict
 

@@ -20,10 +20,10 @@ import pytest
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from test_writers import IDS, episode, loop, write_lerobot
 
-from pipeline.card import REPORTS, Format
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.push import Upload, prepare, send
+from pipeline.publish.card import REPORTS, Format
+from pipeline.publish.push import Upload, prepare, send
 from pipeline.writers import lerobot, rlds
 
 NAME, REPOSITORY = "tiny", "somebody/tiny"

@@ -20,9 +20,9 @@ import yaml
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_writers import REPO, write_lerobot
 
-from pipeline import recipe
 from pipeline.errors import PipelineError
-from pipeline.templates.lerobot_v3 import LeRobotV3
+from pipeline.publish import recipe
+from pipeline.publish.templates.lerobot_v3 import LeRobotV3
 
 NAME = "libero_tiny"
 SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}

@@ -17,8 +17,8 @@ from conftest import PLATE, REPOSITORY
 
 from pipeline import manifest
 from pipeline.errors import PipelineError
-from pipeline.regenerate import regenerate
-from pipeline.shards import checksum, records
+from pipeline.validation.regenerate import regenerate
+from pipeline.validation.shards import checksum, records
 
 
 def perturbed(data: Path) -> dict[str, Any]:

@@ -19,8 +19,8 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import Stream, decode, encode, streams_of, to_policy
+from pipeline.physics.scene import proprioception
 from pipeline.render import Renderer, render
-from pipeline.scene import proprioception
 from pipeline.seeding import rng
 from pipeline.store import FrameStore
 from pipeline.types import Frame, Task, Trajectory

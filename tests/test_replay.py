@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 from pipeline.config import ReplayConfig
 from pipeline.demos import HDF5Source
-from pipeline.environment import Environment
 from pipeline.errors import PipelineError
-from pipeline.judge import verdict
-from pipeline.replay import NOOP_NORM, kept_actions, replay
+from pipeline.physics.environment import Environment
+from pipeline.physics.judge import verdict
+from pipeline.physics.replay import NOOP_NORM, kept_actions, replay
 from pipeline.types import Floats, Task, Trajectory
 
 ACTIONS = st.lists(st.tuples(st.sampled_from([0.0, 5e-5, 0.3]), st.sampled_from([-1.0, 1.0])), min_size=1, max_size=30)

@@ -22,12 +22,13 @@ from conftest import REPOSITORY, tiny_config
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline import clips, coverage, figures, manifest, report, testset, yields
+from pipeline import manifest, testset
 from pipeline.axes import AnyPerturbation, Axes, to_json
 from pipeline.config import Config, RenderConfig
-from pipeline.coverage import Draw
 from pipeline.errors import PipelineError
 from pipeline.frames import encode
+from pipeline.publish import clips, coverage, figures, report, yields
+from pipeline.publish.coverage import Draw
 from pipeline.seeding import rng
 from pipeline.tasks import find_task
 

@@ -11,9 +11,9 @@ from conftest import MILK, PLATE, starter_demo
 from pipeline.axes.base import RefusedError
 from pipeline.axes.robot import HOME_RAD, RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
-from pipeline.environment import Environment
-from pipeline.replay import replay
-from pipeline.scene import Compiled
+from pipeline.physics.environment import Environment
+from pipeline.physics.replay import replay
+from pipeline.physics.scene import Compiled
 from pipeline.seeding import rng
 from pipeline.testset import TestSet, TestTask
 from pipeline.types import Floats, Scene

@@ -22,7 +22,7 @@ from conftest import REPOSITORY, STAGES, STOVE, dvc, link_testset, run_stages, t
 from PIL import Image
 from test_writers import records
 
-from pipeline import manifest, oft_check, plan
+from pipeline import manifest, plan
 from pipeline.axes import from_json
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
@@ -30,6 +30,7 @@ from pipeline.episodes import EpisodeLoader
 from pipeline.frames import decode
 from pipeline.render import Renderer
 from pipeline.store import TrajectoryStore
+from pipeline.validation import oft_check
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import MILK, PLATE, STOVE, starter_demo
 
-from pipeline.environment import Environment
+from pipeline.physics.environment import Environment
 from pipeline.tasks import find_task
 from pipeline.types import Floats, Task, Trajectory
 

@@ -18,12 +18,12 @@ from conftest import REPOSITORY
 from libero.libero import get_libero_path
 from numpy.typing import NDArray
 
-from pipeline import procedural, texture_sources, textures
+from pipeline.catalogue import procedural, texture_sources, textures
+from pipeline.catalogue.sources import Folder
+from pipeline.catalogue.texture_sources import Package, Texture, from_file
+from pipeline.catalogue.textures import catalogue, find, pixels, refusal
+from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
-from pipeline.sources import Folder
-from pipeline.texture_sources import Package, Texture, from_file
-from pipeline.textures import catalogue, find, pixels, refusal
-from pipeline.wheels import Wheel
 
 OFFLINE = catalogue(("libero", "robosuite", "procedural"))
 LIBERO = Path(get_libero_path("assets")) / "textures"

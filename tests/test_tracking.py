@@ -15,11 +15,11 @@ from pipeline.axes.base import PhysicsPerturbation, RefusedError
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
-from pipeline.environment import Environment
-from pipeline.reference import Reference
-from pipeline.replay import replay
+from pipeline.physics.environment import Environment
+from pipeline.physics.reference import Reference
+from pipeline.physics.replay import replay
+from pipeline.physics.tracking import GAIN, PATIENCE, STRIDE, Hand, Route, follow
 from pipeline.seeding import rng
-from pipeline.tracking import GAIN, PATIENCE, STRIDE, Hand, Route, follow
 from pipeline.types import Demo, Floats, Task, Trajectory
 
 AUTO = ReplayConfig(mode="auto")

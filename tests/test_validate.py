@@ -17,16 +17,16 @@ import pytest
 from conftest import MILK, PLATE, STOVE, run_stages, tiny_config
 
 from pipeline import manifest
-from pipeline.checks import CHECKS, Case, Finding
 from pipeline.compute import loop
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.episodes import EpisodeLoader
 from pipeline.frames import decode, encode
-from pipeline.readback import Copy
-from pipeline.shards import METADATA, columns, records
 from pipeline.types import Episode, Task, Trajectory
-from pipeline.validate import validate
+from pipeline.validation.checks import CHECKS, Case, Finding
+from pipeline.validation.readback import Copy
+from pipeline.validation.shards import METADATA, columns, records
+from pipeline.validation.validate import validate
 from pipeline.writers import rlds, video
 
 Tree = dict[str, Any]
@@ -246,7 +246,7 @@ def test_what_is_missing_or_cannot_be_read_is_a_finding(
     *others, _ = records(short)
     short.write_bytes(b"".join(map(rlds._record, others)))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pipeline.validate.witnesses", lambda rows: [])  # Tested above, and slow.
+    monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])  # Tested above, and slow.
     report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
     told = [(finding["dataset"], finding["what"]) for finding in report["readable"]["findings"]]
     assert [dataset for dataset, _ in told] == ["lerobot", "rlds", "rlds"]

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import wheels
+from pipeline.catalogue import wheels
+from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
-from pipeline.wheels import Wheel
 
 
 @pytest.fixture

@@ -14,10 +14,10 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from pipeline import textures
 from pipeline.axes.base import Axis, Frozen, Nearest, RenderPerturbation
+from pipeline.catalogue import textures
+from pipeline.catalogue.texture_sources import Source, Texture
 from pipeline.errors import PipelineError
-from pipeline.texture_sources import Source, Texture
 from pipeline.types import Frame, Task
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Covering(Frozen):
 
     Attributes:
         part: where; a part that the scene lacks is passed over.
-        texture: name in the sources of :mod:`pipeline.textures`.
+        texture: name in the sources of :mod:`pipeline.catalogue.textures`.
         licence: as the texture's source states it.
         sha256: of the texture.
         quarter_turns: how often it is turned by 90 degrees, counter-clockwise.

@@ -10,10 +10,10 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.axes.base import Axis, Frozen, Nearest, PhysicsPerturbation
+from pipeline.catalogue.object_model import ObjectModel
+from pipeline.catalogue.object_sources import Source
+from pipeline.catalogue.objects import find, goes_with, models, taken
 from pipeline.errors import PipelineError
-from pipeline.object_model import ObjectModel
-from pipeline.object_sources import Source
-from pipeline.objects import find, goes_with, models, taken
 from pipeline.types import Demo, Scene, Task
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class AddedObject(Frozen):
-    """An object of ``pipeline.objects``, by name and content.
+    """An object of ``pipeline.catalogue.objects``, by name and content.
 
     Attributes:
         licence, attribution: what it may be shown under and who made it, so that they go where the data goes.
@@ -52,7 +52,7 @@ class LayoutPerturbation(PhysicsPerturbation):
 
     def apply(self, scene: Scene, demo: Demo) -> Scene:
         # Drawing a plan must not load the simulator.
-        from pipeline.placement import place
+        from pipeline.physics.placement import place
 
         return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed)
 

@@ -18,7 +18,7 @@ from pipeline.errors import PipelineError
 from pipeline.types import Demo, Floats, Scene, Task
 
 if TYPE_CHECKING:
-    from pipeline.scene import Compiled
+    from pipeline.physics.scene import Compiled
     from pipeline.testset import TestSet
 
 SETTLE_S = 0.3
@@ -72,7 +72,7 @@ class PosePerturbation(PhysicsPerturbation):
                 that the instruction names; ``object_in_collision`` when it touches something else;
                 ``object_unstable`` when it slides or tilts more than the recorded one.
         """
-        from pipeline.scene import Compiled
+        from pipeline.physics.scene import Compiled
 
         compiled = Compiled(scene)
         then = _settle(compiled, self.moved)

@@ -50,7 +50,7 @@ class RobotPerturbation(PhysicsPerturbation):
                 touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add up
                 to a posture of the test set.
         """
-        from pipeline.scene import Compiled
+        from pipeline.physics.scene import Compiled
 
         compiled = Compiled(scene)
         data, model = compiled.data, compiled.model

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.axes.base import RefusedError
-from pipeline.reference import Mask, Reference
+from pipeline.physics.reference import Mask, Reference
 from pipeline.types import Floats
 
 OUTPUT_MAX = np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5])

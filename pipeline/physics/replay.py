@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from pipeline.axes import PhysicsPerturbation, RefusedError, from_json, of_layer
 from pipeline.compute import Run
 from pipeline.config import DemosConfig, ReplayConfig
-from pipeline.environment import Environment, shared
-from pipeline.judge import verdict
+from pipeline.physics.environment import Environment, shared
+from pipeline.physics.judge import verdict
+from pipeline.physics.reference import Reference
+from pipeline.physics.tracking import Route, follow
 from pipeline.plan import Row, pending
-from pipeline.reference import Reference
 from pipeline.store import TrajectoryStore
-from pipeline.tracking import Route, follow
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
 
 NOOP_NORM = 1e-4

@@ -21,9 +21,9 @@ from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.compute import Run
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
-from pipeline.reference import Reference
-from pipeline.replay import replay_plan
-from pipeline.scene import Compiled, proprioception
+from pipeline.physics.reference import Reference
+from pipeline.physics.replay import replay_plan
+from pipeline.physics.scene import Compiled, proprioception
 from pipeline.store import TrajectoryStore
 from pipeline.testset import TestSet
 from pipeline.types import Floats, Scene, Trajectory

@@ -21,11 +21,11 @@ from pipeline.config import DemosConfig
 from pipeline.episodes import EpisodeLoader
 from pipeline.errors import PipelineError
 from pipeline.frames import streams_of
+from pipeline.physics.replay import ReplayJob
 from pipeline.render import GL, RenderJob
-from pipeline.replay import ReplayJob
-from pipeline.shards import METADATA, columns, records
 from pipeline.store import FrameStore
 from pipeline.types import Verdict
+from pipeline.validation.shards import METADATA, columns, records
 from pipeline.versions import versions
 from pipeline.writers import rlds
 

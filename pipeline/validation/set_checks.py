@@ -11,10 +11,11 @@ from typing import Any
 import av
 import tensorflow_datasets as tfds
 
-from pipeline import manifest, oft_check, plan
-from pipeline.checks import Finding
+from pipeline import manifest, plan
 from pipeline.episode_schema import SCHEMA
-from pipeline.readback import LeRobotSet
+from pipeline.validation import oft_check
+from pipeline.validation.checks import Finding
+from pipeline.validation.readback import LeRobotSet
 from pipeline.writers import lerobot, rlds
 
 Row = Mapping[str, Any]

@@ -18,7 +18,7 @@ from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
-from pipeline.figures import Panel, bars, histogram, scatter, strips
+from pipeline.publish.figures import Panel, bars, histogram, scatter, strips
 from pipeline.tasks import find_task
 from pipeline.testset import TestSet
 from pipeline.types import Floats, Task

@@ -17,17 +17,18 @@ from typing import Any
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline import manifest, oft, set_checks
-from pipeline.checks import CHECKS, Case, Finding
+from pipeline import manifest
 from pipeline.compute import Run
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.episodes import EpisodeLoader
 from pipeline.errors import PipelineError
-from pipeline.readback import UNREADABLE, Copy, LeRobotSet, from_lerobot, from_rlds, open_lerobot
-from pipeline.shards import METADATA, columns, records
 from pipeline.store import TrajectoryStore
-from pipeline.witness import rendered, witnesses
+from pipeline.validation import oft, set_checks
+from pipeline.validation.checks import CHECKS, Case, Finding
+from pipeline.validation.readback import UNREADABLE, Copy, LeRobotSet, from_lerobot, from_rlds, open_lerobot
+from pipeline.validation.shards import METADATA, columns, records
+from pipeline.validation.witness import rendered, witnesses
 from pipeline.writers import rlds
 
 

@@ -20,8 +20,8 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, co
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError, XetError
 
 from pipeline import manifest
-from pipeline.card import REPORTS, REPOSITORY, Format
 from pipeline.errors import PipelineError
+from pipeline.publish.card import REPORTS, REPOSITORY, Format
 from pipeline.writers.rlds import VERSION
 
 SCRIPTS = {".py", ".yaml", ".json"}

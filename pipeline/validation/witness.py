@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
-from pipeline.checks import Case, Finding, psnr_db
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import streams_of
 from pipeline.render import Renderer
 from pipeline.types import Frame, Trajectory
+from pipeline.validation.checks import Case, Finding, psnr_db
 
 PSNR_DB = 25.0
 """Least PSNR of a first frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""

@@ -16,9 +16,9 @@ from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import decode
-from pipeline.readback import Copy, sampled
 from pipeline.tasks import find_task
 from pipeline.types import Episode, Frame, Trajectory
+from pipeline.validation.readback import Copy, sampled
 
 VIDEO_PSNR_DB = 32.0
 """Least PSNR of a video's frame to the stored JPEG; the least of 294 frames under five axes was 35 dB."""

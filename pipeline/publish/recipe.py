@@ -19,7 +19,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 
-SCHEMA_FILE = Path(__file__).parent.parent / "schemas" / "finetune.json"
+SCHEMA_FILE = Path(__file__).parents[2] / "schemas" / "finetune.json"
 TEMPLATES = Path(__file__).parent / "templates"
 COPIED = ("run_openvla_oft.py", "run_openpi.py", "lerobot_v3.py")
 

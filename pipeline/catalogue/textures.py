@@ -8,9 +8,9 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import get_args
 
+from pipeline.catalogue.sources import Folder
+from pipeline.catalogue.texture_sources import Package, Source, Texture, from_file, libero_images, offered
 from pipeline.errors import PipelineError
-from pipeline.sources import Folder
-from pipeline.texture_sources import Package, Source, Texture, from_file, libero_images, offered
 from pipeline.types import Frame
 
 IN_TEST_SET = frozenset(

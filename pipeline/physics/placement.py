@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from pipeline import bddl, seeding
 from pipeline.axes.base import RefusedError
-from pipeline.course import Course
-from pipeline.environment import shared
-from pipeline.object_model import ObjectModel
-from pipeline.replay import kept_actions
+from pipeline.catalogue.object_model import ObjectModel
+from pipeline.physics.course import Course
+from pipeline.physics.environment import shared
+from pipeline.physics.replay import kept_actions
 from pipeline.types import Demo, Floats, Scene, Task
 
 SCENES, DRAWS = 12, 80

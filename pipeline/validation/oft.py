@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline import stats
 from pipeline.errors import PipelineError
-from pipeline.shards import METADATA, columns, records
+from pipeline.validation.shards import METADATA, columns, records
 
 CHUNK = 8
 """Actions that OFT predicts at once on LIBERO: the current one and seven to come."""

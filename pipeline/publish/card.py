@@ -18,10 +18,10 @@ from huggingface_hub import DatasetCardData
 from pipeline import manifest
 from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Level, Perturbation
+from pipeline.catalogue.inventory import attributions
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.inventory import attributions
 from pipeline.writers.rlds import VERSION
 
 Format = Literal["rlds", "lerobot"]

@@ -18,12 +18,13 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from pipeline import procedural, seeding, wheels
-from pipeline.assets import package_folder
+from pipeline import seeding
+from pipeline.catalogue import procedural, wheels
+from pipeline.catalogue.sources import Folder
+from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
-from pipeline.sources import Folder
+from pipeline.physics.assets import package_folder
 from pipeline.types import Frame
-from pipeline.wheels import Wheel
 
 Package = Literal["libero", "robosuite", "procedural", "metaworld", "gymnasium-robotics"]
 Source = Package | Folder

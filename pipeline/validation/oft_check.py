@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from pipeline import oft, stats
+from pipeline import stats
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.validation import oft
 
 SAME = 1e-9
 """Largest difference between statistics read back and those stored; both are computed in double precision."""

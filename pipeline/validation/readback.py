@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.frames import decode
-from pipeline.shards import METADATA
 from pipeline.types import Frame
+from pipeline.validation.shards import METADATA
 from pipeline.writers.lerobot import local_only
 
 UNREADABLE = (

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline.scene import Compiled
+from pipeline.physics.scene import Compiled
 from pipeline.types import Floats, Scene
 
 Mask = NDArray[np.bool_]

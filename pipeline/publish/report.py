@@ -12,22 +12,23 @@ import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from pipeline import clips, coverage, figures, manifest, yields
+from pipeline import manifest
 from pipeline.axes import from_json
-from pipeline.clips import Clip
 from pipeline.config import Config
-from pipeline.coverage import Coverage, Draw
 from pipeline.episode_schema import SCHEMA
 from pipeline.episodes import EpisodeLoader
 from pipeline.errors import PipelineError
-from pipeline.figures import Panel
 from pipeline.files import replaced
 from pipeline.frames import streams_of
+from pipeline.publish import clips, coverage, figures, yields
+from pipeline.publish.clips import Clip
+from pipeline.publish.coverage import Coverage, Draw
+from pipeline.publish.figures import Panel
+from pipeline.publish.yields import Rows, Table
 from pipeline.sheets import describe
 from pipeline.tasks import find_task
 from pipeline.testset import TestSet
 from pipeline.types import Floats
-from pipeline.yields import Rows, Table
 
 FILE = "report.html"
 REWRITES = 12
@@ -66,7 +67,7 @@ def page(config: Config, test: TestSet) -> str:
     axes = list(dict.fromkeys(row["axis"] for row in kept))
     sheets = _pictures(data / "sheets")
     environment = Environment(
-        loader=PackageLoader("pipeline"),
+        loader=PackageLoader("pipeline.publish"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -25,22 +25,22 @@ from libero.libero import get_libero_path
 from rich.console import Console
 from rich.progress import track
 
-from pipeline import sweethome3d
-from pipeline.assets import package_folder
+from pipeline.catalogue import sweethome3d
+from pipeline.catalogue.meshes import RECIPE, convert
+from pipeline.catalogue.object_model import ObjectModel
+from pipeline.catalogue.sources import Folder
+from pipeline.catalogue.sweethome3d import Piece
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.meshes import RECIPE, convert
-from pipeline.object_model import ObjectModel
+from pipeline.physics.assets import package_folder
 from pipeline.seeding import digest
-from pipeline.sources import Folder
-from pipeline.sweethome3d import Piece
 
 Package = Literal["libero", "robosuite", "sweethome3d"]
 Source = Package | Folder
 
 FOLDER = Path("data/objects")
 """Where converted models lie, one folder each: ``<source>/<name>/model.xml`` and ``about.json``."""
-CATALOGUE = Path(__file__).parent / "axes" / "layout_objects.yaml"
+CATALOGUE = Path(__file__).with_name("objects.yaml")
 
 LARGEST_M = 0.5
 """What a user's model may measure in any direction: a larger one is not in metres, or of no use on a table."""

@@ -6,9 +6,9 @@ import re
 from functools import cache
 
 from pipeline import bddl
+from pipeline.catalogue.object_model import ObjectModel
+from pipeline.catalogue.object_sources import Source, catalogue, converted, offered
 from pipeline.errors import PipelineError
-from pipeline.object_model import ObjectModel
-from pipeline.object_sources import Source, catalogue, converted, offered
 from pipeline.types import Task
 
 TEST_CATEGORIES = frozenset(

@@ -9,8 +9,8 @@ from typing import NamedTuple
 from pipeline.axes import Axes, from_json
 from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
-from pipeline.objects import models
-from pipeline.textures import catalogue
+from pipeline.catalogue.objects import models
+from pipeline.catalogue.textures import catalogue
 
 
 class Attribution(NamedTuple):

@@ -1,0 +1,1 @@
+"""Scenes, LIBERO's environment around them, and replaying demonstrations in it."""
