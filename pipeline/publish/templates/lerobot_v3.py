@@ -29,6 +29,8 @@ class LeRobotV3:
 
     def __init__(self, root: Path, horizon: int) -> None:
         info = json.loads((root / "meta" / "info.json").read_text())
+        if info["features"][VIEWS["image"]]["dtype"] != "video":
+            raise ValueError(f"{root} has images; export it with export.lerobot.frames: video")
         columns = ["episode_index", "frame_index", "task_index", *VECTORS.values()]
         table = pq.read_table(root / "data", columns=columns)
         tasks = pq.read_table(root / "meta" / "tasks.parquet").to_pylist()
