@@ -17,8 +17,8 @@ import numpy as np
 import yaml
 
 from pipeline import hdf5
+from pipeline.assets import package_folder, relocate
 from pipeline.errors import PipelineError
-from pipeline.physics.assets import package_folder, relocate
 from pipeline.tasks import SUITES, find_task, tasks
 from pipeline.types import Demo, Floats, Task
 

@@ -12,12 +12,12 @@ from arenas import TASKS, change, changed, checksums, frames, renderer
 from conftest import MILK, REPOSITORY
 
 from pipeline import testset
+from pipeline.assets import package_folder
 from pipeline.axes import RenderPerturbation
 from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering, skin_of
 from pipeline.axes.base import Level
 from pipeline.catalogue.textures import IN_TEST_SET, catalogue
 from pipeline.errors import PipelineError
-from pipeline.physics.assets import package_folder
 from pipeline.render import Renderer
 from pipeline.seeding import rng
 from pipeline.testset import TestSet, TestTask

@@ -13,11 +13,10 @@ import h5py
 import numpy as np
 import pytest
 
-from pipeline import hdf5
+from pipeline import assets, hdf5
+from pipeline.assets import relocate
 from pipeline.demos import HDF5Source, StarterSource
 from pipeline.errors import PipelineError
-from pipeline.physics import assets
-from pipeline.physics.assets import relocate
 from pipeline.tasks import find_task, select_tasks, tasks
 from pipeline.types import Floats, Task
 
@@ -148,7 +147,7 @@ def test_starter_set_refuses_unknown_ids(demo_id: str, what: str) -> None:
 
 
 def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.physics.assets.find_spec", lambda _: None)
+    monkeypatch.setattr("pipeline.assets.find_spec", lambda _: None)
     with pytest.raises(PipelineError, match="pip install robouse"):
         StarterSource().index([TASK])
 

@@ -150,7 +150,8 @@ def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
     found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp")}
     of = np.array(table["episode_index"])
     found["action"][np.flatnonzero(of == index[CHANGED])[3], 0] += 0.001
-    found["timestamp"][of == index[LATE]] += np.float32(1 / SCHEMA.fps_hz)
+    # All but the last: there may be no frame behind that.
+    found["timestamp"][np.flatnonzero(of == index[LATE])[:-1]] += np.float32(1 / SCHEMA.fps_hz)
     for name, values in found.items():
         place = table.schema.get_field_index(name)
         table = table.set_column(place, table.schema.field(name), pa.array(list(values), table.schema.field(name).type))
