@@ -28,7 +28,7 @@ from pipeline.store import TrajectoryStore
 from pipeline.testset import TestSet
 from pipeline.types import Floats, Scene, Trajectory
 
-RESERVE = 1.0
+RESERVE = 2.0
 """Candidates drawn beyond those wanted, as a share: poses that collide are refused, and not every replay succeeds."""
 
 ROUGH = {"steps": 1.5, "path_m": 1.5, "jerk": 2.0}
