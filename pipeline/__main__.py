@@ -63,7 +63,7 @@ def _sources(arguments: argparse.Namespace) -> int:
 
 
 def _expand(arguments: argparse.Namespace) -> int:
-    # The simulator reads when it is imported what renders, which commands that render find out first.
+    # The simulator takes seconds to import, which the other commands can do without.
     from pipeline.physics.expand import expand
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))

@@ -133,6 +133,11 @@ def made_with(row: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
+def rlds_dataset(row: Mapping[str, Any]) -> str:
+    """Name of the RLDS dataset that holds a kept episode: what its shard's name begins with."""
+    return str(row["rlds_shard"]).partition("-")[0]
+
+
 def asked(manifest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """The rows that were tried: all but the reserves that were not needed."""
     return [row for row in manifest if row["reason"] != "reserve_not_needed"]

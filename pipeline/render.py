@@ -18,6 +18,7 @@ from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.episodes import rejected, verdicts
 from pipeline.frames import Stream, encode, streams_of, to_policy
+from pipeline.physics.scene import proprioception
 from pipeline.plan import Row, select
 from pipeline.store import FrameStore, Rendered, TrajectoryStore
 from pipeline.types import Frame, Trajectory
@@ -26,8 +27,6 @@ GL = gl.choose()
 """What renders in this process; chosen here because MuJoCo reads the choice when it is imported."""
 
 import mujoco  # noqa: E402
-
-from pipeline.physics.scene import proprioception  # noqa: E402
 
 
 class Renderer:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import served
 
 from pipeline.errors import PipelineError
 from pipeline.fetch import REPOSITORY, fetch
@@ -93,12 +93,8 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     for suite in ("libero_goal", "libero_object"):
         for task in tasks(suite):
             hub.files[f"{suite}/{task.name}_demo.hdf5"] = rng.bytes(50_000)
-    thread = threading.Thread(target=hub.server.serve_forever, args=(0.01,))
-    thread.start()
-    yield hub
-    hub.server.shutdown()
-    hub.server.server_close()
-    thread.join()
+    with served(hub.server):
+        yield hub
 
 
 def test_fetches_the_suites_asked_for(hub: Hub, tmp_path: Path) -> None:

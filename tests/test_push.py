@@ -17,6 +17,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from conftest import served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from test_writers import IDS, episode, loop, write_lerobot
 
@@ -197,12 +198,8 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     # A broken transfer is tried again five times, after 23 s in all.
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)
     hub = Hub()
-    thread = threading.Thread(target=hub.server.serve_forever, args=(0.01,))
-    thread.start()
-    yield hub
-    hub.server.shutdown()
-    hub.server.server_close()
-    thread.join()
+    with served(hub.server):
+        yield hub
 
 
 @pytest.fixture(scope="module")

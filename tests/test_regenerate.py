@@ -18,7 +18,8 @@ from conftest import PLATE, REPOSITORY
 from pipeline import manifest
 from pipeline.errors import PipelineError
 from pipeline.validation.regenerate import regenerate
-from pipeline.validation.shards import checksum, records
+from pipeline.validation.shards import records
+from pipeline.writers.rlds import checksum
 
 
 def perturbed(data: Path) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -12,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from conftest import served
 
 from pipeline import __main__ as command_line
 from pipeline import chat, rewrite
@@ -99,13 +99,10 @@ class Handler(BaseHTTPRequestHandler):
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
     monkeypatch.delenv("OPENAI_API_KEY", raising=False)
     monkeypatch.setenv("no_proxy", "127.0.0.1")
-    with Server(("127.0.0.1", 0), Handler) as serving:
-        serving.replies, serving.asked, serving.headers = [], [], []
-        thread = threading.Thread(target=serving.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        yield serving
-        serving.shutdown()
-        thread.join()
+    server = Server(("127.0.0.1", 0), Handler)
+    server.replies, server.asked, server.headers = [], [], []
+    with served(server):
+        yield server
 
 
 def ask(server: Server) -> Chat:

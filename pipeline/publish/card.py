@@ -17,19 +17,16 @@ from huggingface_hub import DatasetCardData
 
 from pipeline import manifest
 from pipeline.axes import from_json
-from pipeline.axes.base import Layer, Level, Perturbation
+from pipeline.axes.base import Layer, Perturbation
 from pipeline.catalogue.inventory import attributions
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.publish.yields import LEVELS
 from pipeline.writers.rlds import VERSION
 
 Format = Literal["rlds", "lerobot"]
 FORMATS: tuple[Format, ...] = get_args(Format)
-
-LEVELS: tuple[Level, ...] = get_args(Level)
-
-TEMPLATES = Path(__file__).parent / "templates"
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """What the card tells from, beside the manifest; in the run's folder."""
@@ -95,7 +92,7 @@ def render(
     free = all(FREE.match(one.licence) for one in owed)
     axes = _axes(kept, kind)
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
+        loader=jinja2.PackageLoader("pipeline.publish"),
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -109,8 +106,7 @@ def render(
         kept=kept,
         origins=Counter({row["demo_id"]: row["demo_origin"] for row in kept}.values()),
         steps=sum(row["steps"] for row in kept),
-        # Shards begin with the name of their dataset; there is one for each suite, or one for all.
-        datasets=sorted({row["rlds_shard"].partition("-")[0] for row in kept}),
+        datasets=sorted({manifest.rlds_dataset(row) for row in kept}),
         version=VERSION,
         episodes=_episodes(rows),
         levels=table(

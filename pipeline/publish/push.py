@@ -134,9 +134,9 @@ def _content(path: str, file: Path, repository: str) -> Path | bytes:
 
 def _rlds(data: Path) -> tuple[dict[str, Path], None]:
     """The shards that the manifest names and what TFDS needs beside them, at the place where ``finetune/`` looks."""
-    shards = {row["rlds_shard"] for row in manifest.read(_there(data / "manifest.parquet")) if row["kept"]}
-    folders = {f"{shard.partition('-')[0]}/{VERSION}" for shard in shards}
-    wanted = {f"{shard.partition('-')[0]}/{VERSION}/{shard}" for shard in shards}
+    kept = [row for row in manifest.read(_there(data / "manifest.parquet")) if row["kept"]]
+    folders = {f"{manifest.rlds_dataset(row)}/{VERSION}" for row in kept}
+    wanted = {f"{manifest.rlds_dataset(row)}/{VERSION}/{row['rlds_shard']}" for row in kept}
     wanted |= {f"{folder}/{name}" for folder in folders for name in ("dataset_info.json", "features.json")}
     return {f"rlds/{path}": file for path, file in _exactly(data / "rlds", wanted).items()}, None
 

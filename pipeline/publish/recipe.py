@@ -18,6 +18,7 @@ from pipeline import stats
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.manifest import rlds_dataset
 
 SCHEMA_FILE = Path(__file__).parents[2] / "schemas" / "finetune.json"
 TEMPLATES = Path(__file__).parent / "templates"
@@ -85,7 +86,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, 
     kept = [row for row in rows if row["kept"]]
     if not kept:
         raise PipelineError("no episode was kept", where=manifest_file, remedy="read its column reason")
-    suites = {row["suite"]: _dataset(row["rlds_shard"]) for row in kept}
+    suites = {row["suite"]: rlds_dataset(row) for row in kept}
     counts: dict[str, dict[str, int]] = {}
     for row in kept:
         by_axis = counts.setdefault(row["suite"], {})
@@ -158,11 +159,6 @@ def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
 
 
 _Dumper.add_representer(str, _text)
-
-
-def _dataset(shard: str) -> str:
-    """Name of the RLDS dataset that a shard belongs to, which its file name begins with."""
-    return shard.rsplit("-", maxsplit=4)[0]
 
 
 def _clients(name: str, lerobot: str) -> dict[str, dict[str, str]]:

@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import google_crc32c
 import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
+from pipeline.writers.rlds import checksum
 
 METADATA = "episode_metadata/"
 """What the names of columns with one value for the whole episode begin with."""
@@ -56,12 +56,6 @@ def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:
             f"a record has no feature {error}", expected="what features.json names", remedy="write the dataset again"
         ) from error
     return dict(_flat(example["steps"])) | dict(_flat(example["episode_metadata"], METADATA))
-
-
-def checksum(data: bytes) -> bytes:
-    """TFRecord's masked CRC-32C (``tensorflow/core/lib/io/record_writer.h``)."""
-    crc = google_crc32c.value(data)
-    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
 
 
 def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, NDArray[Any]]]:

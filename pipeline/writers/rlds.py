@@ -223,11 +223,12 @@ def _tree(episode: Episode) -> dict[str, Any]:
 
 
 def _record(data: bytes) -> bytes:
-    """One TFRecord: length, its checksum, data, its checksum (``tensorflow/core/lib/io/record_writer.h``)."""
+    """One TFRecord: length, its checksum, data, its checksum."""
     length = struct.pack("<Q", len(data))
-    return b"".join((length, _masked_crc(length), data, _masked_crc(data)))
+    return b"".join((length, checksum(length), data, checksum(data)))
 
 
-def _masked_crc(data: bytes) -> bytes:
+def checksum(data: bytes) -> bytes:
+    """TFRecord's masked CRC-32C (``tensorflow/core/lib/io/record_writer.h``)."""
     crc = google_crc32c.value(data)
     return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
