@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pipeline import leakage, plan, testset
 from pipeline.config import DemosConfig, load
+from pipeline.run import leakage, plan
+from pipeline.testset import benchmark
 
 
 def main() -> None:
@@ -29,7 +30,7 @@ def main() -> None:
         with timed("index"):
             entries = DemosConfig().index().entries
         with timed("testset"):
-            test = testset.load()
+            test = benchmark.load()
         with timed("draw"):
             rows = plan.make(entries, config.plan, config.replay, test)
         with timed("write"):

@@ -22,14 +22,15 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from pipeline import plan, testset
 from pipeline.axes import from_json
-from pipeline.compute import runner
 from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
+from pipeline.libero.tasks import SUITES
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay_plan
-from pipeline.store import TrajectoryStore
-from pipeline.tasks import SUITES
+from pipeline.run import plan
+from pipeline.run.compute import runner
+from pipeline.run.stores import TrajectoryStore
+from pipeline.testset import benchmark
 from pipeline.types import Verdict
 
 AXES = ("robot", "pose", "layout")
@@ -48,7 +49,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path)
     arguments = parser.parse_args()
     demos = DemosConfig(tasks=tuple(arguments.tasks))
-    entries, test = demos.index().entries, testset.load()
+    entries, test = demos.index().entries, benchmark.load()
     rows: dict[str, plan.Row] = {}
     for axis, level in product(arguments.axes, arguments.levels):
         episodes = {axis: len(entries) * arguments.draws}

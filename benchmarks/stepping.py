@@ -15,9 +15,9 @@ from statistics import median
 
 import numpy as np
 
-from pipeline.demos import StarterSource
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import Environment
-from pipeline.tasks import select_tasks
 from pipeline.types import Demo, Floats
 
 TASKS = (

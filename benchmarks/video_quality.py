@@ -25,14 +25,14 @@ from rich.table import Table
 
 from pipeline import seeding
 from pipeline.axes.noise import NoiseAxis
-from pipeline.compute import runner
 from pipeline.config import ComputeConfig, DemosConfig, RenderConfig, ReplayConfig
-from pipeline.demos import DemoEntry
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import decode, encode, to_policy
+from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.replay import ReplayJob
-from pipeline.render import Renderer
-from pipeline.store import TrajectoryStore
+from pipeline.rendering.jpeg import decode, encode, to_policy
+from pipeline.rendering.renderer import Renderer
+from pipeline.run.compute import runner
+from pipeline.run.stores import TrajectoryStore
 from pipeline.types import Frame
 from pipeline.writers.video import VideoEncoder
 

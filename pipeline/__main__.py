@@ -8,17 +8,18 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from pipeline import doctor, testset
 from pipeline.axes import Axes
-from pipeline.catalogue import inventory
-from pipeline.chat import Chat
-from pipeline.compute import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
-from pipeline.fetch import fetch
 from pipeline.files import replaced
-from pipeline.rewrite import extend
-from pipeline.tasks import SUITES, select_tasks
+from pipeline.libero.fetch import fetch
+from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.publish import attribution
+from pipeline.rewriting.language_model import LanguageModel
+from pipeline.rewriting.rewrite import extend
+from pipeline.run import doctor
+from pipeline.run.compute import runner
+from pipeline.testset import benchmark
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 
@@ -40,7 +41,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 def _preview(arguments: argparse.Namespace) -> int:
     # Rendering starts OpenGL on import, which the other commands can do without.
-    from pipeline import preview
+    from pipeline.publish import preview
 
     config = load(arguments.config)
     tasks = select_tasks([arguments.task])
@@ -52,13 +53,13 @@ def _preview(arguments: argparse.Namespace) -> int:
 
 
 def _rewrite(arguments: argparse.Namespace) -> int:
-    extend(arguments.bddl_file, arguments.out, arguments.per_class, Chat(arguments.endpoint, arguments.model))
+    extend(arguments.bddl_file, arguments.out, arguments.per_class, LanguageModel(arguments.endpoint, arguments.model))
     print(f"{arguments.out} holds {arguments.per_class} rewrites of each class for {arguments.bddl_file.stem}")
     return 0
 
 
 def _sources(arguments: argparse.Namespace) -> int:
-    print(json.dumps(inventory.counts(load(arguments.config).plan.axes)))
+    print(json.dumps(attribution.counts(load(arguments.config).plan.axes)))
     return 0
 
 
@@ -68,7 +69,7 @@ def _expand(arguments: argparse.Namespace) -> int:
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
     with runner(ComputeConfig()) as run:
-        made = expand(arguments.out, demos, arguments.per_task, arguments.seed, testset.load(), run)
+        made = expand(arguments.out, demos, arguments.per_task, arguments.seed, benchmark.load(), run)
     print(
         f"{made.written} demonstrations in {len(made.files)} files: set demos.source: hdf5 and {arguments.out} as root"
     )

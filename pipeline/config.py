@@ -10,9 +10,9 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from pipeline.axes import AnyAxis, Axes, axes_of
 from pipeline.axes.base import Frozen
-from pipeline.demos import DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.errors import PipelineError
-from pipeline.tasks import select_tasks
+from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
+from pipeline.libero.tasks import select_tasks
 
 Count = Annotated[int, Field(ge=1)]
 

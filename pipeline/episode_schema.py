@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -12,9 +11,10 @@ from PIL import Image, UnidentifiedImageError
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from pipeline.errors import PipelineError
+from pipeline.files import schema_file
 from pipeline.types import Episode
 
-SCHEMA_FILE = Path(__file__).resolve().parent.parent / "schemas" / "episode.json"
+SCHEMA_FILE = schema_file("episode.json")
 
 JPEG_END = b"\xff\xd9"
 
@@ -23,14 +23,14 @@ class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class View(_Model):
+class ViewSpec(_Model):
     """One camera: its name in MuJoCo and its key in LeRobot; its key here is its name in RLDS."""
 
     camera: str
     lerobot_key: str
 
 
-class Frame(_Model):
+class FrameSpec(_Model):
     """How every frame is stored."""
 
     shape: tuple[int, int, int]
@@ -39,7 +39,7 @@ class Frame(_Model):
     encoding: str
 
 
-class Vector(_Model):
+class VectorSpec(_Model):
     """A per-step vector; units stand in the names of its entries."""
 
     shape: tuple[int]
@@ -54,26 +54,26 @@ class Vector(_Model):
         return self
 
 
-class State(Vector):
+class StateSpec(VectorSpec):
     """End-effector pose in ``frame`` and finger positions."""
 
     frame: str
 
 
-class Gripper(_Model):
+class GripperSpec(_Model):
     """The two commands of the gripper entry."""
 
     open: float
     close: float
 
 
-class Action(Vector):
+class ActionSpec(VectorSpec):
     """Controller input; ``unit_m`` and ``unit_rad`` are what an entry of 1 asks for."""
 
     range: tuple[float, float]
     unit_m: float
     unit_rad: float
-    gripper: Gripper
+    gripper: GripperSpec
     controller: str
 
 
@@ -84,11 +84,11 @@ class EpisodeSchema(_Model):
     robot_type: str
     image_rotation_deg: int
     min_steps: int
-    views: dict[str, View]
-    frame: Frame
-    state: State
-    joint_state: Vector
-    action: Action
+    views: dict[str, ViewSpec]
+    frame: FrameSpec
+    state: StateSpec
+    joint_state: VectorSpec
+    action: ActionSpec
     provenance: tuple[str, ...]
 
 
@@ -127,7 +127,7 @@ def check(episode: Episode) -> None:
         raise _fault(episode, "provenance", f"names episode {episode.provenance['episode_id']!r}", "its own episode_id")
 
 
-def _check_vector(episode: Episode, field: str, values: NDArray[np.float32], spec: Vector, steps: int) -> None:
+def _check_vector(episode: Episode, field: str, values: NDArray[np.float32], spec: VectorSpec, steps: int) -> None:
     expected = f"({steps}, {spec.shape[0]}) of {spec.dtype}"
     if values.shape != (steps, *spec.shape) or values.dtype != np.dtype(spec.dtype):
         raise _fault(episode, field, f"is {values.shape} of {values.dtype}", expected)

@@ -29,3 +29,15 @@ class PipelineError(Exception):
 
 def _rebuild(what: str, where: str | None, expected: str | None, remedy: str | None) -> PipelineError:
     return PipelineError(what, where=where, expected=expected, remedy=remedy)
+
+
+class RefusedError(Exception):
+    """A perturbation that does not go with its scene.
+
+    Args:
+        reason: short and in snake_case, such as ``robot_in_collision``.
+    """
+
+    def __init__(self, reason: str):
+        super().__init__(reason)
+        self.reason = reason

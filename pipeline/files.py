@@ -9,6 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
+def schema_file(name: str) -> Path:
+    """A file of ``schemas/``: beside the library in a checkout, inside of it in an installed wheel."""
+    package = Path(__file__).resolve().parent
+    inside = package / "schemas" / name
+    return inside if inside.exists() else package.parent / "schemas" / name
+
+
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it is synced to disk and takes the place of ``path``.

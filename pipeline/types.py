@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -77,6 +77,10 @@ class Scene:
     model_xml: str
     state: Floats
     resolved: Mapping[str, Any] = field(default_factory=dict)
+
+
+RollOut = Callable[[Scene, Demo], Floats]
+"""(K+1, S) states that a demonstration's actions lead through from a scene."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from pipeline.config import Config
 from pipeline.publish import card
-from pipeline.stage import main
+from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:

@@ -2,11 +2,11 @@
 
 import json
 
-from pipeline import plan
-from pipeline.compute import runner
 from pipeline.config import Config
-from pipeline.episodes import EpisodeLoader, kept
-from pipeline.stage import main
+from pipeline.run import plan
+from pipeline.run.compute import runner
+from pipeline.run.episode_loader import EpisodeLoader, kept
+from pipeline.run.stage import main
 from pipeline.writers import lerobot
 
 

@@ -2,13 +2,14 @@
 
 from rich.console import Console
 
-from pipeline import leakage, plan, testset
 from pipeline.config import Config
-from pipeline.stage import main
+from pipeline.run import leakage, plan
+from pipeline.run.stage import main
+from pipeline.testset import benchmark
 
 
 def run(config: Config) -> None:
-    findings = leakage.check(plan.read(config.data / "plan.parquet"), testset.load())
+    findings = leakage.check(plan.read(config.data / "plan.parquet"), benchmark.load())
     leakage.write(findings, config.data / "leakage.json")
     Console().print(leakage.report(findings))
     leakage.refuse_overlap(findings)

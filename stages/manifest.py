@@ -2,11 +2,11 @@
 
 import json
 
-from pipeline import manifest, plan, stats
 from pipeline.config import Config
-from pipeline.episodes import EpisodeLoader, kept, outcome, verdicts
-from pipeline.stage import main
-from pipeline.store import FrameStore, TrajectoryStore
+from pipeline.run import manifest, motion_statistics, plan
+from pipeline.run.episode_loader import EpisodeLoader, kept, outcome, verdicts
+from pipeline.run.stage import main
+from pipeline.run.stores import FrameStore, TrajectoryStore
 from pipeline.writers.rlds import by_suite
 
 
@@ -33,7 +33,9 @@ def run(config: Config) -> None:
     load = EpisodeLoader(plan_file, data / "frames", config.render)
     ids = kept(rows, data, config.render)
     sets = by_suite(ids, {row.episode_id: row.suite for row in rows}, config.export.rlds.name)
-    figures = {name: stats.openvla([load.motion(episode) for episode in members]) for name, members in sets.items()}
+    figures = {
+        name: motion_statistics.openvla([load.motion(episode) for episode in members]) for name, members in sets.items()
+    }
     (data / "dataset_statistics.json").write_text(json.dumps(figures, indent=1) + "\n")
     (data / "counts.json").write_text(json.dumps(manifest.counts(table.to_pylist()), indent=1) + "\n")
 

@@ -2,16 +2,17 @@
 
 import sys
 
-from pipeline import plan, testset
 from pipeline.config import Config
-from pipeline.stage import main
+from pipeline.run import plan
+from pipeline.run.stage import main
+from pipeline.testset import benchmark
 
 
 def run(config: Config) -> None:
     index = config.demos.index()
     for problem in index.problems:
         print(f"left out: {problem.error}", file=sys.stderr)
-    rows = plan.make(index.entries, config.plan, config.replay, testset.load())
+    rows = plan.make(index.entries, config.plan, config.replay, benchmark.load())
     for axis, number in plan.shortage(rows, config.plan).items():
         print(
             f"{axis}: {number} of {config.plan.episodes[axis]} wanted episodes cannot be planned, for want of "

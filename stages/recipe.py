@@ -1,9 +1,9 @@
 """Stage recipe: the fine-tuning manifest, and what each policy's code needs to train on the datasets as they are."""
 
-from pipeline import manifest
 from pipeline.config import Config
 from pipeline.publish import recipe
-from pipeline.stage import main
+from pipeline.run import manifest
+from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:

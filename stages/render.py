@@ -1,11 +1,12 @@
 """Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped."""
 
-from pipeline import plan
-from pipeline.compute import runner
 from pipeline.config import Config
 from pipeline.files import keep_only
-from pipeline.render import GL, render_plan
-from pipeline.stage import main
+from pipeline.rendering.render import render_plan
+from pipeline.rendering.renderer import GL
+from pipeline.run import plan
+from pipeline.run.compute import runner
+from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:

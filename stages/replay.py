@@ -2,12 +2,12 @@
 
 import json
 
-from pipeline import plan
-from pipeline.compute import runner
 from pipeline.config import Config
 from pipeline.files import keep_only
 from pipeline.physics.replay import replay_plan
-from pipeline.stage import main
+from pipeline.run import plan
+from pipeline.run.compute import runner
+from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:

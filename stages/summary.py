@@ -2,11 +2,12 @@
 
 from rich.console import Console
 
-from pipeline import manifest, preview, sheets
-from pipeline.compute import runner
 from pipeline.config import Config
-from pipeline.episodes import EpisodeLoader
-from pipeline.stage import main
+from pipeline.publish import preview, sheets
+from pipeline.run import manifest
+from pipeline.run.compute import runner
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:

@@ -2,10 +2,10 @@
 
 import json
 
-from pipeline.compute import runner
 from pipeline.config import Config
 from pipeline.errors import PipelineError
-from pipeline.stage import main
+from pipeline.run.compute import runner
+from pipeline.run.stage import main
 from pipeline.validation.validate import validate
 
 

@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 from conftest import MILK, STOVE, starter_demo
 
+from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
-from pipeline.render import Renderer
-from pipeline.tasks import find_task
+from pipeline.rendering.renderer import Renderer
 from pipeline.types import Floats, Frame
 
 VIEWS = ("agentview", "robot0_eye_in_hand")

@@ -21,13 +21,14 @@ from pipeline import gl
 # Before anything imports MuJoCo.
 gl.choose()
 
-from pipeline import hdf5, testset  # noqa: E402
 from pipeline.config import ReplayConfig  # noqa: E402
-from pipeline.demos import StarterSource  # noqa: E402
+from pipeline.libero import hdf5  # noqa: E402
+from pipeline.libero.demonstrations import StarterSource  # noqa: E402
+from pipeline.libero.tasks import find_task  # noqa: E402
 from pipeline.physics.environment import Environment  # noqa: E402
 from pipeline.physics.replay import replay  # noqa: E402
-from pipeline.tasks import find_task  # noqa: E402
-from pipeline.testset import fetch_testset  # noqa: E402
+from pipeline.testset import benchmark  # noqa: E402
+from pipeline.testset.benchmark import fetch_testset  # noqa: E402
 from pipeline.types import Demo, Task, Trajectory  # noqa: E402
 
 REPOSITORY = Path(__file__).parent.parent
@@ -120,9 +121,9 @@ def served(server: ThreadingHTTPServer) -> Iterator[None]:
 
 def link_testset(folder: Path) -> None:
     """Give a run elsewhere the test set's wheel, which is downloaded once."""
-    wheel = fetch_testset(REPOSITORY / testset.FOLDER)
-    (folder / testset.FOLDER).parent.mkdir(parents=True, exist_ok=True)
-    (folder / testset.FOLDER).symlink_to(wheel.parent)
+    wheel = fetch_testset(REPOSITORY / benchmark.FOLDER)
+    (folder / benchmark.FOLDER).parent.mkdir(parents=True, exist_ok=True)
+    (folder / benchmark.FOLDER).symlink_to(wheel.parent)
 
 
 def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = STAGES) -> str:

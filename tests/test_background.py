@@ -11,16 +11,16 @@ import pytest
 from arenas import TASKS, change, changed, checksums, frames, renderer
 from conftest import MILK, REPOSITORY
 
-from pipeline import testset
-from pipeline.assets import package_folder
 from pipeline.axes import RenderPerturbation
 from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering, skin_of
 from pipeline.axes.base import Level
 from pipeline.catalogue.textures import IN_TEST_SET, catalogue
 from pipeline.errors import PipelineError
-from pipeline.render import Renderer
+from pipeline.libero.assets import package_folder
+from pipeline.rendering.renderer import Renderer
 from pipeline.seeding import rng
-from pipeline.testset import TestSet, TestTask
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet, TestTask
 
 
 def drawn(component: Component, level: Level, key: str | int) -> BackgroundPerturbation:
@@ -117,7 +117,7 @@ def test_nearest_knows_test_images_by_name_and_by_content() -> None:
 
 
 def test_draws_are_clear_of_the_benchmark() -> None:
-    test = testset.load(REPOSITORY / testset.FOLDER)
+    test = benchmark.load(REPOSITORY / benchmark.FOLDER)
     shown = {other.parameters[part] for other in test.of("background") for part in ("surface", "wall")
              if part in other.parameters}  # fmt: skip
     libero = {f"{name}.png".replace("cream-plaster", "cream_plaster") for name in IN_TEST_SET}

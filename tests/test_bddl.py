@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from conftest import MILK, STOVE
 
-from pipeline import bddl
 from pipeline.errors import PipelineError
-from pipeline.tasks import SUITES, find_task, tasks
+from pipeline.libero import bddl
+from pipeline.libero.tasks import SUITES, find_task, tasks
 
 
 def test_a_task_as_its_file_defines_it() -> None:

@@ -19,7 +19,7 @@ from pipeline.axes import from_json, to_json
 from pipeline.axes.camera import CameraAxis, CameraPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.seeding import rng
-from pipeline.testset import TestSet, TestTask
+from pipeline.testset.benchmark import TestSet, TestTask
 
 TABLETOP_POS_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
 TABLETOP_QUAT_WXYZ = np.array([0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349])

@@ -11,12 +11,13 @@ from conftest import PLATE, starter_demo
 
 from pipeline import seeding
 from pipeline.axes import AnyPerturbation, Axes, PhysicsPerturbation, from_json, in_order, of_layer, to_json
-from pipeline.axes.base import RefusedError
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
+from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment
-from pipeline.physics.scene import Compiled
+from pipeline.physics.roll_out import roll_out
+from pipeline.scenes.compiled import CompiledScene
 from pipeline.types import Demo, Floats, Scene
 
 MOVED = PosePerturbation(component="target", level=2, moved="plate_1", dx_m=0.01, dy_m=-0.02, dyaw_deg=5)
@@ -40,7 +41,7 @@ def base(demo: Demo) -> Scene:
 @pytest.fixture(scope="module")
 def crowded(base: Scene, demo: Demo) -> Scene:
     """The scene with two objects added."""
-    return added().apply(base, demo)
+    return added().apply(base, demo, roll_out)
 
 
 def added() -> LayoutPerturbation:
@@ -50,12 +51,12 @@ def added() -> LayoutPerturbation:
 def applied(listed: list[AnyPerturbation], scene: Scene, demo: Demo) -> Scene:
     """As a replay does it, from what the plan records."""
     for perturbation in of_layer(from_json(to_json(listed)), PhysicsPerturbation):
-        scene = perturbation.apply(scene, demo)
+        scene = perturbation.apply(scene, demo, roll_out)
     return scene
 
 
 def pose_of(body: str, scene: Scene) -> Floats:
-    compiled = Compiled(scene)
+    compiled = CompiledScene(scene)
     address = int(compiled.model.joint(f"{body}_joint0").qposadr[0])
     return np.array(compiled.data.qpos[address : address + 7])
 
@@ -90,20 +91,20 @@ def test_a_target_cannot_be_moved_onto_an_added_object(base: Scene, crowded: Sce
         component="target", level=5, moved="plate_1", dx_m=round(dx_m, 4), dy_m=round(dy_m, 4), dyaw_deg=0
     )
     with pytest.raises(RefusedError, match="object_in_collision"):
-        onto.apply(crowded, demo)
-    onto.apply(base, demo)
+        onto.apply(crowded, demo, roll_out)
+    onto.apply(base, demo, roll_out)
 
 
 def test_an_arm_cannot_start_in_an_added_object(base: Scene, crowded: Scene, demo: Demo) -> None:
     """The object is put where the turned hand will be, which is clear of it as it was recorded."""
-    there = Compiled(TURNED.apply(base, demo))
+    there = CompiledScene(TURNED.apply(base, demo, roll_out))
     hand_m = there.data.body("gripper0_eef").xpos.copy()
-    compiled = Compiled(crowded)
+    compiled = CompiledScene(crowded)
     state = crowded.state.copy()
     address = 1 + int(compiled.model.joint("layout0_joint0").qposadr[0])
     state[address : address + 3] = hand_m
-    recorded_m = Compiled(base).data.body("gripper0_eef").xpos
+    recorded_m = CompiledScene(base).data.body("gripper0_eef").xpos
     state[address : address + 3] += (hand_m - recorded_m) / np.linalg.norm(hand_m - recorded_m) * 0.1
     with pytest.raises(RefusedError, match="robot_in_collision"):
-        TURNED.apply(replace(crowded, state=state), demo)
-    TURNED.apply(crowded, demo)
+        TURNED.apply(replace(crowded, state=state), demo, roll_out)
+    TURNED.apply(crowded, demo, roll_out)

@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from pipeline.compute import loop, runner
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
+from pipeline.run.compute import loop, runner
 
 
 def square(number: int) -> int:
@@ -48,7 +48,7 @@ def test_local_processes_and_a_scheduler_by_address() -> None:
 def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch) -> None:
     import dask
 
-    monkeypatch.setattr("pipeline.compute.CONNECT_S", 1)
+    monkeypatch.setattr("pipeline.run.compute.CONNECT_S", 1)
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),

@@ -13,11 +13,11 @@ import h5py
 import numpy as np
 import pytest
 
-from pipeline import assets, hdf5
-from pipeline.assets import relocate
-from pipeline.demos import HDF5Source, StarterSource
 from pipeline.errors import PipelineError
-from pipeline.tasks import find_task, select_tasks, tasks
+from pipeline.libero import assets, hdf5
+from pipeline.libero.assets import relocate
+from pipeline.libero.demonstrations import HDF5Source, StarterSource
+from pipeline.libero.tasks import find_task, select_tasks, tasks
 from pipeline.types import Floats, Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
@@ -33,7 +33,7 @@ FLOOR = "textures/light-gray-floor-tile.png"
 MAKE_SCENE = """
 import sys
 from pipeline.physics.environment import Environment
-from pipeline.tasks import find_task
+from pipeline.libero.tasks import find_task
 print(Environment(find_task(*sys.argv[1:])).place_fixtures(seed=0))
 """
 COMPILE = """
@@ -147,7 +147,7 @@ def test_starter_set_refuses_unknown_ids(demo_id: str, what: str) -> None:
 
 
 def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pipeline.assets.find_spec", lambda _: None)
+    monkeypatch.setattr("pipeline.libero.assets.find_spec", lambda _: None)
     with pytest.raises(PipelineError, match="pip install robouse"):
         StarterSource().index([TASK])
 
@@ -470,8 +470,8 @@ def test_a_hostile_recording_never_becomes_a_demo(root: Path) -> None:
 def test_import_is_quiet_and_needs_no_simulator(tmp_path: Path) -> None:
     code = """
 import sys
-from pipeline.demos import StarterSource
-from pipeline.tasks import tasks
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import tasks
 StarterSource().index(tasks("libero_goal")[:2])
 print(sorted({"mujoco", "robosuite", "torch", "robouse"} & set(sys.modules)))
 """

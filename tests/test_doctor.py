@@ -5,12 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import doctor, gl, testset
+from pipeline import gl
 from pipeline.catalogue import wheels
 from pipeline.errors import PipelineError
+from pipeline.run import doctor
+from pipeline.testset import benchmark
 
 
-def failures(data: Path, *, need_gb: float = 0.001, demos: Path | None = None) -> dict[str, doctor.Finding]:
+def failures(data: Path, *, need_gb: float = 0.001, demos: Path | None = None) -> dict[str, doctor.Diagnosis]:
     findings = doctor.check(data, need_gb=need_gb, demos=demos)
     return {finding.name: finding for finding in findings if finding.status == "fail"}
 
@@ -70,9 +72,9 @@ def test_what_is_to_be_fetched_needs_something_to_fetch_it_with(
     found = {finding.name: finding for finding in doctor.check(tmp_path, need_gb=0.001)}
     # Every plan asks for the test set; further sources are for configurations that name them.
     assert {name for name, finding in found.items() if finding.status == "fail"} == {"test set"}
-    assert testset.WHEEL in found["test set"].remedy
+    assert benchmark.WHEEL in found["test set"].remedy
     assert found["metaworld textures"].status == found["sweethome3d objects"].status == "warn"
-    wheel = tmp_path / testset.FOLDER / testset.WHEEL
+    wheel = tmp_path / benchmark.FOLDER / benchmark.WHEEL
     wheel.parent.mkdir(parents=True)
     wheel.touch()
     assert failures(tmp_path) == {}

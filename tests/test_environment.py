@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from conftest import STOVE
 
+from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
-from pipeline.tasks import find_task
 from pipeline.types import Task, Trajectory
 
 OPEN_DRAWER = find_task(

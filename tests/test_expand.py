@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from conftest import STOVE, link_testset, starter_demo
 
-from pipeline import testset
-from pipeline.compute import loop
 from pipeline.config import DemosConfig, ReplayConfig
-from pipeline.demos import HDF5Source
+from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
 from pipeline.physics.expand import APART_RAD, Expansion, expand
 from pipeline.physics.replay import replay
+from pipeline.run.compute import loop
+from pipeline.testset import benchmark
 
 TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
 
@@ -25,7 +25,7 @@ TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
 def expanded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Expansion]:
     folder = tmp_path_factory.mktemp("expanded")
     link_testset(folder)
-    return folder / "demos", expand(folder / "demos", TASKS, 2, 1, testset.load(folder / testset.FOLDER), loop)
+    return folder / "demos", expand(folder / "demos", TASKS, 2, 1, benchmark.load(folder / benchmark.FOLDER), loop)
 
 
 def test_as_many_as_asked_for_in_liberos_layout(expanded: tuple[Path, Expansion]) -> None:
@@ -54,7 +54,7 @@ def test_a_second_time_nothing_is_replayed_and_the_bytes_are_the_same(expanded: 
     root, made = expanded
     before = made.files[0].read_bytes()
     replays = {file: file.stat().st_mtime_ns for file in (root / ".replays").iterdir()}
-    again = expand(root, TASKS, 2, 1, testset.load(root.parent / testset.FOLDER), loop)
+    again = expand(root, TASKS, 2, 1, benchmark.load(root.parent / benchmark.FOLDER), loop)
     assert again.written == 2
     assert made.files[0].read_bytes() == before
     assert {file: file.stat().st_mtime_ns for file in (root / ".replays").iterdir()} == replays

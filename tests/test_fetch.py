@@ -14,8 +14,8 @@ import pytest
 from conftest import served
 
 from pipeline.errors import PipelineError
-from pipeline.fetch import REPOSITORY, fetch
-from pipeline.tasks import tasks
+from pipeline.libero.fetch import REPOSITORY, fetch
+from pipeline.libero.tasks import tasks
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 

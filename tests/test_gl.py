@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pipeline import gl
-from pipeline.assets import package_folder
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import package_folder
 
 # The decision itself, past the cache that makes it once for each process.
 choose = gl.choose.__wrapped__

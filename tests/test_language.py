@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from pipeline import seeding, testset
+from pipeline import seeding
 from pipeline.axes.base import Level
 from pipeline.axes.language import (
     CLASSES,
@@ -27,8 +27,9 @@ from pipeline.axes.language import (
     normalise,
 )
 from pipeline.errors import PipelineError
-from pipeline.tasks import find_task, tasks
-from pipeline.testset import TestSet
+from pipeline.libero.tasks import find_task, tasks
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
@@ -219,7 +220,7 @@ def test_distance_forgets_case_and_punctuation() -> None:
 
 @pytest.fixture(scope="module")
 def test() -> TestSet:
-    return testset.load(REPOSITORY / testset.FOLDER)
+    return benchmark.load(REPOSITORY / benchmark.FOLDER)
 
 
 def test_the_bank_is_clear_of_the_test_set(task: Task, test: TestSet) -> None:

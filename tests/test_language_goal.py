@@ -9,8 +9,8 @@ import pytest
 
 from pipeline.axes.language import NAMED, lint, load_bank
 from pipeline.axes.language_goal import changed_goal, demands
-from pipeline.goal import Aim, Change, read_goal
-from pipeline.tasks import SUITES, find_task, tasks
+from pipeline.libero.task_goal import Aim, StateChange, read_goal
+from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Task
 
 SOUP = find_task("libero_object", "pick_up_the_alphabet_soup_and_place_it_in_the_basket")
@@ -48,7 +48,7 @@ def test_the_goal_is_read_in_kinds_and_parts() -> None:
     assert read_goal(PUDDING.bddl_file).aims[1] == Aim("right", "chocolate_pudding", "plate")
     shut = read_goal(SHUT.bddl_file)
     assert shut.aims == (Aim("in", "akita_black_bowl", "white_cabinet", "bottom"),)
-    assert shut.changes == (Change("close", "white_cabinet", "bottom"),)
+    assert shut.changes == (StateChange("close", "white_cabinet", "bottom"),)
     between = read_goal(BETWEEN.bddl_file)
     assert between.aims == (Aim("on", "akita_black_bowl", "plate"),)
     assert {aim.place for aim in between.starts if aim.relation == "between"} == {

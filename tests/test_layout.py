@@ -12,17 +12,17 @@ import pytest
 from conftest import PLATE, STOVE, starter_demo
 
 from pipeline import seeding
-from pipeline.axes.base import RefusedError
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.objects import TEST_CATEGORIES, goes_with, models, taken
 from pipeline.config import ReplayConfig
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, RefusedError
+from pipeline.libero.tasks import tasks
 from pipeline.physics.environment import Environment
-from pipeline.physics.placement import CLEARANCE_M, path, place
 from pipeline.physics.replay import replay
-from pipeline.tasks import tasks
-from pipeline.testset import TestSet, TestTask
+from pipeline.physics.roll_out import roll_out
+from pipeline.scenes.placement import CLEARANCE_M, place
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Scene
 
 ROBOT = ("robot0_", "gripper0_")
@@ -51,7 +51,7 @@ def three() -> LayoutPerturbation:
 
 @pytest.fixture(scope="module")
 def changed(three: LayoutPerturbation, base: Scene, demo: Demo) -> Scene:
-    return three.apply(base, demo)
+    return three.apply(base, demo, roll_out)
 
 
 def restored(scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -63,7 +63,7 @@ def restored(scene: Scene) -> tuple[mujoco.MjModel, mujoco.MjData]:
 
 
 def test_the_same_draw_gives_the_same_scene(three: LayoutPerturbation, base: Scene, demo: Demo, changed: Scene) -> None:
-    again = LayoutPerturbation.model_validate_json(three.model_dump_json()).apply(base, demo)
+    again = LayoutPerturbation.model_validate_json(three.model_dump_json()).apply(base, demo, roll_out)
     assert again.model_xml == changed.model_xml
     assert again.state.tobytes() == changed.state.tobytes()
     assert again.resolved == changed.resolved
@@ -143,7 +143,7 @@ def test_objects_touch_the_table_only_and_the_demonstration_passes_them_by(
     table = model.body("table").id
     model.geom_margin[added] = CLEARANCE_M
     model.body_margin[model.geom_bodyid[added]] = CLEARANCE_M
-    states, nq = path(demo, base), model.nq - 21
+    states, nq = roll_out(base, demo), model.nq - 21
     assert len(states) > 50
     for state in states:
         data.qpos[:nq] = state[1 : 1 + nq]
@@ -169,14 +169,14 @@ def test_impossible_wishes_are_refused_with_their_reason(tmp_path: Path, base: S
     file.write_text('<mujoco><worldbody><body><geom type="box" size=".25 .25 .25"/></body></worldbody></mujoco>')
     crate = ObjectModel("own/crate", "crate", "", "", file)
     with pytest.raises(RefusedError) as refused:
-        place(base, demo, [crate] * 5, seed=0)
+        place(base, demo, [crate] * 5, seed=0, roll_out=roll_out)
     assert refused.value.reason in ("layout_in_the_way", "layout_out_of_view", "layout_off_the_surface")
 
 
 def test_an_object_that_is_another_now_is_refused(three: LayoutPerturbation, base: Scene, demo: Demo) -> None:
     stale = three.objects[0].model_copy(update={"sha256": "0" * 64})
     with pytest.raises(PipelineError, match="not the one that was planned with"):
-        LayoutPerturbation(level=1, objects=(stale,), seed=0).apply(base, demo)
+        LayoutPerturbation(level=1, objects=(stale,), seed=0).apply(base, demo, roll_out)
 
 
 def test_distance_to_the_test_set_is_by_category_on_the_same_task(three: LayoutPerturbation) -> None:

@@ -18,18 +18,20 @@ import pytest
 import yaml
 from conftest import REPOSITORY, tiny_config
 
-from pipeline import leakage, plan, seeding, testset
+from pipeline import seeding
 from pipeline.axes import AnyPerturbation, Axes, from_json, to_json
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.robot import HOME_RAD, benchmark_offsets_rad
 from pipeline.errors import PipelineError
-from pipeline.plan import Row
-from pipeline.tasks import SUITES, find_task, tasks
-from pipeline.testset import TestSet, TestTask
+from pipeline.libero.tasks import SUITES, find_task, tasks
+from pipeline.run import leakage, plan
+from pipeline.run.plan import Row
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Task
 
-FOLDER = REPOSITORY / testset.FOLDER
+FOLDER = REPOSITORY / benchmark.FOLDER
 
 AS_DRAWN: dict[str, Callable[[TestTask], dict[str, Any]]] = {
     "camera": lambda tested: dict(tested.parameters),
@@ -57,7 +59,7 @@ AXES = [kind.model_fields["axis"].default for kind in get_args(get_args(AnyPertu
 
 @pytest.fixture(scope="module")
 def test() -> TestSet:
-    return testset.load(FOLDER)
+    return benchmark.load(FOLDER)
 
 
 def repeated(tested: TestTask) -> AnyPerturbation:
@@ -128,7 +130,7 @@ def test_draws_are_mostly_clear_and_the_rest_is_counted(axis: str, test: TestSet
 
 @pytest.mark.parametrize("robot", ["mounted_panda", "on_the_ground_panda"])
 def test_the_robot_axis_knows_the_benchmarks_postures(robot: str) -> None:
-    with zipfile.ZipFile(FOLDER / testset.WHEEL) as wheel:
+    with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as wheel:
         source = wheel.read(f"liberoplus/liberoplus/envs/robots/{robot}.py").decode()
     pattern = r"^class \w+?Panda(\d+)\([^#]*?return np\.array\(\[([^\]]*)\]"
     found = {int(name): [float(angle) for angle in row.split(",")] for name, row in re.findall(pattern, source, re.M)}
@@ -188,8 +190,8 @@ def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -
 def run_stage(folder: Path, rows: list[Row]) -> subprocess.CompletedProcess[str]:
     """The stage as DVC runs it, on a plan of these rows."""
     (folder / "data").mkdir(exist_ok=True)
-    if not (folder / testset.FOLDER).exists():
-        (folder / testset.FOLDER).symlink_to(FOLDER)
+    if not (folder / benchmark.FOLDER).exists():
+        (folder / benchmark.FOLDER).symlink_to(FOLDER)
     plan.write(rows, folder / "data" / "tiny" / "plan.parquet")
     (folder / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(folder)))
     command = [sys.executable, str(REPOSITORY / "stages" / "leakage.py"), "tiny.yaml"]

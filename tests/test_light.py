@@ -13,7 +13,7 @@ from conftest import MILK
 from pipeline.axes.base import Level
 from pipeline.axes.light import Component, LightAxis, LightPerturbation, exposure
 from pipeline.seeding import rng
-from pipeline.testset import TestSet
+from pipeline.testset.benchmark import TestSet
 
 COMPONENTS: tuple[Component, ...] = get_args(Component)
 NEUTRAL = LightPerturbation(component="combined", level=1)

@@ -16,10 +16,11 @@ from pydantic import ValidationError
 from scipy.ndimage import zoom
 from skimage.filters import gaussian
 
-from pipeline import seeding, testset
+from pipeline import seeding
 from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.axes.noise import Effect, NoiseAxis, NoisePerturbation
-from pipeline.testset import TestSet
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Frame, Task
 
 Image = NDArray[np.floating]
@@ -220,7 +221,7 @@ def test_levels_lie_between_neighbouring_severities() -> None:
 
 @pytest.fixture(scope="module")
 def test() -> TestSet:
-    return testset.load(REPOSITORY / testset.FOLDER)
+    return benchmark.load(REPOSITORY / benchmark.FOLDER)
 
 
 def test_the_parsed_severities_are_the_published_ones(test: TestSet) -> None:

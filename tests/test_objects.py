@@ -23,8 +23,8 @@ from pipeline.catalogue.object_sources import Package, catalogue
 from pipeline.catalogue.objects import TEST_CATEGORIES, find, goes_with, models, taken
 from pipeline.catalogue.sources import Folder
 from pipeline.errors import PipelineError
+from pipeline.libero.tasks import find_task, tasks
 from pipeline.seeding import rng
-from pipeline.tasks import find_task, tasks
 
 INSTALLED = models(("libero", "robosuite"))
 

@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline import seeding, stats
+from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.run import motion_statistics
 from pipeline.types import Episode
 from pipeline.validation import oft, oft_check
 from pipeline.writers import rlds
@@ -64,7 +65,7 @@ def write(data: Path, load: Callable[[str], Episode] = episode) -> Path:
     """A run's data folder with one dataset and its statistics; the writer's own check is the caller's to disarm."""
     rlds.write(list(LENGTHS), load, data / "rlds", name=NAME, shards=2, run=lambda fn, jobs, _: list(map(fn, jobs)))
     episodes = [load(name) for name in LENGTHS]
-    figures = stats.openvla([(made.action, made.state) for made in episodes])
+    figures = motion_statistics.openvla([(made.action, made.state) for made in episodes])
     (data / "dataset_statistics.json").write_text(json.dumps({NAME: figures}))
     return data
 

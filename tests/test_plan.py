@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline import plan
 from pipeline.axes import Axes, from_json
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis, deal
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.config import PlanConfig, ReplayConfig
-from pipeline.demos import DemoEntry
 from pipeline.errors import PipelineError
-from pipeline.tasks import find_task, tasks
-from pipeline.testset import TestSet, TestTask
+from pipeline.libero.demonstrations import DemoEntry
+from pipeline.libero.tasks import find_task, tasks
+from pipeline.run import plan
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Verdict
 
 REPLAY = ReplayConfig()

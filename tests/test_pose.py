@@ -12,16 +12,16 @@ import pytest
 from conftest import MILK, PLATE, STOVE, starter_demo
 from scipy.spatial.transform import Rotation
 
-from pipeline.axes.base import RefusedError
 from pipeline.axes.pose import PoseAxis, PosePerturbation
 from pipeline.config import ReplayConfig
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, RefusedError
+from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
-from pipeline.physics.scene import Compiled
+from pipeline.physics.roll_out import roll_out
+from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
-from pipeline.tasks import find_task, select_tasks
-from pipeline.testset import TestSet, TestTask
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Scene, Task
 
 COOKIES = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate")
@@ -86,9 +86,9 @@ def test_the_target_is_what_the_goal_moves() -> None:
 def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
     scene = scenes(PLATE)
     change = moved("plate_1", 0.02, -0.01, 15)
-    after = change.apply(scene, starter_demo(PLATE))
+    after = change.apply(scene, starter_demo(PLATE), roll_out)
     assert after.model_xml == scene.model_xml
-    address = 1 + Compiled(scene).model.joint("plate_1_joint0").qposadr[0]
+    address = 1 + CompiledScene(scene).model.joint("plate_1_joint0").qposadr[0]
     before, now = scene.state.copy(), after.state.copy()
     assert np.allclose(now[address : address + 3] - before[address : address + 3], [0.02, -0.01, 0], atol=1e-12)
     turn = Rotation.from_quat(now[address + 3 : address + 7], scalar_first=True) * (
@@ -114,7 +114,7 @@ def test_only_the_targets_pose_changes(scenes: Scenes) -> None:
 )
 def test_what_cannot_be_is_refused(task: Task, change: PosePerturbation, reason: str, scenes: Scenes) -> None:
     with pytest.raises(RefusedError, match=reason):
-        change.apply(scenes(task), starter_demo(task))
+        change.apply(scenes(task), starter_demo(task), roll_out)
 
 
 def test_a_receptacle_moves_when_asked_for_and_the_targets_relation_still_holds(scenes: Scenes) -> None:
@@ -124,24 +124,24 @@ def test_a_receptacle_moves_when_asked_for_and_the_targets_relation_still_holds(
     assert {p.moved for p in draws(both, BETWEEN, 12)} == {BOWL, "plate_1"}
     assert not axis.applies(PLATE), "the plate goes to a place on the table"
     change = moved("plate_1", 0.01, 0.01, 5)
-    assert change.apply(scenes(BETWEEN), starter_demo(BETWEEN)).resolved["pose"]["moved"] == "plate_1"
+    assert change.apply(scenes(BETWEEN), starter_demo(BETWEEN), roll_out).resolved["pose"]["moved"] == "plate_1"
     with pytest.raises(RefusedError, match="relation_broken"):
-        moved("plate_1", 0.25).apply(scenes(NEXT_TO), starter_demo(NEXT_TO))
+        moved("plate_1", 0.25).apply(scenes(NEXT_TO), starter_demo(NEXT_TO), roll_out)
 
 
 @pytest.mark.parametrize("task", [COOKIES, NEXT_TO, BETWEEN], ids=["on", "next to", "between"])
 def test_small_moves_keep_the_relation(task: Task, scenes: Scenes) -> None:
     for change in (moved(BOWL, 0.01, -0.01, 4), moved(BOWL, -0.01, 0.01, -4)):
-        change.apply(scenes(task), starter_demo(task))
+        change.apply(scenes(task), starter_demo(task), roll_out)
 
 
 def test_a_target_in_mid_air_is_still_moved(scenes: Scenes) -> None:
     """LIBERO records some first states before everything has landed; this bottle hangs 2 cm above the floor."""
     task = find_task("libero_object", "pick_up_the_salad_dressing_and_place_it_in_the_basket")
     scene = scenes(task)
-    compiled = Compiled(scene)
+    compiled = CompiledScene(scene)
     assert not compiled.touching(compiled.part("salad_dressing_1_main"))
-    after = moved("salad_dressing_1", 0.02, 0.01, 10).apply(scene, starter_demo(task))
+    after = moved("salad_dressing_1", 0.02, 0.01, 10).apply(scene, starter_demo(task), roll_out)
     assert not np.array_equal(after.state, scene.state)
 
 

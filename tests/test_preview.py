@@ -14,17 +14,19 @@ from conftest import MILK, REPOSITORY, STOVE
 from PIL import Image
 
 from pipeline import __main__ as command_line
-from pipeline import preview, sheets
-from pipeline.axes import Axes, PhysicsPerturbation, RefusedError, RenderPerturbation
+from pipeline.axes import Axes, PhysicsPerturbation, RenderPerturbation
 from pipeline.axes.base import Axis
 from pipeline.axes.language import LanguageAxis
-from pipeline.compute import loop
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import decode, streams_of
+from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment
-from pipeline.render import render
-from pipeline.types import Demo, Frame, Scene, Task, Trajectory, Verdict
+from pipeline.publish import preview, sheets
+from pipeline.rendering.jpeg import decode
+from pipeline.rendering.render import render
+from pipeline.run.compute import loop
+from pipeline.run.streams import streams_of
+from pipeline.types import Demo, Frame, RollOut, Scene, Task, Trajectory, Verdict
 
 if TYPE_CHECKING:
     import mujoco
@@ -55,7 +57,7 @@ class Lift(PhysicsPerturbation):
     axis: Literal["lift"] = "lift"
     component: Literal["lamp", "window"] = "lamp"
 
-    def apply(self, scene: Scene, demo: Demo) -> Scene:
+    def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         if self.level == 5:
             raise RefusedError("too_high")
         state = scene.state.copy()

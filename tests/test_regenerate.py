@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import PLATE, REPOSITORY
 
-from pipeline import manifest
 from pipeline.errors import PipelineError
+from pipeline.run import manifest
 from pipeline.validation.regenerate import regenerate
 from pipeline.validation.shards import records
 from pipeline.writers.rlds import checksum

@@ -18,11 +18,13 @@ from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import Stream, decode, encode, streams_of, to_policy
-from pipeline.physics.scene import proprioception
-from pipeline.render import Renderer, render
+from pipeline.rendering.jpeg import decode, encode, to_policy
+from pipeline.rendering.render import render
+from pipeline.rendering.renderer import Renderer
+from pipeline.run.stores import FrameStore
+from pipeline.run.streams import Stream, streams_of
+from pipeline.scenes.compiled import proprioception
 from pipeline.seeding import rng
-from pipeline.store import FrameStore
 from pipeline.types import Frame, Task, Trajectory
 
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)

@@ -14,11 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import ReplayConfig
-from pipeline.demos import HDF5Source
 from pipeline.errors import PipelineError
+from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
-from pipeline.physics.judge import verdict
-from pipeline.physics.replay import NOOP_NORM, kept_actions, replay
+from pipeline.physics.replay import replay
+from pipeline.physics.success import verdict
+from pipeline.scenes.noops import NOOP_NORM, kept_actions
 from pipeline.types import Floats, Task, Trajectory
 
 ACTIONS = st.lists(st.tuples(st.sampled_from([0.0, 5e-5, 0.3]), st.sampled_from([-1.0, 1.0])), min_size=1, max_size=30)

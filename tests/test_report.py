@@ -22,15 +22,16 @@ from conftest import REPOSITORY, tiny_config
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline import manifest, testset
 from pipeline.axes import AnyPerturbation, Axes, to_json
 from pipeline.config import Config, RenderConfig
 from pipeline.errors import PipelineError
-from pipeline.frames import encode
+from pipeline.libero.tasks import find_task
 from pipeline.publish import clips, coverage, figures, report, yields
 from pipeline.publish.coverage import Draw
+from pipeline.rendering.jpeg import encode
+from pipeline.run import manifest
 from pipeline.seeding import rng
-from pipeline.tasks import find_task
+from pipeline.testset import benchmark
 
 LOADED = {"src", "poster", "srcset", "xlink:href", "data"}
 """Attributes that a browser follows by itself."""
@@ -76,7 +77,7 @@ def config(finished: Path, short_demos: Path) -> Iterator[Config]:
 
 @pytest.fixture(scope="module")
 def html(config: Config) -> str:
-    return report.page(config, testset.load(REPOSITORY / testset.FOLDER))
+    return report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
 @pytest.fixture(scope="module")
@@ -162,15 +163,15 @@ def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
 def test_every_axis_has_a_picture_of_where_its_draws_lie(name: str) -> None:
     task = find_task("libero_goal", "put_the_bowl_on_the_plate")
     draws = [Draw(task, _draw(name, variant), None) for variant in range(30)]
-    shown = coverage.of(name, draws, testset.load(REPOSITORY / testset.FOLDER))
+    shown = coverage.of(name, draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert shown.panels
-    assert f"{len(testset.load(REPOSITORY / testset.FOLDER).of(name)):,}" in shown.note
+    assert f"{len(benchmark.load(REPOSITORY / benchmark.FOLDER).of(name)):,}" in shown.note
     for panel in shown.panels:
         assert panel.svg.startswith("<svg")
         assert figures.colour(name) in panel.svg or "data:image/png" in panel.svg
         assert figures.INK not in panel.svg
     # One with nothing kept, as of an axis whose replays all fail, is drawn as well.
-    assert len(coverage.of(name, [], testset.load(REPOSITORY / testset.FOLDER)).panels) == len(shown.panels)
+    assert len(coverage.of(name, [], benchmark.load(REPOSITORY / benchmark.FOLDER)).panels) == len(shown.panels)
 
 
 def test_noise_stands_between_the_benchmarks_severities() -> None:
@@ -183,7 +184,7 @@ def test_noise_stands_between_the_benchmarks_severities() -> None:
     draws = [Draw(find_task("libero_goal", "put_the_bowl_on_the_plate"), _draw("noise", n), None) for n in range(100)]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(coverage, "strips", strips)
-        coverage.of("noise", draws, testset.load(REPOSITORY / testset.FOLDER))
+        coverage.of("noise", draws, benchmark.load(REPOSITORY / benchmark.FOLDER))
     assert set(seen) == {"motion", "gaussian", "zoom", "fog", "glass"}
     for kind, severities in seen.items():
         assert len(severities), kind
@@ -199,7 +200,7 @@ def test_the_same_data_give_the_same_figure() -> None:
 def test_an_unfinished_run_says_what_to_run(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(PipelineError, match="dvc repro"):
-        report.page(config, testset.load(REPOSITORY / testset.FOLDER))
+        report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
 def test_a_run_that_kept_nothing_is_refused(
@@ -213,7 +214,7 @@ def test_a_run_that_kept_nothing_is_refused(
     shutil.copy(finished / "leakage.json", tmp_path / config.data)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(PipelineError, match="no episode was kept"):
-        report.page(config, testset.load(REPOSITORY / testset.FOLDER))
+        report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")

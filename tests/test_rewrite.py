@@ -14,11 +14,11 @@ import yaml
 from conftest import served
 
 from pipeline import __main__ as command_line
-from pipeline import chat, rewrite
 from pipeline.axes.language import CLASSES, Component, lint, load_bank, normalise
-from pipeline.chat import Chat
 from pipeline.errors import PipelineError
-from pipeline.tasks import find_task
+from pipeline.libero.tasks import find_task
+from pipeline.rewriting import language_model, rewrite
+from pipeline.rewriting.language_model import LanguageModel
 
 STOVE = find_task("libero_goal", "turn_on_the_stove")
 SENTENCES = tuple(
@@ -105,8 +105,8 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
         yield server
 
 
-def ask(server: Server) -> Chat:
-    return Chat(server.url, "tiny", timeout_s=0.3, backoff_s=0.01)
+def ask(server: Server) -> LanguageModel:
+    return LanguageModel(server.url, "tiny", timeout_s=0.3, backoff_s=0.01)
 
 
 def lists(*each: int) -> list[Reply]:
@@ -236,7 +236,7 @@ def test_busy_and_broken_endpoints_are_asked_again(server: Server, tmp_path: Pat
         (status(200, b"null"), "without choices"),
         (says(None), "without text"),
         (says("I would rather not."), "without a list"),
-        (status(200, b"x" * (chat.MAX_ANSWER_BYTES + 1)), "more than"),
+        (status(200, b"x" * (language_model.MAX_ANSWER_BYTES + 1)), "more than"),
         (says('["put plate_1 on stove_1"]'), "file-name debris"),
         (says('["turn on the stove."]'), "equal to the original"),
         (says('["turn the stove off, please"]'), "does not say to turnon"),
@@ -289,9 +289,9 @@ def test_nothing_in_a_bank_is_refused_by_the_lint_or_said_twice(server: Server, 
 
 def test_an_endpoint_out_of_reach(server: Server, tmp_path: Path) -> None:
     server.replies = [status(502, b"bad gateway")]
-    with pytest.raises(PipelineError, match=f"no answer in {chat.ATTEMPTS} attempts.*502.*bad gateway"):
+    with pytest.raises(PipelineError, match=f"no answer in {language_model.ATTEMPTS} attempts.*502.*bad gateway"):
         ask(server)("hello")
-    assert len(server.asked) == chat.ATTEMPTS
+    assert len(server.asked) == language_model.ATTEMPTS
 
 
 def test_a_redirect_is_not_followed(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,7 +305,7 @@ def test_a_redirect_is_not_followed(server: Server, monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize("endpoint", ["localhost:8000", "file:///etc/passwd", "http://"])
 def test_what_is_no_address_is_refused(endpoint: str) -> None:
     with pytest.raises(PipelineError, match="not an address"):
-        Chat(endpoint, "tiny")
+        LanguageModel(endpoint, "tiny")
 
 
 @pytest.mark.parametrize(

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from conftest import MILK, PLATE, starter_demo
 
-from pipeline.axes.base import RefusedError
 from pipeline.axes.robot import HOME_RAD, RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
+from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
-from pipeline.physics.scene import Compiled
+from pipeline.physics.roll_out import roll_out
+from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
-from pipeline.testset import TestSet, TestTask
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats, Scene
 
 TEST = TestSet(
@@ -78,9 +79,9 @@ def test_every_test_offset_is_found_and_draws_are_clear() -> None:
 
 def test_only_the_arm_changes(scene: Scene) -> None:
     drawn = RobotAxis(levels=(3,)).sample(rng("some"), PLATE, 0)
-    moved = drawn.apply(scene, starter_demo(PLATE))
+    moved = drawn.apply(scene, starter_demo(PLATE), roll_out)
     assert moved.model_xml == scene.model_xml
-    compiled = Compiled(scene)
+    compiled = CompiledScene(scene)
     arm = [1 + compiled.model.joint(f"robot0_joint{n}").qposadr[0] for n in range(1, 8)]
     speeds = [1 + compiled.model.nq + compiled.model.joint(f"robot0_joint{n}").dofadr[0] for n in range(1, 8)]
     expected = scene.state.copy()
@@ -91,7 +92,7 @@ def test_only_the_arm_changes(scene: Scene) -> None:
 
 
 def recorded_rad(scene: Scene) -> Floats:
-    compiled = Compiled(scene)
+    compiled = CompiledScene(scene)
     return np.array([compiled.data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)])
 
 
@@ -104,7 +105,7 @@ def test_what_cannot_be_is_refused(scene: Scene) -> None:
         "test_posture": HOME_RAD + benchmark_offsets_rad()[99] - start,
     }.items():
         with pytest.raises(RefusedError, match=reason):
-            turned(*offsets).apply(scene, demo)
+            turned(*offsets).apply(scene, demo, roll_out)
 
 
 def test_the_replay_starts_there(environment: Environment) -> None:

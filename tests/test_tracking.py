@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from pipeline.axes.base import PhysicsPerturbation, RefusedError
+from pipeline.axes.base import PhysicsPerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
+from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay

@@ -16,14 +16,14 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import MILK, PLATE, STOVE, run_stages, tiny_config
 
-from pipeline import manifest
-from pipeline.compute import loop
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
-from pipeline.episodes import EpisodeLoader
-from pipeline.frames import decode, encode
+from pipeline.rendering.jpeg import decode, encode
+from pipeline.run import manifest
+from pipeline.run.compute import loop
+from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.types import Episode, Task, Trajectory
-from pipeline.validation.checks import CHECKS, Case, Finding
+from pipeline.validation.checks import CHECKS, Case, Fault
 from pipeline.validation.readback import Copy
 from pipeline.validation.shards import METADATA, columns, records
 from pipeline.validation.validate import validate
@@ -225,7 +225,7 @@ def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory])
     joints = np.zeros((len(action), 7), np.float32)
     made = Episode("milk", {}, state, joints, action, "", {})
 
-    def found(sign: float) -> list[Finding]:
+    def found(sign: float) -> list[Fault]:
         commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
         copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {})
         return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], {}, None)))

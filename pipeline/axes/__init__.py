@@ -13,7 +13,6 @@ from pipeline.axes.base import (
     Perturbation,
     PhysicsPerturbation,
     PixelPerturbation,
-    RefusedError,
     RenderPerturbation,
     TextPerturbation,
 )
@@ -24,7 +23,7 @@ from pipeline.axes.light import LightAxis, LightPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.axes.pose import PoseAxis, PosePerturbation
 from pipeline.axes.robot import RobotAxis, RobotPerturbation
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, RefusedError
 
 AnyPerturbation = Annotated[
     CameraPerturbation

@@ -23,7 +23,7 @@ from pipeline.types import Frame, Task
 if TYPE_CHECKING:
     import mujoco
 
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["theme", "surface"]
 Part = Literal["wall", "floor", "cupboard", "surface"]

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from pipeline.types import Demo, Frame, Scene, Task
+from pipeline.types import Demo, Frame, RollOut, Scene, Task
 
 if TYPE_CHECKING:
     import mujoco
 
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 
 class Layer(IntEnum):
@@ -144,25 +144,18 @@ class PhysicsPerturbation(Perturbation):
     layer: ClassVar[Layer] = Layer.PHYSICS
     views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
 
-    def apply(self, scene: Scene, demo: Demo) -> Scene:
+    def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene that ``demo`` is replayed in.
+
+        Args:
+            scene: what the perturbation changes.
+            demo: the demonstration.
+            roll_out: tells where the demonstration's actions lead from a scene; costs a whole replay.
 
         Raises:
             RefusedError: when the change cannot be made here; its reason ends in the manifest.
         """
         raise NotImplementedError
-
-
-class RefusedError(Exception):
-    """A perturbation that does not go with its scene.
-
-    Args:
-        reason: short and in snake_case, such as ``robot_in_collision``.
-    """
-
-    def __init__(self, reason: str):
-        super().__init__(reason)
-        self.reason = reason
 
 
 def _ordered(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:

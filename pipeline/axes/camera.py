@@ -15,7 +15,7 @@ from pipeline.types import Floats, Task
 if TYPE_CHECKING:
     import mujoco
 
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["distance", "spherical", "orientation"]
 

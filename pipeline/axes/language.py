@@ -31,7 +31,7 @@ from pipeline.errors import PipelineError
 from pipeline.types import Task
 
 if TYPE_CHECKING:
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
 CLASSES: tuple[Component, ...] = get_args(Component)

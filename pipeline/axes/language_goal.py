@@ -15,7 +15,7 @@ from functools import cache, partial
 from typing import NamedTuple
 
 from pipeline.axes.language_words import found, pattern, relation_words, thing_words, words
-from pipeline.goal import Aim, Goal, read_goal
+from pipeline.libero.task_goal import Aim, TaskGoal, read_goal
 from pipeline.types import Task
 
 SIDES = ("front", "left", "right")
@@ -158,7 +158,7 @@ def demands(task: Task) -> tuple[Demand, ...]:
     return tuple(demand for demand in _of_goal(goal, original) if demand.met(original))
 
 
-def _of_goal(goal: Goal, original: Reading) -> Iterator[Demand]:
+def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
     located = (*goal.aims, *goal.starts)
     kinds = [kind for aim in located for kind in (aim.thing, aim.place) if kind]
     moved = frozenset(aim.thing for aim in goal.aims)
@@ -181,7 +181,7 @@ def _of_goal(goal: Goal, original: Reading) -> Iterator[Demand]:
         yield Demand("lets the things change places", partial(Reading.in_order, aims=goal.aims))
 
 
-def _relation(aim: Aim, goal: Goal, original: Reading) -> Callable[[Reading], bool]:
+def _relation(aim: Aim, goal: TaskGoal, original: Reading) -> Callable[[Reading], bool]:
     """The demand for an aim's relation, in LIBERO's wording too: what is on a bowl lies in it; a start is left."""
     same_place = [one.relation for one in (*goal.aims, *goal.starts) if one.place == aim.place and one != aim]
     others = frozenset(relation for relation in same_place if relation)

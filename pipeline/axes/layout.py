@@ -14,10 +14,10 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, taken
 from pipeline.errors import PipelineError
-from pipeline.types import Demo, Scene, Task
+from pipeline.types import Demo, RollOut, Scene, Task
 
 if TYPE_CHECKING:
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 
 class AddedObject(Frozen):
@@ -50,11 +50,11 @@ class LayoutPerturbation(PhysicsPerturbation):
     clearance: ClassVar[float] = 1.0
     measure: ClassVar[str] = "1 where no category is shared with a test task of the same LIBERO task, else 0"
 
-    def apply(self, scene: Scene, demo: Demo) -> Scene:
+    def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         # Drawing a plan must not load the simulator.
-        from pipeline.physics.placement import place
+        from pipeline.scenes.placement import place
 
-        return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed)
+        return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed, roll_out)
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
         """By category: infinite where the test tasks on this LIBERO task add nothing of the same category.

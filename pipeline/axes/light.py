@@ -20,7 +20,7 @@ from pipeline.types import Frame, Task
 if TYPE_CHECKING:
     import mujoco
 
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 Property = Literal["diffuse", "direction", "specular", "shadows"]
 Component = Literal["diffuse", "direction", "specular", "shadows", "combined"]

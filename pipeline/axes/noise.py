@@ -16,7 +16,7 @@ from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Z
 from pipeline.types import Frame, Task
 
 if TYPE_CHECKING:
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 Effect = Motion | Gaussian | Zoom | Fog | Glass
 """Their ``strength`` names the parameter that grows with the severity, and gives its value for a clean frame."""

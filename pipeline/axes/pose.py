@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, PositiveFloat
 
-from pipeline import bddl
-from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation, RefusedError
-from pipeline.errors import PipelineError
-from pipeline.types import Demo, Floats, Scene, Task
+from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation
+from pipeline.errors import PipelineError, RefusedError
+from pipeline.libero import bddl
+from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 if TYPE_CHECKING:
-    from pipeline.physics.scene import Compiled
-    from pipeline.testset import TestSet
+    from pipeline.scenes.compiled import CompiledScene
+    from pipeline.testset.benchmark import TestSet
 
 SETTLE_S = 0.3
 """How long an object is watched. The farthest that one of the starter demonstrations still falls takes 0.06 s."""
@@ -61,7 +61,7 @@ class PosePerturbation(PhysicsPerturbation):
     clearance: ClassVar[float] = 0.005
     measure: ClassVar[str] = "m: the norm of the difference between the displacements of the same object"
 
-    def apply(self, scene: Scene, demo: Demo) -> Scene:
+    def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the object moved; its height and velocity and everything else stay as they are.
 
         The recorded and the moved object are both watched for ``SETTLE_S`` while everything else is held: they must
@@ -72,9 +72,9 @@ class PosePerturbation(PhysicsPerturbation):
                 that the instruction names; ``object_in_collision`` when it touches something else;
                 ``object_unstable`` when it slides or tilts more than the recorded one.
         """
-        from pipeline.physics.scene import Compiled
+        from pipeline.scenes.compiled import CompiledScene
 
-        compiled = Compiled(scene)
+        compiled = CompiledScene(scene)
         then = _settle(compiled, self.moved)
         state = scene.state.copy()
         address = 1 + int(compiled.model.joint(f"{self.moved}_joint0").qposadr[0])
@@ -138,7 +138,7 @@ class _Settled(NamedTuple):
     tilted_deg: float
 
 
-def _settle(compiled: Compiled, moved: str) -> _Settled:
+def _settle(compiled: CompiledScene, moved: str) -> _Settled:
     """Let the object come to rest from the compiled state while everything else is held."""
     import mujoco
 

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from pydantic import PositiveFloat
 
-from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation, RefusedError
-from pipeline.types import Demo, Floats, Scene, Task
+from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation
+from pipeline.errors import RefusedError
+from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 if TYPE_CHECKING:
-    from pipeline.testset import TestSet
+    from pipeline.testset.benchmark import TestSet
 
 Joints = tuple[float, float, float, float, float, float, float]
 
@@ -42,7 +43,7 @@ class RobotPerturbation(PhysicsPerturbation):
     clearance: ClassVar[float] = 0.02
     measure: ClassVar[str] = "rad: the norm of the difference between the joint offsets"
 
-    def apply(self, scene: Scene, demo: Demo) -> Scene:
+    def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the arm turned and at rest; the gripper and everything else stay as they are.
 
         Raises:
@@ -50,9 +51,9 @@ class RobotPerturbation(PhysicsPerturbation):
                 touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add up
                 to a posture of the test set.
         """
-        from pipeline.physics.scene import Compiled
+        from pipeline.scenes.compiled import CompiledScene
 
-        compiled = Compiled(scene)
+        compiled = CompiledScene(scene)
         data, model = compiled.data, compiled.model
         robot = compiled.part("robot0_base")
         before = compiled.touching(robot).keys()

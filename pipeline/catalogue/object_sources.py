@@ -25,7 +25,6 @@ from libero.libero import get_libero_path
 from rich.console import Console
 from rich.progress import track
 
-from pipeline.assets import package_folder
 from pipeline.catalogue import sweethome3d
 from pipeline.catalogue.meshes import RECIPE, convert
 from pipeline.catalogue.object_model import ObjectModel
@@ -33,6 +32,7 @@ from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.sweethome3d import Piece
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.libero.assets import package_folder
 from pipeline.seeding import digest
 
 Package = Literal["libero", "robosuite", "sweethome3d"]

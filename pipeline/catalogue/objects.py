@@ -5,10 +5,10 @@ from __future__ import annotations
 import re
 from functools import cache
 
-from pipeline import bddl
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source, catalogue, converted, offered
 from pipeline.errors import PipelineError
+from pipeline.libero import bddl
 from pipeline.types import Task
 
 TEST_CATEGORIES = frozenset(

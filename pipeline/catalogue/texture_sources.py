@@ -19,11 +19,11 @@ import cv2
 import numpy as np
 
 from pipeline import seeding
-from pipeline.assets import package_folder
 from pipeline.catalogue import procedural, wheels
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import package_folder
 from pipeline.types import Frame
 
 Package = Literal["libero", "robosuite", "procedural", "metaworld", "gymnasium-robotics"]

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline.assets import as_evaluated
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import as_evaluated
 from pipeline.physics.stepping import ControlStep
 from pipeline.types import Floats, Task
 

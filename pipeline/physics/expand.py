@@ -15,17 +15,18 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline import hdf5, plan
 from pipeline.axes import Axes
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
-from pipeline.compute import Run
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
+from pipeline.libero import hdf5
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay_plan
-from pipeline.physics.scene import Compiled, proprioception
-from pipeline.store import TrajectoryStore
-from pipeline.testset import TestSet
+from pipeline.run import plan
+from pipeline.run.compute import Run
+from pipeline.run.stores import TrajectoryStore
+from pipeline.scenes.compiled import CompiledScene, proprioception
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Scene, Trajectory
 
 RESERVE = 2.0
@@ -160,7 +161,7 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
 
     As in LIBERO's files, states are those before each action and observations those after it.
     """
-    compiled = Compiled(Scene(trajectory.model_xml, trajectory.states[0]))
+    compiled = CompiledScene(Scene(trajectory.model_xml, trajectory.states[0]))
     robot, state, joints = [], [], []
     for number, flattened in enumerate(trajectory.states):
         compiled.restore(flattened)

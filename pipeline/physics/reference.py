@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline.physics.scene import Compiled
+from pipeline.scenes.compiled import CompiledScene
 from pipeline.types import Floats, Scene
 
 Mask = NDArray[np.bool_]
@@ -52,7 +52,7 @@ class Reference:
             states: (K+1, S) flattened MuJoCo states.
             actions: (K, 7).
         """
-        compiled = Compiled(Scene(model_xml, states[0]))
+        compiled = CompiledScene(Scene(model_xml, states[0]))
         model, data = compiled.model, compiled.data
         steps = len(states)
         root = model.body_rootid
@@ -104,7 +104,7 @@ class Reference:
         }
 
 
-def _partners(compiled: Compiled) -> dict[int, set[int]]:
+def _partners(compiled: CompiledScene) -> dict[int, set[int]]:
     """Root body to the root bodies that it touches."""
     model = compiled.model
     partners: dict[int, set[int]] = {}

@@ -9,49 +9,20 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pipeline.axes import PhysicsPerturbation, RefusedError, from_json, of_layer
-from pipeline.compute import Run
+from pipeline.axes import PhysicsPerturbation, from_json, of_layer
 from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment, shared
-from pipeline.physics.judge import verdict
 from pipeline.physics.reference import Reference
+from pipeline.physics.roll_out import roll_out
+from pipeline.physics.success import verdict
 from pipeline.physics.tracking import Route, follow
-from pipeline.plan import Row, pending
-from pipeline.store import TrajectoryStore
+from pipeline.run.compute import Run
+from pipeline.run.plan import Row, pending
+from pipeline.run.stores import TrajectoryStore
+from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
-
-NOOP_NORM = 1e-4
-"""Largest norm of the six pose deltas that still counts as no motion (OpenVLA's `regenerate_libero_dataset.py`)."""
-
-
-def kept_actions(actions: Floats, noops: str) -> NDArray[np.bool_]:
-    """Which actions are executed; the others are skipped without stepping the physics.
-
-    A no-op moves the arm by less than ``NOOP_NORM`` and leaves the gripper as the last executed action had it
-    (OpenVLA's rule; the very first action is a no-op by its motion alone).
-
-    Args:
-        actions: (T, 7).
-        noops: ``drop``, ``trim_ends`` or ``keep``.
-
-    Returns:
-        (T,) mask.
-    """
-    if noops == "keep":
-        return np.ones(len(actions), bool)
-    still = np.linalg.norm(actions[:, :6], axis=1) < NOOP_NORM
-    real = np.zeros(len(actions), bool)
-    gripper: float | None = None
-    for step, action in enumerate(actions):
-        real[step] = not (still[step] and (gripper is None or action[6] == gripper))
-        if real[step]:
-            gripper = action[6]
-    if noops == "trim_ends" and real.any():
-        first, last = np.flatnonzero(real)[[0, -1]]
-        real[first : last + 1] = True
-    return real
 
 
 def replay(
@@ -125,7 +96,7 @@ def _perturbed(
     scene = Scene(demo.model_xml or environment.place_fixtures(config.fixture_seed), demo.init_state)
     try:
         for perturbation in perturbations:
-            scene = perturbation.apply(scene, demo)
+            scene = perturbation.apply(scene, demo, roll_out)
     except RefusedError as error:
         return scene, Verdict(False, error.reason)
     return scene, None

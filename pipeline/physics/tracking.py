@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.axes.base import RefusedError
+from pipeline.errors import RefusedError
 from pipeline.physics.reference import Mask, Reference
 from pipeline.types import Floats
 

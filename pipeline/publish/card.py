@@ -15,14 +15,14 @@ import jinja2
 import yaml
 from huggingface_hub import DatasetCardData
 
-from pipeline import manifest
 from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
-from pipeline.catalogue.inventory import attributions
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.publish.attribution import attributions
 from pipeline.publish.yields import LEVELS
+from pipeline.run import manifest
 from pipeline.writers.rlds import VERSION
 
 Format = Literal["rlds", "lerobot"]

@@ -15,8 +15,8 @@ import numpy as np
 from PIL import Image
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import decode
-from pipeline.sheets import MOMENT
+from pipeline.publish.sheets import MOMENT
+from pipeline.rendering.jpeg import decode
 from pipeline.types import Frame
 
 PICTURE_PX, PICTURE_QUALITY = 1100, 80

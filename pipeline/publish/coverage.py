@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline import bddl
 from pipeline.axes import AnyPerturbation
 from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.camera import CameraPerturbation
@@ -18,9 +17,10 @@ from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
+from pipeline.libero import bddl
+from pipeline.libero.tasks import find_task
 from pipeline.publish.figures import Panel, bars, histogram, scatter, strips
-from pipeline.tasks import find_task
-from pipeline.testset import TestSet
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 
 STUDY_TABLE_M = np.array([-0.2, 0.0])

@@ -19,9 +19,9 @@ import pyarrow.parquet as pq
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError, XetError
 
-from pipeline import manifest
 from pipeline.errors import PipelineError
 from pipeline.publish.card import REPORTS, REPOSITORY, Format
+from pipeline.run import manifest
 from pipeline.writers.rlds import VERSION
 
 SCRIPTS = {".py", ".yaml", ".json"}

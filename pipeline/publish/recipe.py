@@ -14,13 +14,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import yaml
 
-from pipeline import stats
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
-from pipeline.manifest import rlds_dataset
+from pipeline.files import replaced, schema_file
+from pipeline.run import motion_statistics
+from pipeline.run.manifest import rlds_dataset
 
-SCHEMA_FILE = Path(__file__).parents[2] / "schemas" / "finetune.json"
+SCHEMA_FILE = schema_file("finetune.json")
 TEMPLATES = Path(__file__).parent / "templates"
 COPIED = ("run_openvla_oft.py", "run_openpi.py", "lerobot_v3.py")
 
@@ -126,7 +126,7 @@ def write(manifest: Mapping[str, Any], lerobot: Path, folder: Path) -> None:
     with replaced(folder) as made:
         (made / "openpi_assets").mkdir(parents=True)
         (made / "openpi_assets" / "norm_stats.json").write_text(
-            json.dumps(stats.openpi(actions, states), indent=1) + "\n"
+            json.dumps(motion_statistics.openpi(actions, states), indent=1) + "\n"
         )
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(manifest), Dumper=_Dumper, sort_keys=False, width=10_000)

@@ -12,22 +12,22 @@ import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from pipeline import manifest
 from pipeline.axes import from_json
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
-from pipeline.episodes import EpisodeLoader
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.frames import streams_of
+from pipeline.libero.tasks import find_task
 from pipeline.publish import clips, coverage, figures, yields
 from pipeline.publish.clips import Clip
 from pipeline.publish.coverage import Coverage, Draw
 from pipeline.publish.figures import Panel
+from pipeline.publish.sheets import describe
 from pipeline.publish.yields import Rows, Table
-from pipeline.sheets import describe
-from pipeline.tasks import find_task
-from pipeline.testset import TestSet
+from pipeline.run import manifest
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.streams import streams_of
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats
 
 FILE = "report.html"

@@ -6,9 +6,9 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, get_args
 
-from pipeline import manifest
 from pipeline.axes import from_json
 from pipeline.axes.base import Level
+from pipeline.run import manifest
 
 LEVELS: tuple[Level, ...] = get_args(Level)
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import decode
-from pipeline.tasks import find_task
+from pipeline.libero.tasks import find_task
+from pipeline.rendering.jpeg import decode
 from pipeline.types import Episode, Frame, Trajectory
 from pipeline.validation.readback import Copy, sampled
 
@@ -37,7 +37,7 @@ DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|demo)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Finding:
+class Fault:
     """Something off.
 
     Attributes:
@@ -82,8 +82,8 @@ class Case:
             if all(values.shape == getattr(self.made, name).shape for name, values in copy.motion.items())
         ]
 
-    def finding(self, dataset: str, what: str, expected: object) -> Finding:
-        return Finding(dataset, self.made.episode_id, what, str(expected))
+    def finding(self, dataset: str, what: str, expected: object) -> Fault:
+        return Fault(dataset, self.made.episode_id, what, str(expected))
 
 
 def psnr_db(one: Frame, other: Frame) -> float:
@@ -91,7 +91,7 @@ def psnr_db(one: Frame, other: Frame) -> float:
     return float(cv2.PSNR(one, other))
 
 
-def length(case: Case) -> Iterator[Finding]:
+def length(case: Case) -> Iterator[Fault]:
     """As many steps in every place as the replay executed."""
     steps = len(case.trajectory.actions)
     places = [("manifest", case.row["steps"]), ("frames", len(case.made))]
@@ -100,7 +100,7 @@ def length(case: Case) -> Iterator[Finding]:
             yield case.finding(dataset, f"has {found} steps", steps)
 
 
-def motion(case: Case) -> Iterator[Finding]:
+def motion(case: Case) -> Iterator[Fault]:
     """Actions, states and joint angles, bit for bit, and the actions those that the replay executed."""
     if case.made.action.tobytes() != case.trajectory.actions.astype(np.float32).tobytes():
         yield case.finding("frames", "has other actions", "those that the replay executed")
@@ -118,14 +118,14 @@ def motion(case: Case) -> Iterator[Finding]:
                 )
 
 
-def instruction(case: Case) -> Iterator[Finding]:
+def instruction(case: Case) -> Iterator[Fault]:
     """The manifest's instruction at every step."""
     for copy in case.whole:
         if wrong := set(copy.instructions) - {case.row["instruction"]}:
             yield case.finding(copy.dataset, f"instruction {min(wrong)!r}", repr(case.row["instruction"]))
 
 
-def wording(case: Case) -> Iterator[Finding]:
+def wording(case: Case) -> Iterator[Fault]:
     """The task's own instruction or the rewrite of the bank that was drawn, and nothing of a file's name in it."""
     task, text = find_task(case.row["suite"], case.row["task"]), case.row["instruction"]
     expected = task.instruction
@@ -139,7 +139,7 @@ def wording(case: Case) -> Iterator[Finding]:
         yield case.finding("manifest", f"instruction {text!r}", f"a sentence without {debris[0]!r}")
 
 
-def provenance(case: Case) -> Iterator[Finding]:
+def provenance(case: Case) -> Iterator[Fault]:
     """The manifest's provenance."""
     for copy in case.copies:
         for column in SCHEMA.provenance:
@@ -148,7 +148,7 @@ def provenance(case: Case) -> Iterator[Finding]:
                 yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
 
 
-def jpeg(case: Case) -> Iterator[Finding]:
+def jpeg(case: Case) -> Iterator[Fault]:
     """In RLDS, the very bytes of every stored frame."""
     for view, frames in case.made.frames.items():
         wrong = [t for t, (one, other) in enumerate(zip(case.encoded[view], frames, strict=False)) if one != other]
@@ -156,14 +156,14 @@ def jpeg(case: Case) -> Iterator[Finding]:
             yield case.finding("rlds", f"{view} differs at {len(wrong)} steps, first at {wrong[0]}", "the stored JPEG")
 
 
-def video(case: Case) -> Iterator[Finding]:
+def video(case: Case) -> Iterator[Fault]:
     """In LeRobot, frames within ``VIDEO_PSNR_DB`` of the stored ones."""
     for copy, view, step, shown in _shown(case, "lerobot"):
         if (reached := psnr_db(copy.frames[view, step], shown[view])) < VIDEO_PSNR_DB:
             yield case.finding("lerobot", f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} dB or more")
 
 
-def cameras(case: Case) -> Iterator[Finding]:
+def cameras(case: Case) -> Iterator[Fault]:
     """No view that shows what another camera saw."""
     for copy, view, step, shown in _shown(case, "rlds", "lerobot"):
         for other in shown.keys() - {view}:
@@ -171,7 +171,7 @@ def cameras(case: Case) -> Iterator[Finding]:
                 yield case.finding(copy.dataset, f"{view} of step {step} shows {other}", "its own camera")
 
 
-def alive(case: Case) -> Iterator[Finding]:
+def alive(case: Case) -> Iterator[Fault]:
     """No view that shows nothing, or the same all along."""
     for copy in case.whole:
         for view in SCHEMA.views:
@@ -182,7 +182,7 @@ def alive(case: Case) -> Iterator[Finding]:
                 yield case.finding(copy.dataset, f"{view} is constant", "a camera that sees the robot move")
 
 
-def gripper(case: Case) -> Iterator[Finding]:
+def gripper(case: Case) -> Iterator[Fault]:
     """Commands of -1 and +1, and fingers that part on the one and close on the other."""
     told = SCHEMA.action.gripper
     for copy in case.whole:
@@ -196,7 +196,7 @@ def gripper(case: Case) -> Iterator[Finding]:
             yield case.finding(copy.dataset, what, f"{told.open} opens, {told.close} closes")
 
 
-def flags(case: Case) -> Iterator[Finding]:
+def flags(case: Case) -> Iterator[Fault]:
     """In RLDS, the first and the last step marked as such, and a reward for the last alone."""
     for copy in case.copies:
         if copy.dataset == "rlds":
@@ -209,7 +209,7 @@ def flags(case: Case) -> Iterator[Finding]:
             )
 
 
-def clock(case: Case) -> Iterator[Finding]:
+def clock(case: Case) -> Iterator[Fault]:
     """Steps at the frame rate: of the physics, and in LeRobot counted from 0 and timed."""
     taken = np.diff(case.trajectory.states[:, 0])
     if not np.allclose(taken, 1 / SCHEMA.fps_hz, rtol=0, atol=1e-6):
@@ -220,7 +220,7 @@ def clock(case: Case) -> Iterator[Finding]:
             yield from _marked(case, copy, {"frame_index": step, "timestamp": step / SCHEMA.fps_hz})
 
 
-def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Iterator[Finding]:
+def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Iterator[Fault]:
     for name, expected in wanted.items():
         found = copy.marks[name]
         for step in np.flatnonzero(~np.isclose(found, expected, rtol=0, atol=1e-4))[:1]:
@@ -238,7 +238,7 @@ def _shown(case: Case, *datasets: str) -> Iterator[tuple[Copy, str, int, Mapping
                     yield copy, view, step, shown
 
 
-Check = Callable[[Case], Iterable[Finding]]
+Check = Callable[[Case], Iterable[Fault]]
 
 CHECKS: Mapping[str, Check] = {
     check.__name__: check

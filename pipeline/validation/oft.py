@@ -18,8 +18,8 @@ import tensorflow_datasets as tfds
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from pipeline import stats
 from pipeline.errors import PipelineError
+from pipeline.run import motion_statistics
 from pipeline.validation.shards import METADATA, columns, records
 
 CHUNK = 8
@@ -49,7 +49,7 @@ class Recorded:
 
 
 @dataclass(frozen=True)
-class Trajectory:
+class Samples:
     """What OFT makes of an episode: one sample for each place at which a whole chunk begins, S = T - 7 in all.
 
     Attributes:
@@ -100,16 +100,16 @@ def read(folder: Path) -> Iterator[Recorded]:
                 ) from error
 
 
-def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Trajectory | None:
+def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Samples | None:
     """What OFT trains on, or None where it passes the episode by: no instruction, or fewer than 8 steps."""
     if not any(episode.instructions) or len(episode.action) < CHUNK:
         return None
-    action = normalise(stats.open_is_one(episode.action), statistics["action"])
+    action = normalise(motion_statistics.open_is_one(episode.action), statistics["action"])
     end_effector, fingers = episode.state[:, :6], episode.state[:, -2:]
     proprio = normalise(np.concatenate((end_effector, fingers), axis=1), statistics["proprio"])
     chunks = sliding_window_view(action, CHUNK, axis=0).swapaxes(1, 2)
     samples = len(chunks)
-    return Trajectory(
+    return Samples(
         prompt=episode.instructions[0].lower(),
         actions=chunks,
         proprio=proprio[:samples],

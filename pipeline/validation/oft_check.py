@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from pipeline import stats
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.run import motion_statistics
 from pipeline.validation import oft
 
 SAME = 1e-9
@@ -36,7 +36,7 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
         (largest, between what was read and ``statistics``) and ``violations``, texts.
     """
     violations: list[str] = []
-    motions: list[stats.Motion] = []
+    motions: list[motion_statistics.Motion] = []
     samples: list[int] = []
     episodes = clipped = 0
     for episode in oft.read(folder):
@@ -53,7 +53,7 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
         return {"episodes": episodes, "violations": [*violations, "holds nothing to train on: OFT waits for ever"]}
     if _closes_on_open(motions):
         violations.append("fingers part where the gripper is told to close: the command's sign is wrong")
-    measured = stats.openvla(motions)
+    measured = motion_statistics.openvla(motions)
     difference = _difference(measured, statistics)
     if not difference <= SAME:
         violations.append(f"dataset_statistics.json is off by up to {difference:g}")
@@ -114,7 +114,7 @@ def _is_frame(data: bytes) -> bool:
         return False
 
 
-def _closes_on_open(motions: Sequence[stats.Motion]) -> bool:
+def _closes_on_open(motions: Sequence[motion_statistics.Motion]) -> bool:
     """Whether the fingers, on the whole, part after the command turns positive and close after it turns negative."""
     moved = 0.0
     for action, state in motions:

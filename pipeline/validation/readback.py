@@ -17,7 +17,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import decode
+from pipeline.rendering.jpeg import decode
 from pipeline.types import Frame
 from pipeline.validation.shards import METADATA
 from pipeline.writers.lerobot import local_only

@@ -15,15 +15,16 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline import manifest, plan
-from pipeline.compute import loop
 from pipeline.config import DemosConfig
-from pipeline.episodes import EpisodeLoader
 from pipeline.errors import PipelineError
-from pipeline.frames import streams_of
 from pipeline.physics.replay import ReplayJob
-from pipeline.render import GL, RenderJob
-from pipeline.store import FrameStore
+from pipeline.rendering.render import RenderJob
+from pipeline.rendering.renderer import GL
+from pipeline.run import manifest, plan
+from pipeline.run.compute import loop
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.stores import FrameStore
+from pipeline.run.streams import streams_of
 from pipeline.types import Verdict
 from pipeline.validation.shards import METADATA, columns, records
 from pipeline.versions import versions

@@ -11,10 +11,10 @@ from typing import Any
 import av
 import tensorflow_datasets as tfds
 
-from pipeline import manifest, plan
 from pipeline.episode_schema import SCHEMA
+from pipeline.run import manifest, plan
 from pipeline.validation import oft_check
-from pipeline.validation.checks import Finding
+from pipeline.validation.checks import Fault
 from pipeline.validation.readback import LeRobotSet
 from pipeline.writers import lerobot, rlds
 
@@ -22,11 +22,11 @@ Row = Mapping[str, Any]
 """A row of the manifest."""
 
 
-def counts(data: Path, rows: Sequence[Row]) -> Iterator[Finding]:
+def counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
     """Every planned row in the manifest; no quota overfilled, and none left open while candidates are left."""
     planned = [row.episode_id for row in plan.read(data / "plan.parquet")]
     if planned != [row["episode_id"] for row in rows]:
-        yield Finding("manifest", None, f"{len(rows)} rows", f"the {len(planned)} of the plan, in its order")
+        yield Fault("manifest", None, f"{len(rows)} rows", f"the {len(planned)} of the plan, in its order")
     quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
     for row in rows:
         quotas[row["axis"], row["suite"], row["task"]].append(row)
@@ -34,31 +34,31 @@ def counts(data: Path, rows: Sequence[Row]) -> Iterator[Finding]:
         wanted, kept = sum(row["wanted"] for row in members), sum(row["kept"] for row in members)
         left = any(row["reason"] == "reserve_not_needed" for row in members)
         if kept > wanted or (kept < wanted and left):
-            yield Finding("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
+            yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
     if json.loads((data / "counts.json").read_text()) != manifest.counts(rows):
-        yield Finding("manifest", None, "counts.json does not follow from the rows", "the counts that do")
+        yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
 
 
-def rlds_format(sets: Sequence[Path]) -> Iterator[Finding]:
+def rlds_format(sets: Sequence[Path]) -> Iterator[Fault]:
     """The feature tree of this version, and all shards there."""
     for folder in sets:
         info = tfds.builder_from_directory(folder).info
         if info.features.to_json() != rlds.features().to_json():
-            yield Finding("rlds", None, f"features.json of {info.name} is another", "the one of this version")
+            yield Fault("rlds", None, f"features.json of {info.name} is another", "the one of this version")
         names, found = info.splits[rlds.SPLIT].filenames, {path.name for path in folder.glob("*.tfrecord-*")}
         if set(names) != found:
-            yield Finding("rlds", None, f"{info.name} has the shards {sorted(found)}", f"{sorted(names)}")
+            yield Fault("rlds", None, f"{info.name} has the shards {sorted(found)}", f"{sorted(names)}")
 
 
-def rlds_ids(kept: Mapping[str, Row], places: Counter[str]) -> Iterator[Finding]:
+def rlds_ids(kept: Mapping[str, Row], places: Counter[str]) -> Iterator[Fault]:
     """Every kept episode in RLDS once, and nothing else."""
     for episode_id in sorted({*kept, *places}):
         times = int(episode_id in kept)
         if places[episode_id] != times:
-            yield Finding("rlds", episode_id, f"is there {places[episode_id]} times", f"{times}")
+            yield Fault("rlds", episode_id, f"is there {places[episode_id]} times", f"{times}")
 
 
-def lerobot_format(opened: LeRobotSet, frames: lerobot.Frames) -> Iterator[Finding]:
+def lerobot_format(opened: LeRobotSet, frames: lerobot.Frames) -> Iterator[Fault]:
     """Frame rate, robot, and the columns' names and shapes; the videos' own frame rate."""
     meta = opened.data.meta
     told = {"fps": meta.fps, "robot_type": meta.robot_type}
@@ -73,26 +73,26 @@ def lerobot_format(opened: LeRobotSet, frames: lerobot.Frames) -> Iterator[Findi
             told[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
     for key, expected in wanted.items():
         if told[key] != expected:
-            yield Finding("lerobot", None, f"{key} is {told[key]}", f"{expected}")
+            yield Fault("lerobot", None, f"{key} is {told[key]}", f"{expected}")
 
 
-def lerobot_ids(opened: LeRobotSet, kept: Mapping[str, Row]) -> Iterator[Finding]:
+def lerobot_ids(opened: LeRobotSet, kept: Mapping[str, Row]) -> Iterator[Fault]:
     """Every kept episode in LeRobot at the index that the manifest says, and nothing else."""
     steps = sum(row["steps"] for row in kept.values())
     if (opened.data.meta.total_episodes, opened.data.num_frames) != (len(kept), steps):
         what = f"{opened.data.meta.total_episodes} episodes of {opened.data.num_frames} steps"
-        yield Finding("lerobot", None, what, f"{len(kept)} of {steps}")
+        yield Fault("lerobot", None, what, f"{len(kept)} of {steps}")
     for episode_id in sorted({*kept, *opened.provenance}):
         found = opened.provenance.get(episode_id, {}).get("episode_index")
         expected = kept[episode_id]["lerobot_episode_index"] if episode_id in kept else None
         if found != expected:
-            yield Finding("lerobot", episode_id, f"is at the index {found}", f"{expected}, as the manifest says")
+            yield Fault("lerobot", episode_id, f"is at the index {found}", f"{expected}, as the manifest says")
 
 
-def openvla_oft(statistics: Mapping[str, Any], folder: Path) -> list[Finding]:
+def openvla_oft(statistics: Mapping[str, Any], folder: Path) -> list[Fault]:
     """What would mislead OpenVLA-OFT."""
     name = folder.parent.name
     if name not in statistics:
-        return [Finding("rlds", None, f"dataset_statistics.json has nothing on {name}", "its statistics")]
+        return [Fault("rlds", None, f"dataset_statistics.json has nothing on {name}", "its statistics")]
     found = oft_check.check(folder, statistics[name])
-    return [Finding("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in found["violations"]]
+    return [Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in found["violations"]]

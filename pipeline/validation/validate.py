@@ -17,18 +17,18 @@ from typing import Any
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline import manifest
-from pipeline.compute import Run
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
-from pipeline.episodes import EpisodeLoader
 from pipeline.errors import PipelineError
-from pipeline.store import TrajectoryStore
+from pipeline.run import manifest
+from pipeline.run.compute import Run
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.stores import TrajectoryStore
 from pipeline.validation import oft, set_checks
-from pipeline.validation.checks import CHECKS, Case, Finding
+from pipeline.validation.checks import CHECKS, Case, Fault
 from pipeline.validation.readback import UNREADABLE, Copy, LeRobotSet, from_lerobot, from_rlds, open_lerobot
+from pipeline.validation.rerender import rendered, witnesses
 from pipeline.validation.shards import METADATA, columns, records
-from pipeline.validation.witness import rendered, witnesses
 from pipeline.writers import rlds
 
 
@@ -43,10 +43,10 @@ class Outcome:
     """
 
     checked: Counter[str] = field(default_factory=Counter)
-    findings: dict[str, list[Finding]] = field(default_factory=lambda: defaultdict(list))
+    findings: dict[str, list[Fault]] = field(default_factory=lambda: defaultdict(list))
     places: Counter[str] = field(default_factory=Counter)
 
-    def note(self, check: str, found: Iterable[Finding], checked: int = 1) -> None:
+    def note(self, check: str, found: Iterable[Fault], checked: int = 1) -> None:
         self.checked[check] += checked
         self.findings[check] += found
 
@@ -76,13 +76,13 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
     total.note("format", set_checks.rlds_format(sets), len(sets))
     with tempfile.TemporaryDirectory(prefix=".validate.", dir=data) as cache:
         opened = _opened(root, Path(cache))
-        if isinstance(opened, Finding):
+        if isinstance(opened, Fault):
             total.note("readable", [opened])
         else:
             total.note("format", set_checks.lerobot_format(opened, config.export.lerobot.frames))
             total.note("ids", set_checks.lerobot_ids(opened, kept), len(kept))
         job = ShardJob(
-            config, data, None if isinstance(opened, Finding) else root, Path(cache), frozenset(witnesses(rows))
+            config, data, None if isinstance(opened, Fault) else root, Path(cache), frozenset(witnesses(rows))
         )
         for outcome in run(job, sorted((data / "rlds").glob("*/*/*.tfrecord-*")), "validate"):
             total.add(outcome)
@@ -119,7 +119,7 @@ class ShardJob:
     def __call__(self, shard: Path) -> Outcome:
         outcome = Outcome()
         for index, read in enumerate(_episodes(shard)):
-            if isinstance(read, Finding):
+            if isinstance(read, Fault):
                 outcome.note("readable", [read])
             else:
                 self._check(read, f"record {index} of {shard.name}", outcome)
@@ -132,14 +132,14 @@ class ShardJob:
         if row is None:
             return  # Told by "ids".
         told = f"record {row['rlds_index']} of {row['rlds_shard']}"
-        outcome.note("place", [Finding("manifest", episode_id, told, place)] if told != place else [])
+        outcome.note("place", [Fault("manifest", episode_id, told, place)] if told != place else [])
         copies, unreadable = [], []
         for dataset, reader in self._readers(steps, episode_id).items():
             try:
                 copies.append(reader())
             except UNREADABLE as error:
                 what = f"{type(error).__name__}: {error}"
-                unreadable.append(Finding(dataset, episode_id, what, "an episode that can be read"))
+                unreadable.append(Fault(dataset, episode_id, what, "an episode that can be read"))
         outcome.note("readable", unreadable)
         language = self.config.plan.axes.language
         case = Case(
@@ -162,7 +162,7 @@ class ShardJob:
         return readers
 
 
-def _episodes(shard: Path) -> Iterator[dict[str, NDArray[Any]] | Finding]:
+def _episodes(shard: Path) -> Iterator[dict[str, NDArray[Any]] | Fault]:
     """The columns of every record, and a finding where it goes no further."""
     info = tfds.builder_from_directory(shard.parent).info
     split = info.splits[rlds.SPLIT]
@@ -173,16 +173,16 @@ def _episodes(shard: Path) -> Iterator[dict[str, NDArray[Any]] | Finding]:
             yield columns(record, info.features)
             found += 1
         if found != expected:
-            yield Finding("rlds", None, f"{shard.name} has {found} records", f"{expected}, as dataset_info.json says")
+            yield Fault("rlds", None, f"{shard.name} has {found} records", f"{expected}, as dataset_info.json says")
     except PipelineError as error:
-        yield Finding("rlds", None, str(error), "a whole file")
+        yield Fault("rlds", None, str(error), "a whole file")
 
 
-def _opened(root: Path, cache: Path) -> LeRobotSet | Finding:
+def _opened(root: Path, cache: Path) -> LeRobotSet | Fault:
     try:
         return open_lerobot(root, cache)
     except UNREADABLE as error:
-        return Finding("lerobot", None, f"{type(error).__name__}: {error}", "a dataset that lerobot opens")
+        return Fault("lerobot", None, f"{type(error).__name__}: {error}", "a dataset that lerobot opens")
 
 
 @lru_cache(maxsize=1)

@@ -35,14 +35,14 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import SCHEMA, check
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.stats import describe
+from pipeline.run.motion_statistics import describe
 from pipeline.types import Episode, Floats, Frame
 from pipeline.writers.base import Load, folder_bytes, split
-from pipeline.writers.levels import QUANTILES, Counts, count, statistics
+from pipeline.writers.image_statistics import QUANTILES, Counts, count, statistics
 from pipeline.writers.video import VideoEncoder
 
 if TYPE_CHECKING:  # export imports no simulator, and this would
-    from pipeline.compute import Run
+    from pipeline.run.compute import Run
 
 Frames = Literal["video", "images"]
 """``video`` is H.264 made from the stored frames; ``images`` are the stored JPEG files, three times as large."""

@@ -17,14 +17,14 @@ import google_crc32c
 import numpy as np
 import tensorflow_datasets as tfds
 
-from pipeline.episode_schema import SCHEMA, Vector, check
+from pipeline.episode_schema import SCHEMA, VectorSpec, check
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.types import Episode
 from pipeline.writers.base import Load, folder_bytes, split
 
 if TYPE_CHECKING:  # export imports no simulator, and this would
-    from pipeline.compute import Run
+    from pipeline.run.compute import Run
 
 VERSION = "1.0.0"
 SPLIT = "train"
@@ -169,7 +169,7 @@ def features() -> Any:
     return tfds.features.FeaturesDict({"steps": tfds.features.Dataset(step), "episode_metadata": metadata})
 
 
-def _vector(spec: Vector) -> Any:
+def _vector(spec: VectorSpec) -> Any:
     return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=", ".join(spec.names))
 
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import streams_of
-from pipeline.render import Renderer
+from pipeline.rendering.renderer import Renderer
+from pipeline.run.streams import streams_of
 from pipeline.types import Frame, Trajectory
-from pipeline.validation.checks import Case, Finding, psnr_db
+from pipeline.validation.checks import Case, Fault, psnr_db
 
 PSNR_DB = 25.0
 """Least PSNR of a first frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""
@@ -28,7 +28,7 @@ def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(chosen.values())
 
 
-def rendered(case: Case) -> Iterator[Finding]:
+def rendered(case: Case) -> Iterator[Fault]:
     """The first frame of every view, against a fresh rendering turned by numpy: not the way frames are turned there."""
     turns = SCHEMA.image_rotation_deg // 90
     raw = _raw(case.trajectory, case.row["perturbations"])

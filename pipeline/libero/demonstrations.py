@@ -16,10 +16,10 @@ import h5py
 import numpy as np
 import yaml
 
-from pipeline import hdf5
-from pipeline.assets import package_folder, relocate
 from pipeline.errors import PipelineError
-from pipeline.tasks import SUITES, find_task, tasks
+from pipeline.libero import hdf5
+from pipeline.libero.assets import package_folder, relocate
+from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Demo, Floats, Task
 
 HUMAN, EXPANDED = "human", "expanded"

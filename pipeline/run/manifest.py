@@ -17,12 +17,12 @@ from rich.table import Table
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
-from pipeline.plan import Row
+from pipeline.files import replaced, schema_file
+from pipeline.run.plan import Row
 from pipeline.types import Verdict
 from pipeline.versions import versions
 
-SCHEMA_FILE = Path(__file__).parent.parent / "schemas" / "manifest.json"
+SCHEMA_FILE = schema_file("manifest.json")
 """Column names, types and meanings."""
 
 _TYPES = {"string": pa.string(), "int": pa.int64(), "bool": pa.bool_()}

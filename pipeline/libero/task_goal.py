@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.bddl import Bddl, read
+from pipeline.libero.bddl import Bddl, read
 
 PARTS = ("top", "middle", "bottom", "left", "right", "front", "back", "center")
 """Words in the names of regions that tell which drawer, compartment, side or spot."""
@@ -32,7 +32,7 @@ class Aim(NamedTuple):
     part: str | None = None
 
 
-class Change(NamedTuple):
+class StateChange(NamedTuple):
     """A state (``open``, ``close``, ``turnon``, ``turnoff``) that a kind of thing, or a part of it, is to be in."""
 
     state: str
@@ -41,7 +41,7 @@ class Change(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Goal:
+class TaskGoal:
     """A task's goal, as far as it is not reached at the start, in kinds of things.
 
     Attributes:
@@ -55,12 +55,12 @@ class Goal:
     scene: tuple[str, ...]
     aims: tuple[Aim, ...]
     starts: tuple[Aim, ...]
-    changes: tuple[Change, ...]
+    changes: tuple[StateChange, ...]
     pairs: tuple[str, ...]
 
 
 @cache
-def read_goal(bddl_file: Path) -> Goal:
+def read_goal(bddl_file: Path) -> TaskGoal:
     """The goal of a task.
 
     Raises:
@@ -74,11 +74,11 @@ def read_goal(bddl_file: Path) -> Goal:
     counts = Counter(scene.kinds.get(name, name) for name in moved)
     told_apart = [name for name in moved if counts[scene.kinds.get(name, name)] < scene.count(name)]
     starts = [fact for fact in bddl.start if len(fact) == 3 and fact[1] in told_apart]
-    return Goal(
+    return TaskGoal(
         scene=tuple(dict.fromkeys(scene.kinds.values())),
         aims=tuple(dict.fromkeys(aim for fact in moves for aim in scene.aims(*fact))),
         starts=tuple(dict.fromkeys(aim for fact in starts for aim in scene.aims(*fact))),
-        changes=tuple(Change(fact[0], *scene.part(fact[1])) for fact in facts if len(fact) == 2),
+        changes=tuple(StateChange(fact[0], *scene.part(fact[1])) for fact in facts if len(fact) == 2),
         pairs=tuple(kind for kind, count in counts.items() if count > 1),
     )
 

@@ -2,110 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import gl
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
 from pipeline.axes.light import exposure
-from pipeline.compute import Run
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.episodes import rejected, verdicts
-from pipeline.frames import Stream, encode, streams_of, to_policy
-from pipeline.physics.scene import proprioception
-from pipeline.plan import Row, select
-from pipeline.store import FrameStore, Rendered, TrajectoryStore
-from pipeline.types import Frame, Trajectory
-
-GL = gl.choose()
-"""What renders in this process; chosen here because MuJoCo reads the choice when it is imported."""
-
-import mujoco  # noqa: E402
-
-
-class Renderer:
-    """Renders one scene through one GL context; close it before the next is made.
-
-    Args:
-        model_xml: MJCF of the scene.
-    """
-
-    def __init__(self, model_xml: str):
-        height, width, _ = SCHEMA.frame.shape
-        self.model = mujoco.MjModel.from_xml_string(model_xml)
-        self.data = mujoco.MjData(self.model)
-        self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
-        self._option = mujoco.MjvOption()
-        # As robosuite's off-screen context: visual meshes without the collision geometry.
-        self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
-
-    def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
-        """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
-        nq, nv = self.model.nq, self.model.nv
-        self.data.time = state[0]
-        self.data.qpos[:] = state[1 : 1 + nq]
-        self.data.qvel[:] = state[1 + nq : 1 + nq + nv]
-        self.model.site_rgba[:, 3] = site_alpha
-        mujoco.mj_forward(self.model, self.data)
-
-    def frame(self, camera: str) -> Frame:
-        """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
-        self._renderer.update_scene(self.data, camera, self._option)
-        return np.ascontiguousarray(self._renderer.render()[::-1])
-
-    @contextmanager
-    def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
-        """Apply render-layer perturbations to the model for a moment."""
-        written = {name for perturbation in perturbations for name in perturbation.fields}
-        saved = {name: getattr(self.model, name).copy() for name in written}
-        # Textures are a hundred megabytes and more, and copied to the GL context: keep only those that change.
-        pixels = saved.pop("tex_data", None)
-        replaced: dict[int, NDArray[np.uint8]] = {}
-        try:
-            try:
-                for perturbation in perturbations:
-                    perturbation.apply(self.model)
-            finally:
-                if pixels is not None:
-                    replaced = self._changed(pixels)
-                    del pixels
-            self._upload(replaced)
-            yield
-        finally:
-            for name, value in saved.items():
-                getattr(self.model, name)[:] = value
-            for texture, value in replaced.items():
-                self.model.tex_data[self._texels()[texture]] = value
-            self._upload(replaced)
-
-    def _texels(self) -> list[slice]:
-        """Where each texture's bytes lie in the model's ``tex_data``."""
-        starts = self.model.tex_adr
-        sizes = self.model.tex_height * self.model.tex_width * self.model.tex_nchannel
-        return [slice(start, start + size) for start, size in zip(starts.tolist(), sizes.tolist(), strict=True)]
-
-    def _changed(self, pixels: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
-        """The former bytes of the textures that differ from ``pixels``, an earlier copy of ``tex_data``."""
-        return {
-            texture: pixels[texels].copy()
-            for texture, texels in enumerate(self._texels())
-            if not np.array_equal(pixels[texels], self.model.tex_data[texels])
-        }
-
-    def _upload(self, textures: Iterable[int]) -> None:
-        """Copy textures of the model to the GL context."""
-        self._renderer._gl_context.make_current()
-        for texture in textures:
-            mujoco.mjr_uploadTexture(self.model, self._renderer._mjr_context, texture)
-
-    def close(self) -> None:
-        self._renderer.close()
+from pipeline.rendering.jpeg import encode, to_policy
+from pipeline.rendering.renderer import GL, Renderer
+from pipeline.run.compute import Run
+from pipeline.run.episode_loader import rejected, verdicts
+from pipeline.run.plan import Row, select
+from pipeline.run.stores import FrameStore, Rendered, TrajectoryStore
+from pipeline.run.streams import Stream, streams_of
+from pipeline.scenes.compiled import proprioception
+from pipeline.types import Trajectory
 
 
 def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConfig) -> Rendered:

@@ -43,7 +43,7 @@ class _StayHere(urllib.request.HTTPRedirectHandler):
 
 
 @dataclass(frozen=True)
-class Chat:
+class LanguageModel:
     """A model to ask. The key, where one is needed, comes from the environment variable ``OPENAI_API_KEY``.
 
     Attributes:

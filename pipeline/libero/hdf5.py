@@ -14,9 +14,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.assets import package_folder
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.libero.assets import package_folder
 from pipeline.types import Floats, Task
 
 AGAIN = "delete the file and download it again; the starter set needs no download"

@@ -8,8 +8,8 @@ from pipeline.axes import Axes, to_json
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
-from pipeline.catalogue import inventory
-from pipeline.catalogue.inventory import Attribution, attributions
+from pipeline.publish import attribution
+from pipeline.publish.attribution import Attribution, attributions
 from pipeline.seeding import rng
 
 
@@ -38,4 +38,4 @@ def test_a_texture_on_two_parts_of_a_scene_is_one_episode() -> None:
 
 
 def test_what_is_installed_holds_what_the_documentation_says() -> None:
-    assert inventory.counts(Axes()) == {"surfaces": 444, "procedural": 420, "models": 58, "categories": 26}
+    assert attribution.counts(Axes()) == {"surfaces": 444, "procedural": 420, "models": 58, "categories": 26}

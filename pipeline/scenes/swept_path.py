@@ -16,7 +16,7 @@ SURFACES = ("table", "study_table", "living_room_table", "floor")
 _RAY_GROUP = 5
 
 
-class Course:
+class SweptPath:
     """A copy of a model in which the only contacts are those that must not be: an object with anything but a surface.
 
     Args:

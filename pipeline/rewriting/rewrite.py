@@ -18,11 +18,11 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from pipeline.axes.language import CLASSES, MAX_WORDS, MIN_WORDS, REMEDY, Bank, Component, lint, load_bank, normalise
-from pipeline.bddl import Fact, read
-from pipeline.chat import UnusableError
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.tasks import SUITES, tasks
+from pipeline.libero.bddl import Fact, read
+from pipeline.libero.tasks import SUITES, tasks
+from pipeline.rewriting.language_model import UnusableError
 from pipeline.types import Task
 
 IDLE_ANSWERS = 3

@@ -22,13 +22,13 @@ from pipeline.axes import AnyPerturbation, from_json
 from pipeline.axes.base import Nearest
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.plan import Row
-from pipeline.tasks import find_task
-from pipeline.testset import TestSet
+from pipeline.libero.tasks import find_task
+from pipeline.run.plan import Row
+from pipeline.testset.benchmark import TestSet
 
 
 @dataclass(frozen=True)
-class Finding:
+class AxisDistance:
     """How close a plan comes to the test tasks of one axis.
 
     Attributes:
@@ -54,7 +54,7 @@ class Finding:
     verdict: str
 
 
-def check(rows: Sequence[Row], test: TestSet) -> dict[str, Finding]:
+def check(rows: Sequence[Row], test: TestSet) -> dict[str, AxisDistance]:
     """Axis to finding, in the order of the plan."""
     found: dict[str, list[tuple[Nearest, str]]] = defaultdict(list)
     kinds: dict[str, AnyPerturbation] = {}
@@ -68,12 +68,12 @@ def check(rows: Sequence[Row], test: TestSet) -> dict[str, Finding]:
     return {axis: _finding(found[axis], kind, len(test.of(axis))) for axis, kind in kinds.items()}
 
 
-def _finding(found: Sequence[tuple[Nearest, str]], kind: AnyPerturbation, test_tasks: int) -> Finding:
+def _finding(found: Sequence[tuple[Nearest, str]], kind: AnyPerturbation, test_tasks: int) -> AxisDistance:
     nearest, closest = min(found, key=lambda pair: pair[0].distance)
     comparisons = sum(one.compared for one, _ in found)
     overlaps = sum(one.distance < kind.clearance for one, _ in found)
     alike = math.isfinite(nearest.distance)
-    return Finding(
+    return AxisDistance(
         rows=len(found),
         test_tasks=test_tasks,
         comparisons=comparisons,
@@ -86,12 +86,12 @@ def _finding(found: Sequence[tuple[Nearest, str]], kind: AnyPerturbation, test_t
     )
 
 
-def write(findings: dict[str, Finding], path: Path) -> None:
+def write(findings: dict[str, AxisDistance], path: Path) -> None:
     with replaced(path) as temporary:
         temporary.write_text(json.dumps({axis: asdict(finding) for axis, finding in findings.items()}, indent=1) + "\n")
 
 
-def report(findings: dict[str, Finding]) -> Group:
+def report(findings: dict[str, AxisDistance]) -> Group:
     """The findings as a person reads them: a table that fits 80 columns, and what each distance is."""
     table = Table("axis", title="distance to the LIBERO-Plus test set", box=box.SIMPLE)
     for column in ("episodes", "tests", "overlaps", "smallest", "clearance"):
@@ -104,7 +104,7 @@ def report(findings: dict[str, Finding]) -> Group:
     return Group(table, *(Text(f"{axis}: {finding.measure}") for axis, finding in findings.items()))
 
 
-def refuse_overlap(findings: dict[str, Finding]) -> None:
+def refuse_overlap(findings: dict[str, AxisDistance]) -> None:
     """Stop a run that would train on test tasks.
 
     Raises:

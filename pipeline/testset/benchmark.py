@@ -15,7 +15,7 @@ from pathlib import Path
 from pipeline.catalogue import wheels
 from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
-from pipeline.liberoplus import Reader, Value
+from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
 
 FOLDER = Path("data/testset")
@@ -163,5 +163,5 @@ def check_counts(test: TestSet) -> None:
             f"the test set does not add up: {', '.join(faults)}",
             where=PACKAGE.requirement,
             expected="10,030 test tasks",
-            remedy="report it: pipeline/liberoplus.py misreads the wheel",
+            remedy="report it: pipeline/testset/definitions.py misreads the wheel",
         )

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import plan
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.frames import streams_of
+from pipeline.run import plan
+from pipeline.run.stores import FrameStore, TrajectoryStore
+from pipeline.run.streams import streams_of
 from pipeline.seeding import digest
-from pipeline.store import FrameStore, TrajectoryStore
 from pipeline.types import Episode, Verdict
 from pipeline.versions import versions
 

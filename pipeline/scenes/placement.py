@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import lru_cache
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import bddl, seeding
-from pipeline.axes.base import RefusedError
+from pipeline import seeding
 from pipeline.catalogue.object_model import ObjectModel
-from pipeline.physics.course import Course
-from pipeline.physics.environment import shared
-from pipeline.physics.replay import kept_actions
-from pipeline.types import Demo, Floats, Scene, Task
+from pipeline.errors import RefusedError
+from pipeline.libero import bddl
+from pipeline.scenes.swept_path import SweptPath
+from pipeline.types import Demo, Floats, RollOut, Scene
 
 SCENES, DRAWS = 12, 80
 """How often a whole scene is begun, and how often one object's place is drawn in it, before giving up."""
@@ -35,7 +33,7 @@ _DISTURBED_M = 1e-3
 _VIEWED_STATES, _VIEWED_POINTS = 6, 60
 
 
-def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int) -> Scene:
+def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, roll_out: RollOut) -> Scene:
     """Add objects to a scene: at rest on its working surface, in view, clear of the demonstration's path.
 
     Everything that was in the scene keeps its recorded state exactly. The objects' joints come last: the state is
@@ -43,13 +41,16 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int) -
 
     Args:
         seed: keys the places that are tried.
+        roll_out: tells where the demonstration's actions lead when nothing is added.
 
     Raises:
         RefusedError: when no place was found; the reason is the one that most places were refused for.
     """
     names = [f"layout{number}" for number in range(len(objects))]
     model_xml = _with(scene.model_xml, objects, names)
-    room = _Room(model_xml, scene.state, path(demo, scene), objects, names, bddl.read(demo.task.bddl_file).of_interest)
+    room = _Room(
+        model_xml, scene.state, roll_out(scene, demo), objects, names, bddl.read(demo.task.bddl_file).of_interest
+    )
     rejected: Counter[str] = Counter()
     for attempt in range(SCENES):
         poses = room.drawn(seeding.rng(seed, "layout", attempt), rejected)
@@ -70,23 +71,6 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int) -
         resolved = {"objects": placed, "scenes": attempt + 1, "rejected": dict(sorted(rejected.items()))}
         return Scene(model_xml, state, {**scene.resolved, "layout": resolved})
     raise RefusedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
-
-
-def path(demo: Demo, scene: Scene) -> Floats:
-    """(K+1, S) states that the demonstration's actions lead through when nothing is added to the scene."""
-    return _path(demo.task, scene.model_xml, scene.state.tobytes(), demo.actions.tobytes())
-
-
-@lru_cache(maxsize=4)
-def _path(task: Task, model_xml: str, state: bytes, actions: bytes) -> Floats:
-    environment = shared(task)
-    environment.restore(model_xml, np.frombuffer(state))
-    recorded = np.frombuffer(actions).reshape(-1, 7)
-    states = [environment.state]
-    for action in recorded[kept_actions(recorded, "drop")]:
-        environment.step(action)
-        states.append(environment.state)
-    return np.stack(states)
 
 
 def _with(model_xml: str, objects: Sequence[ObjectModel], names: Sequence[str]) -> str:
@@ -124,7 +108,7 @@ class _Room:
         self._old_nv = self._model.nv - 6 * len(names)
         self._state, self._states, self._objects = state, states, objects
         self._added = np.isin(self._model.geom_bodyid, [self._model.body(name).id for name in names])
-        self._course = Course(self._model, self._added, states[:, 1 : 1 + self.old_nq])
+        self._swept = SweptPath(self._model, self._added, states[:, 1 : 1 + self.old_nq])
         self._parked = np.array([[50.0 + 5 * number, 0.0, 50.0, 1.0, 0.0, 0.0, 0.0] for number in range(len(names))])
         self._targets = np.array(
             [
@@ -160,13 +144,13 @@ class _Room:
         half = (np.array(high) - np.array(low)) / 2
         turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
         corners = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * half[:2] @ turn.T + at_m
-        heights = [self._course.height(corner) for corner in corners]
+        heights = [self._swept.height(corner) for corner in corners]
         if min(heights) == -np.inf or max(heights) - min(heights) > 1e-3:
             return "off_the_surface"
         poses[number] = [*at_m, heights[0] + 0.001, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
         if not self._in_view(poses[number, :3] + [0, 0, half[2]]):
             fault = "out_of_view"
-        elif not self._course.clear(poses, DRAW_CLEARANCE_M):
+        elif not self._swept.clear(poses, DRAW_CLEARANCE_M):
             fault = "in_the_way"
         elif self._hidden(poses) > HIDDEN:
             fault = "hides_target"
@@ -190,7 +174,7 @@ class _Room:
         if upright.min() < np.cos(np.deg2rad(_TILT_DEG)) or slid.max() > _SLID_M:
             return poses, "fell_over"
         rest = np.round(rest, 6) + 0.0  # no -0.0
-        if not self._course.clear(rest, CLEARANCE_M):
+        if not self._swept.clear(rest, CLEARANCE_M):
             return poses, "in_the_way"
         if self._hidden(rest) > HIDDEN:
             return poses, "hides_target"

@@ -8,7 +8,7 @@ from pathlib import Path
 from huggingface_hub import snapshot_download
 
 from pipeline.errors import PipelineError
-from pipeline.tasks import tasks
+from pipeline.libero.tasks import tasks
 
 REPOSITORY = "yifengzhu-hf/LIBERO-datasets"
 

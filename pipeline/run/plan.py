@@ -14,11 +14,11 @@ import pyarrow.parquet as pq
 
 from pipeline.axes import AnyAxis, AnyPerturbation, PhysicsPerturbation, TextPerturbation, in_order, of_layer, to_json
 from pipeline.config import PlanConfig, ReplayConfig
-from pipeline.demos import DemoEntry
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
-from pipeline.testset import TestSet
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
 
 _ATTEMPTS = 100

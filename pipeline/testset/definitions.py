@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline import bddl
-from pipeline.bddl import Bddl
 from pipeline.errors import PipelineError
-from pipeline.tasks import tasks
+from pipeline.libero import bddl
+from pipeline.libero.bddl import Bddl
+from pipeline.libero.tasks import tasks
 
 Value = str | int | float
 
@@ -39,8 +39,8 @@ _NOISE = {
 """Component to the benchmark's function and this project's names of its parameters, in the benchmark's order."""
 
 
-class Change(NamedTuple):
-    """What a test task changes; the fields are those of ``pipeline.testset.TestTask``."""
+class TestChange(NamedTuple):
+    """What a test task changes; the fields are those of ``pipeline.testset.benchmark.TestTask``."""
 
     base: str
     axis: str
@@ -81,7 +81,7 @@ class Reader:
                 settings = re.findall(r'"(scene_xml|floor_style|wall_style)": "([^"]+)"', body)
                 yield name.lower(), dict(settings)
 
-    def change(self, suite: str, name: str) -> Change:
+    def change(self, suite: str, name: str) -> TestChange:
         """What a test task changes, by its name and, where that does not say it all, its BDDL file.
 
         Raises:
@@ -96,25 +96,25 @@ class Reader:
             kind, severity = divmod(int(number) - 1, 10)
             component = list(_NOISE)[kind]
             parameters = {"severity": severity + 1, **self._severities[component][severity]}
-            return Change(base.name, "noise", component, parameters)
+            return TestChange(base.name, "noise", component, parameters)
         if number := match["language"]:
             text = self._scene(suite, f"{base.name}_language_{number}").language
-            return Change(base.name, "language", "rewrite", {"text": text})
+            return TestChange(base.name, "language", "rewrite", {"text": text})
         if (number := match["robot"]) and int(number):
-            return Change(base.name, "robot", "initial_joints", {"id": int(number)})
+            return TestChange(base.name, "robot", "initial_joints", {"id": int(number)})
         if view := match["view"]:
-            return Change(base.name, "camera", *_camera(*map(int, view.split("_"))))
+            return TestChange(base.name, "camera", *_camera(*map(int, view.split("_"))))
         scene = self._scene(suite, name)
         if light := _LIGHT.fullmatch(scene.problem):
-            return Change(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
+            return TestChange(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
         if match["layout"]:
-            return Change(base.name, "layout", "objects", _added(scene))
+            return TestChange(base.name, "layout", "objects", _added(scene))
         if match["level"]:
             moved = _displacement(scene, bddl.read(base.bddl_file))
             drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
-            return Change(base.name, "pose", "pose", {**drawn, **moved})
+            return TestChange(base.name, "pose", "pose", {**drawn, **moved})
         component = "theme" if match["theme"] else "surface"
-        return Change(base.name, "background", component, self._textures(scene, component == "theme"))
+        return TestChange(base.name, "background", component, self._textures(scene, component == "theme"))
 
     def _scene(self, suite: str, name: str) -> Bddl:
         file = f"bddl_files/{suite}/{name}.bddl"

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pipeline.types import Floats, Scene
 
 
-class Compiled:
+class CompiledScene:
     """A scene's model and data at its state.
 
     Args:

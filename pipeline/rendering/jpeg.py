@@ -1,0 +1,37 @@
+"""Frames as a policy sees them, and as JPEG files. Light to import: no simulator, no axes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from pipeline.types import Frame
+
+if TYPE_CHECKING:
+    from pipeline.config import RenderConfig
+
+
+def to_policy(frame: Frame) -> Frame:
+    """Turn a raw LIBERO frame by 180 degrees, as OpenVLA trains and evaluates on it.
+
+    This is the only place where frames are turned. LIBERO's raw frames have their first row at the bottom.
+    """
+    return np.ascontiguousarray(frame[::-1, ::-1])
+
+
+def encode(frame: Frame, config: RenderConfig) -> bytes:
+    """JPEG file of an RGB frame; every dataset carries these bytes or pixels decoded from them."""
+    done, packed = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
+    if not done:
+        raise RuntimeError("OpenCV could not encode a frame as JPEG")
+    return packed.tobytes()
+
+
+def decode(packed: bytes) -> Frame:
+    """(H, W, 3) uint8 RGB of an encoded frame."""
+    frame = cv2.imdecode(np.frombuffer(packed, np.uint8), cv2.IMREAD_COLOR_RGB)
+    if frame is None:
+        raise ValueError("not an image that OpenCV can decode")
+    return np.asarray(frame, np.uint8)

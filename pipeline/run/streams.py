@@ -1,0 +1,32 @@
+"""Which frames an episode shows: episodes that look the same share one stream of them. No simulator here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, from_json, to_json
+from pipeline.episode_schema import SCHEMA
+from pipeline.seeding import digest
+
+
+@dataclass(frozen=True)
+class Stream:
+    """One view under the perturbations that show in it.
+
+    Attributes:
+        view: ``image`` or ``wrist_image``.
+        perturbations: render and pixel layers, in the order they apply.
+    """
+
+    view: str
+    perturbations: tuple[AnyPerturbation, ...]
+
+    @property
+    def stream_id(self) -> str:
+        return digest("stream", self.view, to_json(self.perturbations))[:16]
+
+
+def streams_of(perturbations_json: str) -> dict[str, Stream]:
+    """View name to the stream that shows it, for an episode with these perturbations."""
+    visible = [p for p in from_json(perturbations_json) if isinstance(p, RenderPerturbation | PixelPerturbation)]
+    return {view: Stream(view, tuple(p for p in visible if view in p.views)) for view in SCHEMA.views}
