@@ -13,7 +13,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import PLATE, REPOSITORY
+from conftest import BOWL, REPOSITORY
 
 from pipeline.errors import PipelineError
 from pipeline.run import manifest
@@ -27,7 +27,7 @@ def perturbed(data: Path) -> dict[str, Any]:
     (row,) = (
         row
         for row in manifest.read(data / "manifest.parquet")
-        if row["kept"] and row["axis"] == "noise" and row["task"] == PLATE.name
+        if row["kept"] and row["axis"] == "noise" and row["task"] == BOWL.name
     )
     return row
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import MILK, PLATE, STOVE
+from conftest import BOWL, MILK, STOVE
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -104,8 +104,8 @@ def test_burner_does_not_stay_lit(short_demos: Path) -> None:
 def test_replay_starts_from_the_recorded_state_and_reaches_the_recorded_goal(
     short_demos: Path, whole: dict[Task, Trajectory]
 ) -> None:
-    trajectory = replayed(short_demos, PLATE, Environment(PLATE))
-    recorded = whole[PLATE].states[-len(trajectory.states)]
+    trajectory = replayed(short_demos, BOWL, Environment(BOWL))
+    recorded = whole[BOWL].states[-len(trajectory.states)]
     assert np.array_equal(trajectory.states[0], recorded)
     assert trajectory.verdict.kept
     assert len(trajectory.states) == len(trajectory.actions) + 1 == trajectory.kept_mask.sum() + 1
@@ -126,7 +126,7 @@ def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> 
 
 def test_state_of_another_scene_is_refused(short_demos: Path, whole: dict[Task, Trajectory]) -> None:
     with pytest.raises(PipelineError, match="the recorded state has 79 numbers, the scene's has 110"):
-        Environment(MILK).restore(whole[MILK].model_xml, whole[PLATE].states[0])
+        Environment(MILK).restore(whole[MILK].model_xml, whole[BOWL].states[0])
 
 
 @pytest.mark.parametrize(

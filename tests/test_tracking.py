@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import MILK, PLATE, STOVE, starter_demo
+from conftest import BOWL, MILK, STOVE, starter_demo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -185,9 +185,9 @@ def test_auto_leaves_a_success_alone(whole: dict[Task, Trajectory]) -> None:
     def never() -> Reference:
         raise AssertionError("the reference is not needed")
 
-    trajectory = replay(Environment(PLATE), starter_demo(PLATE), "t", AUTO, (), never)
+    trajectory = replay(Environment(BOWL), starter_demo(BOWL), "t", AUTO, (), never)
     assert trajectory.mode == "open_loop"
-    assert np.array_equal(trajectory.states, whole[PLATE].states)
+    assert np.array_equal(trajectory.states, whole[BOWL].states)
 
 
 def test_recorded_states_recover_what_open_loop_loses(whole: dict[Task, Trajectory]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import MILK, PLATE, STOVE, run_stages, tiny_config
+from conftest import BOWL, MILK, STOVE, run_stages, tiny_config
 
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
@@ -75,17 +75,17 @@ def take_credit(tree: Tree) -> None:
 IN_RLDS: dict[tuple[str, Task], Callable[[Tree], None]] = {
     ("camera", STOVE): swap_cameras,
     ("camera", MILK): flip_gripper,
-    ("clean", PLATE): turn_back,
-    ("noise", PLATE): freeze,
+    ("clean", BOWL): turn_back,
+    ("noise", BOWL): freeze,
     ("language", STOVE): change_text,
     ("noise", MILK): truncate,
-    ("language", PLATE): end_early,
+    ("language", BOWL): end_early,
     ("clean", MILK): take_credit,
 }
 """Axis and task to what is done to the episode's example."""
 
 
-BLACK, CHANGED, LATE = ("noise", STOVE), ("clean", STOVE), ("camera", PLATE)
+BLACK, CHANGED, LATE = ("noise", STOVE), ("clean", STOVE), ("camera", BOWL)
 """In LeRobot black from one camera, with another action, and timed late."""
 
 EXPECTED = {
@@ -93,14 +93,14 @@ EXPECTED = {
     ("cameras", "rlds", ("camera", STOVE)),
     ("rendered", "rlds", ("camera", STOVE)),  # The one of its axis that is rendered anew.
     ("motion", "rlds", ("camera", MILK)),
-    ("jpeg", "rlds", ("clean", PLATE)),
-    ("rendered", "rlds", ("clean", PLATE)),
-    ("jpeg", "rlds", ("noise", PLATE)),
-    ("alive", "rlds", ("noise", PLATE)),
+    ("jpeg", "rlds", ("clean", BOWL)),
+    ("rendered", "rlds", ("clean", BOWL)),
+    ("jpeg", "rlds", ("noise", BOWL)),
+    ("alive", "rlds", ("noise", BOWL)),
     ("instruction", "rlds", ("language", STOVE)),
     ("length", "rlds", ("noise", MILK)),
     ("flags", "rlds", ("noise", MILK)),
-    ("flags", "rlds", ("language", PLATE)),
+    ("flags", "rlds", ("language", BOWL)),
     ("provenance", "rlds", ("clean", MILK)),
     ("video", "lerobot", BLACK),
     ("alive", "lerobot", BLACK),
@@ -124,7 +124,7 @@ def named(rows: Rows) -> dict[str, tuple[str, Task] | str]:
     names: dict[str, tuple[str, Task] | str] = {}
     for row in rows:
         if row["kept"]:
-            name = (row["axis"], next(task for task in (STOVE, PLATE, MILK) if task.name == row["task"]))
+            name = (row["axis"], next(task for task in (STOVE, BOWL, MILK) if task.name == row["task"]))
             names[row["episode_id"]] = "other" if name in names.values() else name
     return names
 
