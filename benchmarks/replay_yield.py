@@ -29,9 +29,8 @@ from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay_plan
 from pipeline.run import plan
 from pipeline.run.compute import runner
-from pipeline.run.stores import TrajectoryStore
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
-from pipeline.types import Verdict
 
 AXES = ("robot", "pose", "layout")
 SATURATED = 0.93
@@ -57,21 +56,22 @@ def main() -> None:
         rows |= {row.episode_id: row for row in plan.make(entries, drawn, REPLAY, test)}
     with tempfile.TemporaryDirectory() as temporary, runner(ComputeConfig()) as run:
         store = TrajectoryStore(arguments.folder or Path(temporary))
-        verdicts = replay_plan(list(rows.values()), demos, REPLAY, store.root, run)
-        lines = _lines(rows.values(), verdicts, store)
-        shapes = list(_shapes(rows.values(), verdicts, store))
+        replay_plan(list(rows.values()), demos, REPLAY, store.root, run)
+        replayed = store.rows()
+        lines = _lines(rows.values(), replayed)
+        shapes = list(_shapes(rows.values(), replayed, store))
     _print(lines)
     print(json.dumps({"yields": lines, "smoothness": _medians(shapes)}))
 
 
-def _lines(rows: Iterable[plan.Row], verdicts: Mapping[str, Verdict], store: TrajectoryStore) -> list[dict[str, Any]]:
+def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """A line for each axis and level. Draws that the scene refuses are counted apart, as they cost no replay."""
     reasons: dict[tuple[str, int], dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
     for row in rows:
         level: int = from_json(row.perturbations)[0].level if row.perturbations != "[]" else 0
-        reason = verdicts[row.trajectory_id].reason
-        mode, steps, _ = store.outcome(row.trajectory_id)
-        if not steps:
+        outcome = replayed[row.trajectory_id]
+        reason, mode = outcome["reason"], outcome["mode"]
+        if not outcome["steps"]:
             reason = f"refused: {reason}"
         elif reason == "kept":
             # In `auto`, what is kept as tracked has failed open-loop before.
@@ -94,12 +94,13 @@ def _lines(rows: Iterable[plan.Row], verdicts: Mapping[str, Verdict], store: Tra
 
 
 def _shapes(
-    rows: Iterable[plan.Row], verdicts: Mapping[str, Verdict], store: TrajectoryStore
+    rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]], store: TrajectoryStore
 ) -> Iterator[dict[str, float]]:
     """How each tracked replay compares with what the demonstrator did, as ratios."""
     twins = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
     for row in rows:
-        if verdicts[row.trajectory_id].kept and store.outcome(row.trajectory_id)[0] == "tracked":
+        outcome = replayed[row.trajectory_id]
+        if outcome["kept"] and outcome["mode"] == "tracked":
             own, twin = (_shape(store, trajectory_id) for trajectory_id in (row.trajectory_id, twins[row.demo_id]))
             ratios = {name: own[name] / twin[name] for name in own if name != "saturated"}
             yield ratios | {"saturated": own["saturated"], "saturated_twin": twin["saturated"]}

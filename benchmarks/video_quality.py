@@ -32,7 +32,7 @@ from pipeline.physics.replay import ReplayJob
 from pipeline.rendering.jpeg import decode, encode, to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.compute import runner
-from pipeline.run.stores import TrajectoryStore
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.types import Frame
 from pipeline.writers.video import VideoEncoder
 

@@ -3,16 +3,16 @@
 import json
 
 from pipeline.config import Config
-from pipeline.run import plan
+from pipeline.run import outcome
 from pipeline.run.compute import runner
-from pipeline.run.episode_loader import EpisodeLoader, kept
+from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.stage import main
 from pipeline.writers import lerobot
 
 
 def run(config: Config) -> None:
     plan_file = config.data / "plan.parquet"
-    ids = kept(plan.read(plan_file), config.data, config.render)
+    ids = outcome.read(config).kept
     load = EpisodeLoader(plan_file, config.data / "frames", config.render)
     target = config.export.lerobot
     out = config.data / "lerobot" / target.name

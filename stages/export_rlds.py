@@ -4,20 +4,20 @@ import json
 
 from pipeline.config import Config
 from pipeline.files import keep_only
-from pipeline.run import plan
+from pipeline.run import outcome
 from pipeline.run.compute import runner
-from pipeline.run.episode_loader import EpisodeLoader, kept
+from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.stage import main
 from pipeline.writers import rlds
 
 
 def run(config: Config) -> None:
     plan_file = config.data / "plan.parquet"
-    rows = plan.read(plan_file)
-    ids = kept(rows, config.data, config.render)
+    became = outcome.read(config)
+    ids = became.kept
     load = EpisodeLoader(plan_file, config.data / "frames", config.render)
     target = config.export.rlds
-    sets = rlds.by_suite(ids, {row.episode_id: row.suite for row in rows}, target.name)
+    sets = rlds.by_suite(ids, {row.episode_id: row.suite for row in became.rows}, target.name)
     out = config.data / "rlds"
     locations: dict[str, rlds.Location] = {}
     with runner(config.compute) as workers:

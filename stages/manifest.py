@@ -3,26 +3,17 @@
 import json
 
 from pipeline.config import Config
-from pipeline.run import manifest, motion_statistics, plan
-from pipeline.run.episode_loader import EpisodeLoader, kept, outcome, verdicts
+from pipeline.run import manifest, motion_statistics, outcome
+from pipeline.run.frame_store import FrameStore
 from pipeline.run.stage import main
-from pipeline.run.stores import FrameStore, TrajectoryStore
 from pipeline.writers.rlds import by_suite
 
 
 def run(config: Config) -> None:
     data = config.data
-    plan_file, trajectories = data / "plan.parquet", data / "trajectories"
-    rows = plan.read(plan_file)
-    known = verdicts(rows, trajectories)
-    became = outcome(rows, data, config.render)
-    store, frames = TrajectoryStore(trajectories), FrameStore(data / "frames", config.render)
-    rendered = {row.trajectory_id for row in rows if became[row.episode_id].kept}
+    run = outcome.read(config)
     table = manifest.build(
-        rows,
-        outcome=became,
-        replayed={trajectory_id: store.outcome(trajectory_id) for trajectory_id in known},
-        devices={trajectory_id: frames.device(trajectory_id) for trajectory_id in rendered},
+        run,
         rlds={
             episode: (shard, index) for episode, (shard, index) in json.loads((data / "rlds.json").read_text()).items()
         },
@@ -30,11 +21,13 @@ def run(config: Config) -> None:
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 
-    load = EpisodeLoader(plan_file, data / "frames", config.render)
-    ids = kept(rows, data, config.render)
-    sets = by_suite(ids, {row.episode_id: row.suite for row in rows}, config.export.rlds.name)
+    rows = {row.episode_id: row for row in run.rows}
+    frames = FrameStore(data / "frames", config.render)
+    motions = {row: frames.motion(row) for row in dict.fromkeys(rows[episode].trajectory_id for episode in run.kept)}
+    sets = by_suite(run.kept, {row.episode_id: row.suite for row in run.rows}, config.export.rlds.name)
     figures = {
-        name: motion_statistics.openvla([load.motion(episode) for episode in members]) for name, members in sets.items()
+        name: motion_statistics.openvla([motions[rows[episode].trajectory_id] for episode in members])
+        for name, members in sets.items()
     }
     (data / "dataset_statistics.json").write_text(json.dumps(figures, indent=1) + "\n")
     (data / "counts.json").write_text(json.dumps(manifest.counts(table.to_pylist()), indent=1) + "\n")

@@ -1,11 +1,11 @@
 """Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped."""
 
 from pipeline.config import Config
-from pipeline.files import keep_only
 from pipeline.rendering.render import render_plan
 from pipeline.rendering.renderer import GL
 from pipeline.run import plan
 from pipeline.run.compute import runner
+from pipeline.run.frame_store import FrameStore
 from pipeline.run.stage import main
 
 
@@ -15,7 +15,7 @@ def run(config: Config) -> None:
     folder = config.data / "frames"
     with runner(config.compute) as workers:
         rendered = render_plan(rows, config, config.data / "trajectories", folder, workers)
-    keep_only(folder, {f"{trajectory_id}.h5" for trajectory_id in rendered})
+    FrameStore(folder, config.render).keep(rendered)
     print(f"rendered {len(rendered)} trajectories into {folder}")
 
 

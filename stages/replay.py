@@ -3,11 +3,11 @@
 import json
 
 from pipeline.config import Config
-from pipeline.files import keep_only
 from pipeline.physics.replay import replay_plan
 from pipeline.run import plan
 from pipeline.run.compute import runner
 from pipeline.run.stage import main
+from pipeline.run.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:
@@ -15,7 +15,7 @@ def run(config: Config) -> None:
     folder = config.data / "trajectories"
     with runner(config.compute) as workers:
         verdicts = replay_plan(rows, config.demos, config.replay, folder, workers)
-    keep_only(folder, {f"{trajectory_id}.h5" for trajectory_id in verdicts})
+    TrajectoryStore(folder).keep(verdicts)
     kept = sum(verdict.kept for verdict in verdicts.values())
     (config.data / "replay.json").write_text(json.dumps({"replayed": len(verdicts), "kept": kept}) + "\n")
     print(f"replayed {len(verdicts)} trajectories, {kept} reach their goal")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.jpeg import decode, encode, to_policy
 from pipeline.rendering.render import render
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.stores import FrameStore
+from pipeline.run.frame_store import FrameStore, stream_ids
 from pipeline.run.streams import Stream, streams_of
 from pipeline.scenes.compiled import proprioception
 from pipeline.seeding import rng
@@ -178,6 +179,7 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     assert rendered.rejected == {streams[1].stream_id: "too_dark"}
     assert set(rendered.streams) == {streams[0].stream_id, streams[2].stream_id}
     store = FrameStore(tmp_path, RenderConfig())
-    store.save("t", rendered)
-    assert store.streams("t") == {stream.stream_id for stream in streams}
-    assert store.rejected("t") == rendered.rejected
+    store.save("t", rendered, "some device")
+    row = store.rows()["t"]
+    assert stream_ids(row) == {stream.stream_id for stream in streams}
+    assert json.loads(row["rejected"]) == rendered.rejected

@@ -29,7 +29,7 @@ from pipeline.rendering.jpeg import decode
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest, plan
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.stores import TrajectoryStore
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.validation import oft_check
 
 

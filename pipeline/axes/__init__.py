@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeVar, get_args
 
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
 from pipeline.axes.base import (
     Frozen,
+    Layer,
     Perturbation,
     PhysicsPerturbation,
     PixelPerturbation,
@@ -60,6 +61,9 @@ class Axes(Frozen):
     language: LanguageAxis | None = None
 
 
+_LAYERS: dict[str, Layer] = {
+    kind.model_fields["axis"].default: kind.layer for kind in get_args(get_args(AnyPerturbation)[0])
+}
 _PLACE = {axis: place for place, axis in enumerate(Axes.model_fields)}
 
 
@@ -77,6 +81,11 @@ def axes_of(name: str) -> tuple[str, ...]:
     if len(set(axes)) < len(axes):
         raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
     return tuple(sorted(axes, key=_PLACE.__getitem__))
+
+
+def layer_of(axis: str) -> Layer:
+    """The layer that an axis, by its name, changes."""
+    return _LAYERS[axis]
 
 
 def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:
@@ -123,6 +132,7 @@ __all__ = [
     "axes_of",
     "from_json",
     "in_order",
+    "layer_of",
     "of_layer",
     "to_json",
 ]

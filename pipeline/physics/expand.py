@@ -24,7 +24,7 @@ from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay_plan
 from pipeline.run import plan
 from pipeline.run.compute import Run
-from pipeline.run.stores import TrajectoryStore
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.scenes.compiled import CompiledScene, proprioception
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Scene, Trajectory

@@ -20,7 +20,8 @@ from pipeline.physics.success import verdict
 from pipeline.physics.tracking import Route, follow
 from pipeline.run.compute import Run
 from pipeline.run.plan import Row, pending
-from pipeline.run.stores import TrajectoryStore
+from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.run.trajectory_store import verdicts as verdicts_of
 from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
 
@@ -167,12 +168,11 @@ def _replay(
     folder: Path,
     run: Run,
 ) -> dict[str, Verdict]:
-    store = TrajectoryStore(folder)
     row_of = {row.trajectory_id: row for row in rows}
     twin_of = {row.demo_id: row.trajectory_id for row in twins}
+    stored = verdicts_of(TrajectoryStore(folder).refresh())
     while needed := pending(rows, verdicts):
-        found = {trajectory_id: store.verdict(trajectory_id) for trajectory_id in needed}
-        verdicts |= {trajectory_id: verdict for trajectory_id, verdict in found.items() if verdict is not None}
+        verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed if trajectory_id in stored}
         # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
         jobs = [
             ReplayJob(
@@ -185,7 +185,7 @@ def _replay(
                 folder,
             )
             for trajectory_id in sorted(needed, key=lambda trajectory_id: row_of[trajectory_id].demo_id)
-            if found[trajectory_id] is None
+            if trajectory_id not in stored
         ]
         if jobs:
             judged = run(ReplayJob.__call__, jobs, "replay")

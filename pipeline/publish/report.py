@@ -26,6 +26,7 @@ from pipeline.publish.sheets import describe
 from pipeline.publish.yields import Rows, Table
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.frame_store import FrameStore
 from pipeline.run.streams import streams_of
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats
@@ -63,7 +64,7 @@ def page(config: Config, test: TestSet) -> str:
     kept = [row for row in asked if row["kept"]]
     if not kept:
         raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
-    actions = _actions(kept, load)
+    actions = _actions(kept, FrameStore(data / "frames", config.render))
     axes = list(dict.fromkeys(row["axis"] for row in kept))
     sheets = _pictures(data / "sheets")
     environment = Environment(
@@ -113,12 +114,12 @@ def _headline(asked: Rows, kept: Rows) -> dict[str, str]:
     return {name: f"{count:,}" for name, count in counts.items()}
 
 
-def _actions(kept: Rows, load: EpisodeLoader) -> dict[str, Floats]:
+def _actions(kept: Rows, frames: FrameStore) -> dict[str, Floats]:
     """Episode id to its actions (T, 7); episodes of one trajectory share the array."""
     read: dict[str, Floats] = {}
     for row in kept:
         if row["trajectory_id"] not in read:
-            read[row["trajectory_id"]] = load.motion(row["episode_id"])[0].astype(np.float64)
+            read[row["trajectory_id"]] = frames.motion(row["trajectory_id"])[0].astype(np.float64)
     return {row["episode_id"]: read[row["trajectory_id"]] for row in kept}
 
 

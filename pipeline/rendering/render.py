@@ -13,13 +13,15 @@ from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_l
 from pipeline.axes.light import exposure
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
 from pipeline.rendering.jpeg import encode, to_policy
 from pipeline.rendering.renderer import GL, Renderer
 from pipeline.run.compute import Run
-from pipeline.run.episode_loader import rejected, verdicts
+from pipeline.run.frame_store import FrameStore, Rendered, stream_ids
+from pipeline.run.outcome import rejections, replayed
 from pipeline.run.plan import Row, select
-from pipeline.run.stores import FrameStore, Rendered, TrajectoryStore
 from pipeline.run.streams import Stream, streams_of
+from pipeline.run.trajectory_store import TrajectoryStore, verdicts
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Trajectory
 
@@ -75,20 +77,27 @@ class RenderJob:
 
     def __call__(self) -> None:
         """Render what is missing and store it with what an earlier run already rendered."""
-        store = FrameStore(self.frames, self.config, GL.device)
-        there = store.streams(self.trajectory_id)
+        store, device = FrameStore(self.frames, self.config), GL.device
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
-        rendered = render(trajectory, [s for s in self.streams if s.stream_id not in there], self.config)
-        refused = store.rejected(self.trajectory_id) if there else {}
-        earlier = [s.stream_id for s in self.streams if s.stream_id in there and s.stream_id not in refused]
-        if there:
-            known = store.load(self.trajectory_id, earlier)
+        earlier = self._earlier(store, device)
+        known = {*earlier.streams, *earlier.rejected} if earlier else set()
+        rendered = render(trajectory, [stream for stream in self.streams if stream.stream_id not in known], self.config)
+        if earlier:
             rendered = replace(
                 rendered,
-                streams={**rendered.streams, **known.streams},
-                rejected={**rendered.rejected, **refused},
+                streams={**rendered.streams, **earlier.streams},
+                rejected={**rendered.rejected, **earlier.rejected},
             )
-        store.save(self.trajectory_id, rendered)
+        store.save(self.trajectory_id, rendered, device)
+
+    def _earlier(self, store: FrameStore, device: str) -> Rendered | None:
+        """What is stored of the wanted streams, from the same device."""
+        wanted = {stream.stream_id for stream in self.streams}
+        row = store.row(self.trajectory_id)
+        if row is None or row["device"] != device:
+            return None
+        stored = store.load(self.trajectory_id, sorted(wanted & set(row["streams"])))
+        return replace(stored, rejected={name: why for name, why in stored.rejected.items() if name in wanted})
 
 
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, run: Run) -> set[str]:
@@ -97,26 +106,41 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing.
 
     Returns:
-        The trajectories that have a file in ``folder`` now.
+        The trajectories whose frames the plan needs; all have a file in ``folder`` now.
+
+    Raises:
+        PipelineError: when a trajectory is missing, or rendering leaves the same work undone.
     """
-    store = FrameStore(folder, config.render, GL.device)
-    judged = verdicts(rows, trajectories)
+    store, device = FrameStore(folder, config.render), GL.device
+    judged = verdicts(replayed(rows, trajectories))
     steps = {row.trajectory_id: row.demo_steps for row in rows}
+    undone: set[str] = set()
     while True:
-        refused = rejected(rows, store)
-        outcome = select(rows, judged, refused)
-        streams: dict[str, dict[str, Stream]] = {}
+        stored = {name: row for name, row in store.refresh().items() if row["device"] == device}
+        rejected = rejections(rows, stored)
+        outcome = select(rows, judged, rejected)
+        needed: dict[str, dict[str, Stream]] = {}
         for row in rows:
-            if outcome[row.episode_id].kept or row.episode_id in refused:
-                shown = streams.setdefault(row.trajectory_id, {})
-                shown |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+            # A rejected stream stays needed: without it, its episode would be tried again.
+            if outcome[row.episode_id].kept or row.episode_id in rejected:
+                streams = needed.setdefault(row.trajectory_id, {})
+                streams |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
         jobs = [
-            RenderJob(trajectory_id, tuple(shown.values()), trajectories, folder, config.render)
-            for trajectory_id, shown in streams.items()
-            if store.streams(trajectory_id) != set(shown)
+            RenderJob(trajectory_id, tuple(streams.values()), trajectories, folder, config.render)
+            for trajectory_id, streams in needed.items()
+            if trajectory_id not in stored or stream_ids(stored[trajectory_id]) != set(streams)
         ]
         if not jobs:
-            return set(streams)
+            return set(needed)
+        keys = {f"{job.trajectory_id} {sorted(stream.stream_id for stream in job.streams)}" for job in jobs}
+        if keys == undone:
+            raise PipelineError(
+                f"{len(jobs)} trajectories were rendered and are still not there, such as this one",
+                where=store.path(jobs[0].trajectory_id),
+                expected=f"files written by workers into this folder, rendered on {device}",
+                remedy="check that all workers see this folder and have the same versions and OpenGL device",
+            )
+        undone = keys
         # The longest first, so that no worker is left alone with one at the end.
         jobs.sort(key=lambda job: -steps[job.trajectory_id] * len(job.streams))
         run(RenderJob.__call__, jobs, "render")

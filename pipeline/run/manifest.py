@@ -18,9 +18,8 @@ from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import replaced, schema_file
-from pipeline.run.plan import Row
-from pipeline.types import Verdict
-from pipeline.versions import versions
+from pipeline.identity import versions
+from pipeline.run.outcome import Outcome
 
 SCHEMA_FILE = schema_file("manifest.json")
 """Column names, types and meanings."""
@@ -45,42 +44,33 @@ class Settings(Frozen):
         return cls(source=config.demos.source, replay=config.replay, render=config.render)
 
 
-def build(
-    rows: Sequence[Row],
-    outcome: Mapping[str, Verdict],
-    replayed: Mapping[str, tuple[str, int, str]],
-    devices: Mapping[str, str],
-    rlds: Mapping[str, tuple[str, int]],
-    lerobot: Mapping[str, int],
-) -> pa.Table:
+def build(run: Outcome, rlds: Mapping[str, tuple[str, int]], lerobot: Mapping[str, int]) -> pa.Table:
     """Join the plan with what became of it.
 
     Args:
-        rows: the plan.
-        outcome: episode id to verdict.
-        replayed: trajectory id to the mode used, the number of executed actions and what physics perturbations came to.
-        devices: trajectory id to the OpenGL device that rendered it, for every rendered trajectory.
+        run: the plan, and what replay and rendering made of it.
         rlds: episode id to its shard's file name and its place in it, for every kept episode.
         lerobot: episode id to its ``episode_index``, for every kept episode.
     """
     shared = {version_column(name): version for name, version in versions().items()}
     table = []
-    for row in rows:
-        verdict = outcome[row.episode_id]
-        mode, steps, resolved = replayed.get(row.trajectory_id, (None, None, None))
+    for row in run.rows:
+        verdict = run.verdicts[row.episode_id]
+        replayed = run.trajectories.get(row.trajectory_id, {})
+        rendered = run.frames.get(row.trajectory_id, {})
         shard, index = rlds.get(row.episode_id, (None, None))
-        made: dict[str, Any] = {
+        columns: dict[str, Any] = {
             "kept": verdict.kept,
             "reason": verdict.reason,
-            "replay_mode": mode,
-            "steps": steps,
-            "resolved": resolved,
-            "gl_device": devices.get(row.trajectory_id),
+            "replay_mode": replayed.get("mode"),
+            "steps": replayed.get("steps"),
+            "resolved": replayed.get("resolved"),
+            "gl_device": rendered.get("device"),
             "rlds_shard": shard,
             "rlds_index": index,
             "lerobot_episode_index": lerobot.get(row.episode_id),
         }
-        table.append(asdict(row) | made | shared)
+        table.append(asdict(row) | columns | shared)
     return pa.Table.from_pylist(table, schema=schema())
 
 

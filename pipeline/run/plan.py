@@ -12,7 +12,17 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.axes import AnyAxis, AnyPerturbation, PhysicsPerturbation, TextPerturbation, in_order, of_layer, to_json
+from pipeline.axes import (
+    AnyAxis,
+    AnyPerturbation,
+    PhysicsPerturbation,
+    TextPerturbation,
+    in_order,
+    layer_of,
+    of_layer,
+    to_json,
+)
+from pipeline.axes.base import Layer
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
@@ -212,7 +222,8 @@ def pending(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> list[str]:
     """
     wanted: dict[str, None] = {}
     for group in _groups(rows):
-        need = sum(row.wanted for row in group)
+        # Frames are made after all physics: where they may be rejected, every reserve must have been replayed by then.
+        need = len(group) if _frames_may_be_rejected(group[0]) else sum(row.wanted for row in group)
         for row in group:
             verdict = verdicts.get(row.trajectory_id)
             if need and (verdict is None or verdict.kept):
@@ -220,6 +231,12 @@ def pending(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> list[str]:
                 if verdict is None:
                     wanted[row.trajectory_id] = None
     return list(wanted)
+
+
+def _frames_may_be_rejected(row: Row) -> bool:
+    """Whether a row has physics of its own and also a change of its scene's looks that may turn out black or white."""
+    layers = {layer_of(axis) for axis in row.axis.split("+") if axis != "clean"}
+    return {Layer.PHYSICS, Layer.RENDER} <= layers
 
 
 def select(

@@ -17,17 +17,17 @@ from numpy.typing import NDArray
 
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
+from pipeline.identity import versions
 from pipeline.physics.replay import ReplayJob
 from pipeline.rendering.render import RenderJob
 from pipeline.rendering.renderer import GL
 from pipeline.run import manifest, plan
 from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.stores import FrameStore
+from pipeline.run.frame_store import FrameStore
 from pipeline.run.streams import streams_of
 from pipeline.types import Verdict
 from pipeline.validation.shards import METADATA, columns, records
-from pipeline.versions import versions
 from pipeline.writers import rlds
 
 Row = Mapping[str, Any]
@@ -136,7 +136,7 @@ def _rebuild(
     if not verdict.kept:
         return None, verdict.reason
     RenderJob(trajectory_id, streams, trajectories, frames, settings.render)()
-    if rejected := FrameStore(frames, settings.render).rejected(trajectory_id):
+    if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)
     made = rlds.write([row["episode_id"]], load, out / "rlds", name="regenerated", shards=1, run=loop)

@@ -23,7 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.run import manifest
 from pipeline.run.compute import Run
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.stores import TrajectoryStore
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.validation import oft, set_checks
 from pipeline.validation.checks import CHECKS, Case, Fault
 from pipeline.validation.readback import UNREADABLE, Copy, LeRobotSet, from_lerobot, from_rlds, open_lerobot

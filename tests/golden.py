@@ -1,0 +1,139 @@
+"""A few short real episodes whose results are written down: `python tests/golden.py` adds what is not yet there.
+
+Numbers that are there are never written over. Where a result has changed, raise its layer's number in
+``pipeline.identity.RECIPES`` in the same commit and run this again: then every stored file of that layer is made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+if __name__ == "__main__":  # run as a script, from anywhere
+    sys.path[:0] = [os.fspath(Path(__file__).parent.parent)]
+
+from pipeline import gl, identity
+from pipeline.axes import PhysicsPerturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer
+from pipeline.config import RenderConfig, ReplayConfig
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
+from pipeline.physics.environment import Environment
+from pipeline.physics.reference import Reference
+from pipeline.physics.replay import replay
+from pipeline.rendering.jpeg import encode
+from pipeline.rendering.renderer import Renderer
+from pipeline.types import Floats, Frame, Trajectory
+
+FILE = Path(__file__).with_name("golden.json")
+STEPS = 25
+"""How much of a trajectory is written down; later, contacts magnify what two processors compute differently."""
+DECIMALS = 6
+CELLS = 8
+"""Thumbnails are CELLS x CELLS means: what any renderer must show, to a grey level or so."""
+
+
+@dataclass
+class Golden:
+    """What the recorded cases come to here and now."""
+
+    cases: dict[str, str]
+
+    @cached_property
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Case to replay, for the clean one and those that change physics."""
+        source, task = StarterSource(), find_task("libero_goal", "put_the_bowl_on_the_plate")
+        demo = source.load(source.index([task]).entries[0].demo_id)
+        environment = Environment(task)
+        clean = replay(environment, demo, "clean", ReplayConfig())
+        replays = {"clean": clean}
+        for case, listed in self.cases.items():
+            if physics := of_layer(from_json(listed), PhysicsPerturbation):
+                reference = Reference.of(clean.model_xml, clean.states, clean.actions)
+                config = ReplayConfig(mode="tracked" if case == "robot" else "open_loop")
+                replays[case] = replay(environment, demo, case, config, physics, lambda reference=reference: reference)
+        environment.close()
+        if refused := [case for case, trajectory in replays.items() if not len(trajectory.actions)]:
+            raise ValueError(f"refused in this scene, so they show nothing: {refused}")
+        return replays
+
+    @cached_property
+    def frames(self) -> dict[str, Frame]:
+        """``<case> <camera>`` to the first frame."""
+        frames = {}
+        for case, listed in self.cases.items():
+            perturbations = from_json(listed)
+            trajectory = self.trajectories.get(case, self.trajectories["clean"])
+            renderer = Renderer(trajectory.model_xml)
+            with renderer.perturbed(of_layer(perturbations, RenderPerturbation)):
+                renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+                for camera in ("agentview", "robot0_eye_in_hand"):
+                    frame = renderer.frame(camera)
+                    for noise in of_layer(perturbations, PixelPerturbation):
+                        frame = noise.apply(frame, 0)
+                    frames[f"{case} {camera}"] = frame
+            renderer.close()
+        return frames
+
+    def physics(self) -> dict[str, str]:
+        return {case: _digest(trajectory) for case, trajectory in self.trajectories.items()}
+
+    def pixels(self) -> dict[str, str]:
+        return {name: hashlib.sha256(frame.tobytes()).hexdigest()[:16] for name, frame in self.frames.items()}
+
+    def thumbnails(self) -> dict[str, list[list[float]]]:
+        return {name: np.round(thumbnail(frame), 1).tolist() for name, frame in self.frames.items()}
+
+    def encoding(self) -> str:
+        """Of a picture that no renderer made."""
+        rows, columns = np.mgrid[0:256, 0:256]
+        picture = np.stack([rows, columns, rows ^ columns], axis=-1).astype(np.uint8)
+        return hashlib.sha256(encode(picture, RenderConfig())).hexdigest()[:16]
+
+
+def thumbnail(frame: Frame) -> Floats:
+    """(CELLS, CELLS) mean grey levels of a frame."""
+    height, width, _ = frame.shape
+    cells: Floats = frame.reshape(CELLS, height // CELLS, CELLS, width // CELLS, 3).mean(axis=(1, 3, 4))
+    return cells
+
+
+def _digest(trajectory: Trajectory) -> str:
+    # Adding zero turns a rounded -0.0 into 0.0.
+    rounded = np.round(
+        np.concatenate([trajectory.states[:STEPS].ravel(), trajectory.actions[:STEPS].ravel()]), DECIMALS
+    )
+    return hashlib.sha256((rounded + 0.0).tobytes()).hexdigest()[:16]
+
+
+def recorded() -> dict[str, Any]:
+    """The file: cases, and for each layer its recipe number to the results."""
+    content: dict[str, Any] = json.loads(FILE.read_text())
+    return content
+
+
+def main() -> None:
+    gl.choose()
+    content = recorded()
+    golden, device = Golden(content["cases"]), gl.choose().device
+    number = {layer: str(recipe) for layer, recipe in identity.RECIPES.items()}
+    pixels = content["pixels"].setdefault(number["pixels"], {"thumbnails": golden.thumbnails(), "devices": {}})
+    for known, key, result, layer in (
+        (content["physics"], number["physics"], golden.physics(), "physics"),
+        (pixels["devices"], device, golden.pixels(), "pixels"),
+        (content["encoding"], number["encoding"], golden.encoding(), "encoding"),
+    ):
+        if known.setdefault(key, result) != result:
+            sys.exit(f"{layer} has changed and its number has not: raise pipeline.identity.RECIPES[{layer!r}]")
+    FILE.write_text(json.dumps(content, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

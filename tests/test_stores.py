@@ -1,0 +1,218 @@
+"""What is stored is current or missing, the table tells it without opening files, and nothing shrinks in silence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+from conftest import BOWL, tiny_config
+
+from pipeline import identity
+from pipeline.axes import to_json
+from pipeline.axes.light import LightPerturbation
+from pipeline.axes.robot import RobotPerturbation
+from pipeline.config import Config
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.physics.replay import replay_plan
+from pipeline.rendering.render import RenderJob, render_plan
+from pipeline.rendering.renderer import GL
+from pipeline.run import outcome, plan
+from pipeline.run.compute import loop
+from pipeline.run.frame_store import FrameStore, Rendered
+from pipeline.run.store import TABLE
+from pipeline.run.trajectory_store import TrajectoryStore, verdicts
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Verdict
+
+
+@pytest.fixture(scope="module")
+def config(short_demos: Path) -> Config:
+    fields = tiny_config(short_demos)
+    fields["demos"] = {"source": "hdf5", "root": str(short_demos), "tasks": [f"{BOWL.suite}/{BOWL.name}"]}
+    fields["plan"] = {"seed": 7, "axes": {"light": {}}, "episodes": {"light": 1}, "reserve": 1.0}
+    return Config.model_validate(fields)
+
+
+@pytest.fixture(scope="module")
+def rows(config: Config) -> list[plan.Row]:
+    """A clean twin, a light episode and its reserve."""
+    return plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
+
+
+@pytest.fixture(scope="module")
+def replayed(config: Config, rows: list[plan.Row], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("replayed")
+    judged = replay_plan(rows, config.demos, config.replay, folder, loop)
+    TrajectoryStore(folder).keep(judged)
+    assert all(verdict.kept for verdict in judged.values())
+    return folder
+
+
+@pytest.fixture
+def trajectories(replayed: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(replayed, tmp_path / "trajectories"))
+
+
+def test_the_table_spares_opening_the_files(replayed: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = TrajectoryStore(replayed).rows()
+    assert len(rows) == 1
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("a file was opened although the table tells what is in it")
+
+    monkeypatch.setattr(h5py, "File", never)
+    assert TrajectoryStore(replayed).rows() == rows
+
+
+def test_a_lost_or_damaged_table_is_rebuilt(trajectories: Path) -> None:
+    rows = TrajectoryStore(trajectories).rows()
+    (trajectories / TABLE).write_bytes(b"PAR1 and then nothing")
+    assert TrajectoryStore(trajectories).rows() == rows
+    (trajectories / TABLE).unlink()
+    assert TrajectoryStore(trajectories).refresh() == rows
+    assert (trajectories / TABLE).exists()
+
+
+def _shorten(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-100])
+
+
+def _remove(file: Path) -> None:
+    file.unlink()
+
+
+def _make_foreign(file: Path) -> None:
+    with h5py.File(file, "r+") as opened:
+        opened.attrs["made_by"] = "somebody else"
+
+
+def _take_out_states(file: Path) -> None:
+    with h5py.File(file, "r+") as opened:
+        del opened["states"]
+
+
+@pytest.mark.parametrize("fault", [_shorten, _remove, _make_foreign, _take_out_states])
+def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_made_again(
+    config: Config, rows: list[plan.Row], trajectories: Path, fault: Any
+) -> None:
+    file = next(trajectories.glob("*.h5"))
+    before = file.read_bytes()
+    fault(file)
+    with pytest.raises(PipelineError, match=rf"(?s){file.name}.*run the replay stage again"):
+        outcome.replayed(rows, trajectories)
+    replay_plan(rows, config.demos, config.replay, trajectories, loop)
+    assert file.read_bytes() == before
+    assert outcome.replayed(rows, trajectories)
+
+
+@pytest.mark.parametrize("layer", identity.RECIPES)
+def test_another_recipe_makes_its_layer_and_all_after_it_anew(
+    layer: identity.Layer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    layers = list(identity.RECIPES)
+    before = {each: identity.fingerprint(each) for each in layers}
+    identity._recipe.cache_clear()
+    monkeypatch.setitem(identity.RECIPES, layer, identity.RECIPES[layer] + 1)
+    changed = {each for each in layers if identity.fingerprint(each) != before[each]}
+    identity._recipe.cache_clear()
+    assert changed == set(layers[layers.index(layer) :])
+
+
+def test_another_quality_and_another_shape_of_frames_are_other_frames(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made_by() -> str:
+        return FrameStore(tmp_path, config.render).made_by
+
+    today = made_by()
+    assert FrameStore(tmp_path, config.render.model_copy(update={"jpeg_quality": 80})).made_by != today
+    smaller = SCHEMA.frame.model_copy(update={"shape": (128, 128, 3)})
+    monkeypatch.setattr("pipeline.run.frame_store.SCHEMA", SCHEMA.model_copy(update={"frame": smaller}))
+    assert made_by() != today
+
+
+NIGHT = LightPerturbation(component="diffuse", level=5, diffuse_scale_rgb=(0.0, 0.0, 0.0))
+
+
+@pytest.fixture
+def rejecting(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every frame under a changed light counts as too dark: LIBERO's head light keeps real draws from being so."""
+    monkeypatch.setattr("pipeline.rendering.render.exposure", lambda frame: "too_dark")
+
+
+def without_twins(rows: Sequence[plan.Row]) -> list[plan.Row]:
+    return [row for row in rows if row.role != "twin"]
+
+
+@pytest.mark.usefixtures("rejecting")
+def test_rendering_ends_when_all_streams_of_a_trajectory_are_rejected(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
+) -> None:
+    lights = without_twins(rows)
+    assert len(lights) == 2
+    passes: list[int] = []
+
+    def counted(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
+        passes.append(len(items))
+        return loop(fn, items, description)
+
+    render_plan(lights, config, replayed, tmp_path, counted)
+    stored = FrameStore(tmp_path, config.render).rows()
+    (row,) = stored.values()
+    assert row["streams"] == []
+    assert len(json.loads(row["rejected"])) == 4, "two views of the light episode and of its reserve"
+    assert outcome.rejections(lights, stored) == dict.fromkeys((row.episode_id for row in lights), "too_dark")
+    rendered = len(passes)
+    render_plan(lights, config, replayed, tmp_path, counted)
+    assert len(passes) == rendered, "a second run has nothing to do"
+
+
+def test_a_rejection_that_is_no_longer_planned_is_forgotten(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
+) -> None:
+    store, trajectory_id = FrameStore(tmp_path, config.render), rows[0].trajectory_id
+    render_plan(rows[:1], config, replayed, tmp_path, loop)
+    twin = store.load(trajectory_id, store.rows()[trajectory_id]["streams"])
+    store.save(
+        trajectory_id,
+        Rendered(twin.replay_mode, twin.state, twin.joint_state, twin.action, twin.streams, {"earlier": "too_dark"}),
+        GL.device,
+    )
+    render_plan(rows[:1], config, replayed, tmp_path, loop)
+    row = store.rows()[trajectory_id]
+    assert json.loads(row["rejected"]) == {}
+    assert row["streams"] == sorted(twin.streams)
+
+
+def test_rendering_that_leaves_the_same_work_undone_is_an_error(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
+) -> None:
+    def elsewhere(fn: Any, items: Sequence[RenderJob], description: str) -> list[Any]:
+        """Workers that write into a folder of their own."""
+        return []
+
+    with pytest.raises(PipelineError, match="still not there"):
+        render_plan(rows[:1], config, replayed, tmp_path, elsewhere)
+
+
+def test_reserves_are_replayed_where_frames_may_be_rejected_after_all_physics(rows: list[plan.Row]) -> None:
+    start = RobotPerturbation(component="initial_joints", level=1, joint_offsets_rad=(0.01,) * 7)
+    both = [
+        plan.Row(
+            **{**vars(row), "axis": "robot+light", "perturbations": to_json((start, NIGHT)), "trajectory_id": name}
+        )
+        for row, name in zip(without_twins(rows), "ab", strict=True)
+    ]
+    assert [row.wanted for row in both] == [True, False]
+    assert plan.pending(both, {}) == ["a", "b"]
+    kept = {"a": Verdict(True, "kept"), "b": Verdict(True, "kept")}
+    assert [verdict.reason for verdict in plan.select(both, kept).values()] == ["kept", "reserve_not_needed"]
+    rejected = plan.select(both, kept, {both[0].episode_id: "too_dark"})
+    assert [verdict.reason for verdict in rejected.values()] == ["too_dark", "kept"]
+    assert plan.pending([row for row in both if row.wanted], verdicts({})) == ["a"]
