@@ -1,0 +1,65 @@
+"""The user's own files that a configuration names: demonstrations, a bank of rewrites, folders of textures and objects.
+
+DVC cannot know them, as they are named in the configuration. So a stage lists them each time, and the plan depends on
+the list: a changed file is noticed, and the same list runs nothing again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from pipeline.config import Config
+from pipeline.files import replaced
+
+HASHED_BYTES = 16_000_000
+"""Files up to this size are listed by their content; larger ones by size and time of change, as hashing takes long."""
+
+
+def listing(config: Config) -> dict[str, list[str | int]]:
+    """Path of each file that the configuration's paths lead to, and what tells whether it has changed."""
+    files = sorted({file for path in _paths(dict(config)) for file in _files(path)})
+    return {str(file): _state(file) for file in files}
+
+
+def write(listed: Mapping[str, list[str | int]], path: Path) -> None:
+    with replaced(path) as temporary:
+        temporary.write_text(json.dumps(listed, indent=0) + "\n")
+
+
+def _paths(value: Any) -> Iterator[Path]:
+    """Every path in a configuration, however deep."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, BaseModel):
+        yield from _paths(dict(value))
+    elif isinstance(value, Mapping):
+        for member in value.values():
+            yield from _paths(member)
+    elif isinstance(value, list | tuple):
+        for member in value:
+            yield from _paths(member)
+
+
+def _files(path: Path) -> Iterator[Path]:
+    if path.is_dir():
+        # Hidden files are notes of downloads.
+        yield from (
+            file
+            for file in path.rglob("*")
+            if file.is_file() and not any(part.startswith(".") for part in file.relative_to(path).parts)
+        )
+    elif path.exists():
+        yield path
+
+
+def _state(file: Path) -> list[str | int]:
+    status = file.stat()
+    if status.st_size <= HASHED_BYTES:
+        return [hashlib.sha256(file.read_bytes()).hexdigest()]
+    return [status.st_size, status.st_mtime_ns]

@@ -1,0 +1,66 @@
+"""dvc.yaml tells the truth: a stage runs on what it declares alone, and opens something of all that it declares."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from conftest import REPOSITORY, link_testset
+from file_access import opened_files
+
+STAGES: dict[str, dict[str, Any]] = yaml.safe_load((REPOSITORY / "dvc.yaml").read_text())["stages"]
+
+WATCHED_BY_HASH = {"requirements.lock"}
+"""Declared, but opened by no stage: it stands for the installed packages, whose versions stages ask for."""
+
+
+def declared(stage: str) -> list[str]:
+    return [path.replace("${run}", "tiny") for path in STAGES[stage]["deps"]]
+
+
+def outputs(stage: str) -> list[str]:
+    listed = [*STAGES[stage].get("outs", []), *STAGES[stage].get("metrics", [])]
+    return [next(iter(entry)).replace("${run}", "tiny") for entry in listed]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_opens_all_that_it_declares_and_needs_nothing_else(stage: str, finished: Path, tmp_path: Path) -> None:
+    clone = finished.parent.parent
+    for name in (*declared(stage), "configs/tiny.yaml"):
+        source, target = clone / name, tmp_path / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, target)
+    # Without other processes: what a worker opens is seen too, but starting them takes longer than the stage.
+    file = tmp_path / "configs" / "tiny.yaml"
+    config = yaml.safe_load(file.read_text())
+    file.write_text(yaml.safe_dump({**config, "compute": {"cluster": "loop"}}))
+    link_testset(tmp_path)
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    with opened_files(tmp_path) as opened:
+        done = subprocess.run(
+            [sys.executable, f"stages/{STAGES[stage]['cmd'].split()[1].removeprefix('stages/')}", file],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 0, f"{stage} needs more than it declares:\n{done.stderr}"
+    for name in outputs(stage):
+        assert (tmp_path / name).exists(), f"{stage} does not make {name}"
+    idle = [
+        name
+        for name in declared(stage)
+        if name not in WATCHED_BY_HASH and not any(path.is_relative_to(tmp_path / name) for path in opened)
+    ]
+    assert idle == [], f"{stage} declares what it does not open"
