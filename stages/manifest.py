@@ -3,11 +3,12 @@
 import json
 
 from pipeline.config import Config
+from pipeline.formats import registry
+from pipeline.formats.rlds_layout import by_suite
 from pipeline.run import manifest, motion_statistics, plan
 from pipeline.run.episode_loader import EpisodeLoader, kept, outcome, verdicts
 from pipeline.run.stage import main
 from pipeline.run.stores import FrameStore, TrajectoryStore
-from pipeline.writers.rlds import by_suite
 
 
 def run(config: Config) -> None:
@@ -23,10 +24,8 @@ def run(config: Config) -> None:
         outcome=became,
         replayed={trajectory_id: store.outcome(trajectory_id) for trajectory_id in known},
         devices={trajectory_id: frames.device(trajectory_id) for trajectory_id in rendered},
-        rlds={
-            episode: (shard, index) for episode, (shard, index) in json.loads((data / "rlds.json").read_text()).items()
-        },
-        lerobot=json.loads((data / "lerobot.json").read_text()),
+        places=registry.places(registry.formats_of(data, config.export)),
+        columns=registry.columns(),
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 

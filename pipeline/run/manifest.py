@@ -50,8 +50,8 @@ def build(
     outcome: Mapping[str, Verdict],
     replayed: Mapping[str, tuple[str, int, str]],
     devices: Mapping[str, str],
-    rlds: Mapping[str, tuple[str, int]],
-    lerobot: Mapping[str, int],
+    places: Mapping[str, Mapping[str, Any]],
+    columns: Sequence[pa.Field],
 ) -> pa.Table:
     """Join the plan with what became of it.
 
@@ -60,15 +60,14 @@ def build(
         outcome: episode id to verdict.
         replayed: trajectory id to the mode used, the number of executed actions and what physics perturbations came to.
         devices: trajectory id to the OpenGL device that rendered it, for every rendered trajectory.
-        rlds: episode id to its shard's file name and its place in it, for every kept episode.
-        lerobot: episode id to its ``episode_index``, for every kept episode.
+        places: episode id to where it lies in the datasets, for every kept episode.
+        columns: those of ``places``.
     """
     shared = {version_column(name): version for name, version in versions().items()}
     table = []
     for row in rows:
         verdict = outcome[row.episode_id]
         mode, steps, resolved = replayed.get(row.trajectory_id, (None, None, None))
-        shard, index = rlds.get(row.episode_id, (None, None))
         made: dict[str, Any] = {
             "kept": verdict.kept,
             "reason": verdict.reason,
@@ -76,12 +75,9 @@ def build(
             "steps": steps,
             "resolved": resolved,
             "gl_device": devices.get(row.trajectory_id),
-            "rlds_shard": shard,
-            "rlds_index": index,
-            "lerobot_episode_index": lerobot.get(row.episode_id),
         }
-        table.append(asdict(row) | made | shared)
-    return pa.Table.from_pylist(table, schema=schema())
+        table.append({**asdict(row), **made, **places.get(row.episode_id, {}), **shared})
+    return pa.Table.from_pylist(table, schema=schema(columns))
 
 
 def version_column(name: str) -> str:
@@ -89,10 +85,12 @@ def version_column(name: str) -> str:
     return f"{name.replace('-', '_')}_version"
 
 
-def schema() -> pa.Schema:
-    """The manifest's columns, from ``schemas/manifest.json``."""
+def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
+    """The manifest's columns, from ``schemas/manifest.json``, and before the versions those of the output formats."""
     columns = json.loads(SCHEMA_FILE.read_text())["columns"]
-    return pa.schema([pa.field(c["name"], _TYPES[c["type"]], metadata={"meaning": c["meaning"]}) for c in columns])
+    fields = [pa.field(c["name"], _TYPES[c["type"]], metadata={"meaning": c["meaning"]}) for c in columns]
+    versions_from = next(k for k, field in enumerate(fields) if field.name.endswith("_version"))
+    return pa.schema([*fields[:versions_from], *places, *fields[versions_from:]])
 
 
 def write(table: pa.Table, path: Path, settings: Settings) -> None:
@@ -131,11 +129,6 @@ def made_with(row: Mapping[str, Any]) -> dict[str, str]:
         for column, version in row.items()
         if column.endswith("_version")
     }
-
-
-def rlds_dataset(row: Mapping[str, Any]) -> str:
-    """Name of the RLDS dataset that holds a kept episode: what its shard's name begins with."""
-    return str(row["rlds_shard"]).partition("-")[0]
 
 
 def asked(manifest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
