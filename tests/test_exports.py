@@ -142,7 +142,7 @@ def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_p
     assert stamps(made.folder) == before
     assert not (tmp_path / ".work").exists()
 
-    changed = replace(source, content=source.content | {IDS[0]: "second"})
+    changed = replace(source, content={**source.content, IDS[0]: "second"})
     assert not is_current(made, changed)
     assert not is_current(made, replace(source, ids=source.ids[1:]))
     other = type(made)(tmp_path, made.options.model_copy(update={"name": "other"}))
