@@ -1,4 +1,4 @@
-"""Rates and peak memory of the writers on synthetic episodes; the last line printed is JSON."""
+"""Rates and peak memory of the exports on synthetic episodes; the last line printed is JSON."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
+from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.formats.base import Episodes, Format
+from pipeline.formats.export import export
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.rlds import Rlds
 from pipeline.types import Episode
 
 PER_PART = 150
@@ -53,7 +58,7 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
 
 
 def replay(episode_id: str, source: Episode) -> Episode:
-    """The same content under another id, so that making episodes costs the writers nothing."""
+    """The same content under another id, so that making episodes costs the exports nothing."""
     return Episode(
         **{**vars(source), "episode_id": episode_id, "provenance": {**source.provenance, "episode_id": episode_id}}
     )
@@ -64,6 +69,13 @@ def pool_map(pool: ProcessPoolExecutor, fn: Callable[[Any], Any], items: Sequenc
     return list(pool.map(fn, items))
 
 
+def dataset(writer: str, out: Path, parts: int) -> Format[Any]:
+    if writer == "rlds":
+        return Rlds(out, RldsConfig(name="benchmark", shards=parts))
+    frames: Literal["video", "images"] = "video" if writer == "lerobot_video" else "images"
+    return LeRobot(out, LeRobotConfig(name="benchmark", parts=parts, frames=frames))
+
+
 def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, float]:
     """Rates and memory of one writer; peaks are those of a process's whole life, so each writer gets a new one."""
     ids = [f"synthetic-{k:05d}" for k in range(episodes)]
@@ -72,30 +84,25 @@ def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, f
     with tempfile.TemporaryDirectory() as out:
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
             run = partial(pool_map, pool)
+            target = dataset(writer, Path(out), parts)
 
-            def write(ids: Sequence[str]) -> Any:
-                # Each writer's libraries count for that writer alone: lerobot's are most of its memory.
-                if writer == "rlds":
-                    from pipeline.writers import rlds
-
-                    return rlds.write(ids, load, Path(out), name="benchmark", shards=parts, run=run)
-                from pipeline.writers import lerobot
-
-                frames: lerobot.Frames = "video" if writer == "lerobot_video" else "images"
-                folder = Path(out) / "lerobot"
-                return lerobot.write(ids, load, folder, repo_id="local/benchmark", parts=parts, run=run, frames=frames)
+            def write(ids: Sequence[str]) -> int:
+                """Bytes of the dataset."""
+                suites, content = (dict.fromkeys(ids, value) for value in ("libero_spatial", "synthetic"))
+                export(target, Episodes(ids, load, suites, content), run)
+                return sum((target.folder / file).stat().st_size for file in target.record().files)
 
             write(ids[:workers])  # imports, in every worker
             start = time.perf_counter()
-            report = write(ids)
+            size = write(ids)
             seconds = time.perf_counter() - start
         # The largest of the children that have ended, in KiB.
         worker, parent = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_CHILDREN, resource.RUSAGE_SELF))
         return {
             "episodes_per_s": round(episodes / seconds, 2),
-            "steps_per_s": round(report.steps / seconds, 1),
-            "mb_per_s": round(report.bytes / 1e6 / seconds, 2),
-            "mb_per_episode": round(report.bytes / 1e6 / episodes, 3),
+            "steps_per_s": round(steps * episodes / seconds, 1),
+            "mb_per_s": round(size / 1e6 / seconds, 2),
+            "mb_per_episode": round(size / 1e6 / episodes, 3),
             "peak_worker_mb": round(worker * 1024 / 1e6),
             "peak_parent_mb": round(parent * 1024 / 1e6),
         }

@@ -27,6 +27,7 @@ from pipeline import seeding
 from pipeline.axes.noise import NoiseAxis
 from pipeline.config import ComputeConfig, DemosConfig, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
+from pipeline.formats.lerobot_video import VideoEncoder
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.replay import ReplayJob
 from pipeline.rendering.jpeg import decode, encode, to_policy
@@ -34,7 +35,6 @@ from pipeline.rendering.renderer import Renderer
 from pipeline.run.compute import runner
 from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.types import Frame
-from pipeline.writers.video import VideoEncoder
 
 TASKS = (
     "libero_spatial/pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate",

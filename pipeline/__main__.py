@@ -12,6 +12,7 @@ from pipeline.axes import Axes
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.formats.registry import FORMATS, formats_of
 from pipeline.libero.fetch import fetch
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish import attribution
@@ -99,7 +100,8 @@ def _push(arguments: argparse.Namespace) -> int:
     from pipeline.publish import push
 
     config = load(arguments.config)
-    upload = push.prepare(config.data, arguments.format, config.export.lerobot.name)
+    (target,) = (one for one in formats_of(config.data, config.export) if one.name == arguments.format)
+    upload = push.prepare(target)
     print(upload.summary())
     if not arguments.really:
         print(f"nothing was sent: with --really this goes to {arguments.repository}")
@@ -246,12 +248,13 @@ def parser() -> argparse.ArgumentParser:
     command = commands.add_parser(
         "push",
         help="upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go",
-        description="Sends one of the two datasets of a finished and validated run: its files, the card, the manifest "
+        description="Sends one of the datasets of a finished and validated run: its files, the card, the manifest "
         "and the recipe, in one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or "
         "`hf auth login`.",
     )
     command.add_argument("config", type=Path, metavar="CONFIG", help="of the run, such as configs/starter.yaml")
-    command.add_argument("format", choices=("rlds", "lerobot"), metavar="FORMAT", help="rlds or lerobot")
+    names = [kind.name for kind in FORMATS]
+    command.add_argument("format", choices=names, metavar="FORMAT", help=" or ".join(names))
     command.add_argument("repository", metavar="REPOSITORY", help="owner/name on the hub")
     command.add_argument("--really", action="store_true", help="send it")
     command.add_argument("--private", action="store_true", help="make a new repository private")

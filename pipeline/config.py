@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import yaml
 from pydantic import Field, ValidationError, field_validator, model_validator
@@ -11,10 +11,9 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from pipeline.axes import AnyAxis, Axes, axes_of
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
+from pipeline.export_config import Count, ExportConfig
 from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import select_tasks
-
-Count = Annotated[int, Field(ge=1)]
 
 
 class DemosConfig(Frozen):
@@ -117,30 +116,6 @@ class RenderConfig(Frozen):
 
     encoding: Literal["jpeg"] = "jpeg"
     jpeg_quality: int = Field(default=95, ge=50, le=100)
-
-
-class RldsConfig(Frozen):
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    shards: Count
-
-
-class LeRobotConfig(Frozen):
-    """How the LeRobot dataset is written.
-
-    Attributes:
-        name: of the dataset.
-        parts: pieces written in parallel, then merged.
-        frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
-    """
-
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    parts: Count
-    frames: Literal["video", "images"] = "video"
-
-
-class ExportConfig(Frozen):
-    rlds: RldsConfig
-    lerobot: LeRobotConfig
 
 
 class ComputeConfig(Frozen):

@@ -24,21 +24,44 @@ def replaced(path: Path) -> Iterator[Path]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    _remove(temporary)
+    remove(temporary)
     try:
         yield temporary
-        for made in (*temporary.rglob("*"), temporary):
-            _sync(made)
-        if temporary.is_dir():
-            _remove(path)
-        os.replace(temporary, path)
-        _sync(path.parent)
+        put_in_place(temporary, path)
     finally:
         # After a failure other workers may still be writing into a folder: what they leave is removed next time.
         if temporary.is_dir():
             shutil.rmtree(temporary, ignore_errors=True)
         else:
             temporary.unlink(missing_ok=True)
+
+
+def put_in_place(whole: Path, path: Path) -> None:
+    """Sync a file or a folder of the same file system to disk, and give it the place of what is at ``path``."""
+    sync(whole)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if whole.is_dir():
+        remove(path)
+    os.replace(whole, path)
+    _sync(path.parent)
+
+
+@contextmanager
+def scratch(folder: Path) -> Iterator[Path]:
+    """An empty folder, removed at the end; its name is fixed, so that what a killed run left in it goes now."""
+    remove(folder)
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        remove_if_empty(folder.parent)
+
+
+def sync(path: Path) -> None:
+    """Have a file, or a folder with everything in it, on disk."""
+    for entry in (*path.rglob("*"), path):
+        _sync(entry)
 
 
 def _sync(path: Path) -> None:
@@ -54,10 +77,27 @@ def keep_only(folder: Path, names: set[str]) -> None:
     if folder.is_dir():
         for entry in folder.iterdir():
             if entry.name not in names:
-                _remove(entry)
+                remove(entry)
 
 
-def _remove(path: Path) -> None:
+def keep_below(folder: Path, files: set[Path]) -> None:
+    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one."""
+    if folder.is_dir():
+        on_the_way = {parent for file in files for parent in file.parents}
+        for entry in folder.iterdir():
+            if entry in on_the_way and not entry.is_symlink():
+                keep_below(entry, files)
+            elif entry not in files:
+                remove(entry)
+
+
+def remove_if_empty(folder: Path) -> None:
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def remove(path: Path) -> None:
+    """Delete a file or a folder, if it is there."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

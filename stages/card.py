@@ -1,12 +1,13 @@
 """Stage card: the dataset card of each format, from the manifest and the reports."""
 
 from pipeline.config import Config
+from pipeline.formats.registry import formats_of
 from pipeline.publish import card
 from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    card.write(config.data, config.export.lerobot.name)
+    card.write(config.data, formats_of(config.data, config.export), config.export.lerobot.name)
     print(f"{config.data / 'card'} has a README.md for each format; `python -m pipeline push` uploads it with the data")
 
 

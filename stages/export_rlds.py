@@ -1,32 +1,13 @@
-"""Stage export_rlds: write the kept episodes as RLDS, a set for each suite, without TensorFlow."""
-
-import json
+"""Stage export_rlds: the kept episodes as RLDS, a set for each suite, without TensorFlow."""
 
 from pipeline.config import Config
-from pipeline.files import keep_only
-from pipeline.run import outcome
-from pipeline.run.compute import runner
-from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.formats.export_run import export_run
+from pipeline.formats.rlds import Rlds
 from pipeline.run.stage import main
-from pipeline.writers import rlds
 
 
 def run(config: Config) -> None:
-    plan_file = config.data / "plan.parquet"
-    became = outcome.read(config)
-    ids = became.kept
-    load = EpisodeLoader(plan_file, config.data / "frames", config.render)
-    target = config.export.rlds
-    sets = rlds.by_suite(ids, {row.episode_id: row.suite for row in became.rows}, target.name)
-    out = config.data / "rlds"
-    locations: dict[str, rlds.Location] = {}
-    with runner(config.compute) as workers:
-        for name, members in sets.items():
-            shards = max(1, round(target.shards * len(members) / len(ids)))
-            locations |= rlds.write(members, load, out, name=name, shards=shards, run=workers).locations
-    keep_only(out, set(sets))
-    (config.data / "rlds.json").write_text(json.dumps(locations, indent=0) + "\n")
-    print(f"wrote {len(ids)} episodes to {', '.join(sets)} in {out}")
+    export_run(Rlds(config.data, config.export.rlds), config)
 
 
 if __name__ == "__main__":

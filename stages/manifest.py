@@ -3,10 +3,11 @@
 import json
 
 from pipeline.config import Config
+from pipeline.formats import registry
+from pipeline.formats.rlds_layout import by_suite
 from pipeline.run import manifest, motion_statistics, outcome
 from pipeline.run.frame_store import FrameStore
 from pipeline.run.stage import main
-from pipeline.writers.rlds import by_suite
 
 
 def run(config: Config) -> None:
@@ -14,16 +15,14 @@ def run(config: Config) -> None:
     run = outcome.read(config)
     table = manifest.build(
         run,
-        rlds={
-            episode: (shard, index) for episode, (shard, index) in json.loads((data / "rlds.json").read_text()).items()
-        },
-        lerobot=json.loads((data / "lerobot.json").read_text()),
+        places=registry.places(registry.formats_of(data, config.export)),
+        columns=registry.columns(),
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 
     rows = {row.episode_id: row for row in run.rows}
     frames = FrameStore(data / "frames", config.render)
-    motions = {row: frames.motion(row) for row in dict.fromkeys(rows[episode].trajectory_id for episode in run.kept)}
+    motions = {name: frames.motion(name) for name in dict.fromkeys(rows[episode].trajectory_id for episode in run.kept)}
     sets = by_suite(run.kept, {row.episode_id: row.suite for row in run.rows}, config.export.rlds.name)
     figures = {
         name: motion_statistics.openvla([motions[rows[episode].trajectory_id] for episode in members])

@@ -1,4 +1,4 @@
-"""Stage validate: reopen both datasets and the manifest, and stop where anything is off."""
+"""Stage validate: reopen the datasets and the manifest, and stop where anything is off."""
 
 import json
 

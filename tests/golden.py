@@ -53,12 +53,12 @@ class Golden:
         demo = source.load(source.index([task]).entries[0].demo_id)
         environment = Environment(task)
         clean = replay(environment, demo, "clean", ReplayConfig())
+        reference = Reference.of(clean.model_xml, clean.states, clean.actions)
         replays = {"clean": clean}
         for case, listed in self.cases.items():
             if physics := of_layer(from_json(listed), PhysicsPerturbation):
-                reference = Reference.of(clean.model_xml, clean.states, clean.actions)
                 config = ReplayConfig(mode="tracked" if case == "robot" else "open_loop")
-                replays[case] = replay(environment, demo, case, config, physics, lambda reference=reference: reference)
+                replays[case] = replay(environment, demo, case, config, physics, lambda: reference)
         environment.close()
         if refused := [case for case, trajectory in replays.items() if not len(trajectory.actions)]:
             raise ValueError(f"refused in this scene, so they show nothing: {refused}")

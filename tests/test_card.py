@@ -21,8 +21,9 @@ from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
+from pipeline.formats.registry import FORMATS, formats_of
 from pipeline.publish import card
-from pipeline.publish.card import FORMATS, Format
 from pipeline.seeding import rng
 from pipeline.types import Task
 
@@ -92,8 +93,13 @@ def data(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def written(data: Path, kind: Format) -> str:
-    card.write(data, NAME)
+def write(data: Path) -> None:
+    options = ExportConfig(rlds=RldsConfig(name=NAME, shards=1), lerobot=LeRobotConfig(name=NAME, parts=1))
+    card.write(data, formats_of(data, options), NAME)
+
+
+def written(data: Path, kind: str) -> str:
+    write(data)
     return (data / "card" / kind / "README.md").read_text()
 
 
@@ -109,8 +115,8 @@ def cells(text: str, first: str, under: str) -> list[str]:
     return [cell.strip() for cell in found[1].split(" | ")]
 
 
-@pytest.mark.parametrize("kind", FORMATS)
-def test_the_hub_reads_the_metadata(data: Path, kind: Format) -> None:
+@pytest.mark.parametrize("kind", [kind.name for kind in FORMATS])
+def test_the_hub_reads_the_metadata(data: Path, kind: str) -> None:
     metadata = metadata_of(written(data, kind))
     assert metadata["license"] == "cc-by-4.0"
     assert metadata["task_categories"] == ["robotics"]
@@ -151,7 +157,7 @@ def test_pictures_are_beside_the_card_and_only_those_that_exist(data: Path) -> N
     [("rlds", "`state`", "openvla_oft", "openpi"), ("lerobot", "`observation.state`", "openpi", "openvla_oft")],
 )
 def test_conventions_and_commands_are_the_formats_own(
-    data: Path, kind: Format, state: str, client: str, other: str
+    data: Path, kind: str, state: str, client: str, other: str
 ) -> None:
     text = written(data, kind)
     assert f"**State**, {state} (8)" in text
@@ -200,10 +206,10 @@ def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, fr
 def test_says_what_is_missing(data: Path, name: str) -> None:
     (data / name).unlink()
     with pytest.raises(PipelineError, match=f"{name} not there"):
-        card.write(data, NAME)
+        write(data)
 
 
 def test_nothing_kept_is_refused(data: Path) -> None:
     pq.write_table(pa.Table.from_pylist([ROWS[6]]), data / "manifest.parquet")
     with pytest.raises(PipelineError, match="no episode was kept"):
-        card.write(data, NAME)
+        write(data)

@@ -18,10 +18,15 @@ from PIL import Image
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.export_config import RldsConfig
+from pipeline.formats import rlds_write
+from pipeline.formats.base import Episodes
+from pipeline.formats.export import export
+from pipeline.formats.rlds import Rlds
 from pipeline.run import motion_statistics
+from pipeline.run.compute import loop
 from pipeline.types import Episode
 from pipeline.validation import oft, oft_check
-from pipeline.writers import rlds
 
 NAME = "libero_tiny"
 LENGTHS = {"a": 30, "b": 8, "c": 19}
@@ -63,7 +68,8 @@ def grey(jpeg: bytes) -> int:
 
 def write(data: Path, load: Callable[[str], Episode] = episode) -> Path:
     """A run's data folder with one dataset and its statistics; the writer's own check is the caller's to disarm."""
-    rlds.write(list(LENGTHS), load, data / "rlds", name=NAME, shards=2, run=lambda fn, jobs, _: list(map(fn, jobs)))
+    suites, content = dict.fromkeys(LENGTHS, "libero_tiny"), dict.fromkeys(LENGTHS, "")
+    export(Rlds(data, RldsConfig(name="libero", shards=2)), Episodes(list(LENGTHS), load, suites, content), loop)
     episodes = [load(name) for name in LENGTHS]
     figures = motion_statistics.openvla([(made.action, made.state) for made in episodes])
     (data / "dataset_statistics.json").write_text(json.dumps({NAME: figures}))
@@ -162,7 +168,7 @@ FAULTS: dict[str, Callable[[Episode], Episode]] = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_check_catches_a_bad_episode(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rlds, "check", lambda _: None)
+    monkeypatch.setattr(rlds_write, "check", lambda _: None)
     found = oft_check.check_run(write(tmp_path, partial(spoilt, FAULTS[fault])))[NAME]
     assert found["violations"][0].startswith(fault)
     assert (found["episodes"], found["passed_by"]) == (3, 1)

@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -19,16 +18,23 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
-from test_writers import IDS, episode, loop, write_lerobot
+from test_writers import SET, write_lerobot, write_rlds
 
 from pipeline.errors import PipelineError
+from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
 from pipeline.files import replaced
-from pipeline.publish.card import REPORTS, Format
-from pipeline.publish.push import Upload, prepare, send
-from pipeline.writers import lerobot, rlds
+from pipeline.formats.registry import formats_of
+from pipeline.publish import push
+from pipeline.publish.card import REPORTS
+from pipeline.publish.push import Upload, send
 
 NAME, REPOSITORY = "tiny", "somebody/tiny"
 LARGE = (".parquet", ".mp4", ".png")
+
+
+def prepare(data: Path, kind: str) -> Upload:
+    options = ExportConfig(rlds=RldsConfig(name="synthetic", shards=3), lerobot=LeRobotConfig(name=NAME, parts=3))
+    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind))
 
 
 class Hub:
@@ -206,13 +212,9 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's folder with both datasets of six episodes, in the order in which the stages write it."""
     data = tmp_path_factory.mktemp("data")
-    report = rlds.write(IDS, episode, data / "rlds", name=NAME, shards=2, run=loop)
-    write_lerobot(data)
-    (data / "lerobot").rename(data / "root")
-    (data / "lerobot").mkdir()
-    (data / "root").rename(data / "lerobot" / NAME)
-    rows = [{"kept": True, "rlds_shard": location.shard} for location in report.locations.values()]
-    pq.write_table(pa.Table.from_pylist([*rows, {"kept": False, "rlds_shard": None}]), data / "manifest.parquet")
+    write_rlds(data)
+    write_lerobot(data, name=NAME)
+    pq.write_table(pa.Table.from_pylist([{"kept": True}, {"kept": False}]), data / "manifest.parquet")
     (data / "finetune" / "__pycache__").mkdir(parents=True)
     (data / "finetune" / "finetune.yaml").write_text("recipe: {}\n")
     (data / "finetune" / "__pycache__" / "run.pyc").write_bytes(b"compiled")
@@ -251,8 +253,8 @@ def large(upload: Upload) -> set[str]:
 
 
 def test_dry_run_says_what_would_go(made: Path) -> None:
-    upload = prepare(made, "rlds", NAME)
-    folder = f"rlds/{NAME}/{rlds.VERSION}"
+    upload = prepare(made, "rlds")
+    folder = f"rlds/{SET}/1.0.0"
     assert list(upload.files) == sorted(
         [
             *("README.md", "pictures/camera.png", "manifest.parquet", *REPORTS, "finetune/finetune.yaml"),
@@ -261,24 +263,23 @@ def test_dry_run_says_what_would_go(made: Path) -> None:
     )
     size = sum(file.stat().st_size for file in upload.files.values())
     summary = upload.summary()
-    assert re.search(rf"4 files .* MB  {folder}/", summary)
+    assert re.search(rf"5 files .* MB  {folder}/", summary)
     assert re.search(rf"{len(upload.files)} files +{size / 1e6:.1f} MB  in all", summary)
     assert "tag: none" in summary
-    assert f"tag: {CODEBASE_VERSION}" in prepare(made, "lerobot", NAME).summary()
+    assert f"tag: {CODEBASE_VERSION}" in prepare(made, "lerobot").summary()
 
 
 def test_a_set_with_images_has_no_videos(data: Path) -> None:
-    shutil.rmtree(data / "lerobot" / NAME)
-    lerobot.write(IDS, episode, data / "lerobot" / NAME, repo_id=NAME, parts=2, run=loop, frames="images")
+    write_lerobot(data, name=NAME, frames="images")
     for later in (data / "validation.json", data / "card" / "lerobot" / "README.md"):
         later.write_bytes(later.read_bytes())
-    folders = {path.partition("/")[0] for path in prepare(data, "lerobot", NAME).files if path.count("/") > 1}
+    folders = {path.partition("/")[0] for path in prepare(data, "lerobot").files if path.count("/") > 1}
     assert folders == {"data", "meta"}
 
 
 @pytest.mark.parametrize("kind", ["rlds", "lerobot"])
-def test_what_arrives_is_the_dataset_and_a_second_time_nothing(hub: Hub, made: Path, kind: Format) -> None:
-    upload = prepare(made, kind, NAME)
+def test_what_arrives_is_the_dataset_and_a_second_time_nothing(hub: Hub, made: Path, kind: str) -> None:
+    upload = prepare(made, kind)
     address = send(upload, REPOSITORY, private=True, endpoint=hub.endpoint)
     assert address == f"{hub.endpoint}/datasets/{REPOSITORY}/commit/1"
     assert hub.files == expected(upload)
@@ -295,7 +296,7 @@ def test_what_arrives_is_the_dataset_and_a_second_time_nothing(hub: Hub, made: P
 
 
 def test_goes_on_after_the_network_broke(hub: Hub, made: Path) -> None:
-    upload = prepare(made, "lerobot", NAME)
+    upload = prepare(made, "lerobot")
     hub.allowed, hub.cuts = 2, 1000
     with pytest.raises(PipelineError, match=r"stopped.*Error while uploading") as caught:
         send(upload, REPOSITORY, endpoint=hub.endpoint)
@@ -314,13 +315,13 @@ def test_goes_on_after_the_network_broke(hub: Hub, made: Path) -> None:
 
 def test_a_short_break_is_not_noticed(hub: Hub, made: Path) -> None:
     hub.cuts = 2
-    upload = prepare(made, "rlds", NAME)
+    upload = prepare(made, "rlds")
     send(upload, REPOSITORY, endpoint=hub.endpoint)
     assert hub.files == expected(upload)
 
 
 def test_goes_on_after_the_hub_failed_to_commit(hub: Hub, made: Path) -> None:
-    upload = prepare(made, "rlds", NAME)
+    upload = prepare(made, "rlds")
     hub.failing = 1
     with pytest.raises(PipelineError, match=r"stopped.*500"):
         send(upload, REPOSITORY, endpoint=hub.endpoint)
@@ -337,7 +338,7 @@ def test_what_the_dataset_no_longer_has_goes(hub: Hub, made: Path) -> None:
         ".gitattributes": b"",
         "mine/notes.md": b"",
     }
-    upload = prepare(made, "lerobot", NAME)
+    upload = prepare(made, "lerobot")
     send(upload, REPOSITORY, endpoint=hub.endpoint)
     assert hub.files == {".gitattributes": b"", "mine/notes.md": b"", **expected(upload)}
 
@@ -401,22 +402,22 @@ def incomplete(data: Path) -> None:
         (without_card, r"README\.md: not there"),
         (foreign, r"1 files that are not of the dataset.*passwords\.txt"),
         (hidden, r"not of the dataset.*\.cache/note"),
-        (elsewhere, r"1 that lie elsewhere, such as meta/stats\.json"),
-        (folder_elsewhere, "such as more"),
-        (incomplete, r"lacks 1 files, such as videos/.*\.mp4"),
+        (elsewhere, r"1 that lie elsewhere, such as tiny/meta/stats\.json"),
+        (folder_elsewhere, "such as tiny/more"),
+        (incomplete, r"lacks 1 files, such as tiny/videos/.*\.mp4"),
     ],
 )
 def test_refuses(data: Path, spoil: Callable[[Path], None], complaint: str) -> None:
-    assert prepare(data, "lerobot", NAME).files
+    assert prepare(data, "lerobot").files
     spoil(data)
     with pytest.raises(PipelineError, match=complaint):
-        prepare(data, "lerobot", NAME)
+        prepare(data, "lerobot")
 
 
 def test_refuses_what_training_left_in_rlds(data: Path) -> None:
-    (data / "rlds" / NAME / rlds.VERSION / "dataset_statistics_0123.json").write_text("{}")
+    (data / "rlds" / SET / "1.0.0" / "dataset_statistics_0123.json").write_text("{}")
     with pytest.raises(PipelineError, match=r"not of the dataset.*dataset_statistics_0123") as caught:
-        prepare(data, "rlds", NAME)
+        prepare(data, "rlds")
     assert "move them away" in str(caught.value)
 
 
@@ -424,7 +425,7 @@ def test_asks_for_a_token(hub: Hub, made: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.delenv("HF_TOKEN")
     monkeypatch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(tmp_path / "none"))
     with pytest.raises(PipelineError, match="no token") as caught:
-        send(prepare(made, "rlds", NAME), REPOSITORY, endpoint=hub.endpoint)
+        send(prepare(made, "rlds"), REPOSITORY, endpoint=hub.endpoint)
     assert "hf auth login" in str(caught.value)
     assert hub.private is None
 
@@ -432,11 +433,11 @@ def test_asks_for_a_token(hub: Hub, made: Path, tmp_path: Path, monkeypatch: pyt
 def test_a_token_that_may_not_write_is_told_apart(hub: Hub, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_TOKEN", "reader")
     with pytest.raises(PipelineError, match="does not let you write"):
-        send(prepare(made, "rlds", NAME), REPOSITORY, endpoint=hub.endpoint)
+        send(prepare(made, "rlds"), REPOSITORY, endpoint=hub.endpoint)
 
 
 def test_an_unreachable_hub_and_a_wrong_name_are_told_apart(hub: Hub, made: Path) -> None:
-    upload = prepare(made, "rlds", NAME)
+    upload = prepare(made, "rlds")
     with pytest.raises(PipelineError, match="stopped"):
         send(upload, REPOSITORY, endpoint="http://127.0.0.1:9")
     with pytest.raises(PipelineError, match="refused"):

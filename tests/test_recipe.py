@@ -52,10 +52,7 @@ def build(folder: Path, name: str = NAME, rows: list[dict[str, Any]] = ROWS) -> 
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's data folder with a LeRobot dataset and what the recipe stage writes."""
     data = tmp_path_factory.mktemp("data")
-    write_lerobot(data)
-    (data / "lerobot").rename(data / "tiny")
-    (data / "lerobot").mkdir()
-    (data / "tiny").rename(data / "lerobot" / "tiny")
+    write_lerobot(data, name="tiny")
     recipe.write(build(data), data / "lerobot" / "tiny", data / "finetune")
     return data
 

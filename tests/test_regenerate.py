@@ -16,10 +16,9 @@ import pytest
 from conftest import BOWL, REPOSITORY
 
 from pipeline.errors import PipelineError
+from pipeline.formats.tfrecord import framed, records
 from pipeline.run import manifest
 from pipeline.validation.regenerate import regenerate
-from pipeline.validation.shards import records
-from pipeline.writers.rlds import checksum
 
 
 def perturbed(data: Path) -> dict[str, Any]:
@@ -36,7 +35,7 @@ def changed(data: Path, change: dict[str, Any]) -> None:
     """Change columns of the episode's row."""
     file, episode_id = data / "manifest.parquet", perturbed(data)["episode_id"]
     rows = [row | (change if row["episode_id"] == episode_id else {}) for row in manifest.read(file)]
-    manifest.write(pa.Table.from_pylist(rows, schema=manifest.schema()), file, manifest.settings(file))
+    manifest.write(pa.Table.from_pylist(rows, schema=pq.read_schema(file)), file, manifest.settings(file))
 
 
 @pytest.fixture
@@ -89,11 +88,6 @@ def test_says_what_differs(copy: Path, short_demos: Path, tmp_path: Path) -> Non
     assert found["gl_device"] == {"manifest": "another", "here": row["gl_device"]}
     steps = row["steps"]
     assert found["differs"] == {"language_instruction": f"{steps} of {steps} steps, the first at step 0"}
-
-
-def framed(data: bytes) -> bytes:
-    length = len(data).to_bytes(8, "little")
-    return length + checksum(length) + data + checksum(data)
 
 
 def test_without_the_dataset_it_is_only_made(copy: Path, short_demos: Path, tmp_path: Path) -> None:

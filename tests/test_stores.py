@@ -20,7 +20,7 @@ from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.physics.replay import replay_plan
-from pipeline.rendering.render import RenderJob, render_plan
+from pipeline.rendering.render import render_plan
 from pipeline.rendering.renderer import GL
 from pipeline.run import outcome, plan
 from pipeline.run.compute import loop
@@ -193,7 +193,7 @@ def test_a_rejection_that_is_no_longer_planned_is_forgotten(
 def test_rendering_that_leaves_the_same_work_undone_is_an_error(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
 ) -> None:
-    def elsewhere(fn: Any, items: Sequence[RenderJob], description: str) -> list[Any]:
+    def elsewhere(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
         """Workers that write into a folder of their own."""
         return []
 

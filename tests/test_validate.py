@@ -18,16 +18,16 @@ from conftest import BOWL, MILK, STOVE, run_stages, tiny_config
 
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
+from pipeline.formats import lerobot_video, rlds_write
+from pipeline.formats.base import Copy, Fault
+from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.rendering.jpeg import decode, encode
 from pipeline.run import manifest
 from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.types import Episode, Task, Trajectory
-from pipeline.validation.checks import CHECKS, Case, Fault
-from pipeline.validation.readback import Copy
-from pipeline.validation.shards import METADATA, columns, records
+from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.validate import validate
-from pipeline.writers import rlds, video
 
 Tree = dict[str, Any]
 Rows = list[dict[str, Any]]
@@ -133,15 +133,15 @@ def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
     """Write every shard again, with faults in the examples."""
     load = EpisodeLoader(data / "plan.parquet", data / "frames", RenderConfig())
     for shard in (data / "rlds").rglob("*.tfrecord-*"):
-        ids = [columns(record, rlds.features())[f"{METADATA}episode_id"][0].decode() for record in records(shard)]
+        ids = [columns(record, rlds_write.features())[f"{METADATA}episode_id"][0].decode() for record in records(shard)]
         with shard.open("wb") as file:
             for episode_id in ids:
                 name = names[episode_id]
-                tree = rlds._tree(load(episode_id))
+                tree = rlds_write._tree(load(episode_id))
                 if isinstance(name, tuple) and name in IN_RLDS:
                     IN_RLDS[name](tree)
-                example = rlds._serializer().get_tf_example(rlds.features().encode_example(tree))
-                file.write(rlds._record(example.SerializeToString()))
+                example = rlds_write._serializer().get_tf_example(rlds_write.features().encode_example(tree))
+                file.write(framed(example.SerializeToString()))
 
 
 def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
@@ -163,7 +163,7 @@ def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
     (video_file,) = (root / "videos" / key).rglob("*.mp4")
     with av.open(str(video_file)) as shown:
         frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
-    made = video._Video(video_file)
+    made = lerobot_video._Video(video_file)
     for step, frame in enumerate(frames):
         made.add(np.zeros_like(frame) if begin <= step < end else frame)
     made.finish()
@@ -177,7 +177,7 @@ def spoil_manifest(data: Path, rows: Rows, other: str) -> None:
             row["rlds_shard"] = next(r["rlds_shard"] for r in rows if r["kept"] and r["task"] == STOVE.name)
             row["instruction"] = "STUDY_SCENE1_" + row["instruction"]
     file = data / "manifest.parquet"
-    manifest.write(pa.Table.from_pylist(rows, schema=manifest.schema()), file, manifest.settings(file))
+    manifest.write(pa.Table.from_pylist(rows, schema=pq.read_schema(file)), file, manifest.settings(file))
     counts = json.loads((data / "counts.json").read_text())
     counts["camera"]["libero_goal"]["kept"] += 1
     (data / "counts.json").write_text(json.dumps(counts))
@@ -190,7 +190,7 @@ def test_a_good_run_passes(finished: Path) -> None:
     assert {report[check]["checked"] for check in ("motion", "video", "gripper", "place", "provenance")} == {kept}
     # The clean episode of each of three tasks, and one of each of three axes.
     assert report["rendered"]["checked"] == 6
-    assert not list(finished.glob(".validate.*"))
+    assert not (finished / ".work").exists()
 
 
 def test_planted_faults_stop_the_run_and_nothing_else_is_found(
@@ -227,8 +227,8 @@ def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory])
 
     def found(sign: float) -> list[Fault]:
         commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
-        copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {})
-        return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], {}, None)))
+        copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {}, {})
+        return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], None)))
 
     assert found(1.0) == []
     (flipped,) = found(-1.0)
@@ -245,11 +245,11 @@ def test_what_is_missing_or_cannot_be_read_is_a_finding(
     cut, short = sorted((data / "rlds").rglob("*.tfrecord-*"))
     cut.write_bytes(cut.read_bytes()[:-1])
     *others, _ = records(short)
-    short.write_bytes(b"".join(map(rlds._record, others)))
+    short.write_bytes(b"".join(map(framed, others)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])  # Tested above, and slow.
     report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
-    told = [(finding["dataset"], finding["what"]) for finding in report["readable"]["findings"]]
+    told = sorted((finding["dataset"], finding["what"]) for finding in report["readable"]["findings"])
     assert [dataset for dataset, _ in told] == ["lerobot", "rlds", "rlds"]
     assert re.search(rf"{cut.name}: record \d+ is damaged", told[1][1])
     assert told[2][1] == f"{short.name} has {len(others)} records"

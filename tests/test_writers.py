@@ -1,4 +1,4 @@
-"""Both writers on synthetic episodes: what is read back is what went in, and bad episodes leave nothing behind."""
+"""Both formats on synthetic episodes: what is read back is what went in, and bad episodes replace nothing."""
 
 from __future__ import annotations
 
@@ -31,14 +31,18 @@ from numpy.typing import NDArray
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.formats import lerobot_write, rlds_write
+from pipeline.formats.base import Episodes, split
+from pipeline.formats.export import export
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.rlds import Rlds
 from pipeline.types import Episode
-from pipeline.writers import lerobot as lerobot_writer
-from pipeline.writers import rlds
-from pipeline.writers.base import split
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
-REPO = "local/synthetic"
+SET = f"{NAME}_spatial"
+REPO = NAME
 MIN_PSNR_DB = 36.0
 
 Tree = dict[str, bytes]
@@ -99,26 +103,44 @@ def files(folder: Path) -> Tree:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def write_rlds(out: Path, load: Callable[[str], Episode] = episode, run: Any = loop) -> rlds.RldsReport:
-    return rlds.write(IDS, load, out, name=NAME, shards=3, run=run)
+def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -> Episodes:
+    return Episodes(IDS, load, dict.fromkeys(IDS, "libero_spatial"), dict.fromkeys(IDS, content))
+
+
+def write_rlds(out: Path, load: Callable[[str], Episode] = episode, run: Any = loop) -> Rlds:
+    target = Rlds(out, RldsConfig(name=NAME, shards=3))
+    export(target, episodes(load), run)
+    return target
 
 
 def write_lerobot(
-    out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, frames: lerobot_writer.Frames = "video"
-) -> lerobot_writer.LeRobotReport:
-    folder = out / ("lerobot" if frames == "video" else frames)
-    return lerobot_writer.write(IDS, load, folder, repo_id=REPO, parts=3, run=run, frames=frames)
+    out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, frames: Any = "video", name: str = NAME
+) -> LeRobot:
+    target = LeRobot(out, LeRobotConfig(name=name, parts=3, frames=frames))
+    export(target, episodes(load), run)
+    return target
 
 
 @dataclass(frozen=True)
 class Written:
-    rlds: rlds.RldsReport
-    lerobot: lerobot_writer.LeRobotReport
-    images: lerobot_writer.LeRobotReport
+    rlds: Rlds
+    lerobot: LeRobot
+    images: LeRobot
+
+    @property
+    def version(self) -> Path:
+        """The version folder of the RLDS set."""
+        return self.rlds.folder / SET / "1.0.0"
 
 
 def write_all(out: Path, run: Any = loop) -> Written:
-    return Written(write_rlds(out, run=run), write_lerobot(out, run=run), write_lerobot(out, run=run, frames="images"))
+    return Written(
+        write_rlds(out, run=run), write_lerobot(out, run=run), write_lerobot(out / "images", run=run, frames="images")
+    )
+
+
+def lerobot_index(target: LeRobot) -> dict[str, int]:
+    return {episode_id: place["lerobot_episode_index"] for episode_id, place in target.record().places.items()}
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +157,9 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Written]:
             offline.setattr(socket.socket, "connect", refuse)
             every = write_all(out)
         assert not cache_folder.exists()
-        assert sorted(path.name for path in out.iterdir()) == ["images", "lerobot", NAME]
+        assert sorted(path.name for path in out.iterdir()) == [
+            *("images", "lerobot", "lerobot.json", "rlds", "rlds.json")
+        ]
         yield every
 
 
@@ -176,9 +200,9 @@ def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
 
 
 def test_rlds_features_are_openvlas(written: Written) -> None:
-    builder = tfds.builder_from_directory(written.rlds.folder)
+    builder = tfds.builder_from_directory(written.version)
     features = builder.info.features
-    assert features.to_json() == rlds.features().to_json()
+    assert features.to_json() == rlds_write.features().to_json()
     specs = {
         name: (spec.shape, np.dtype(spec.np_dtype))
         for name, spec in features["steps"].feature.items()
@@ -203,22 +227,24 @@ def test_rlds_features_are_openvlas(written: Written) -> None:
     }
     assert observation["image"].encoding_format == "jpeg"
     assert set(features["episode_metadata"]) == {"file_path", *SCHEMA.provenance}
-    assert (builder.info.name, str(builder.info.version)) == (NAME, "1.0.0")
+    assert (builder.info.name, str(builder.info.version)) == (SET, "1.0.0")
     assert builder.info.splits["train"].shard_lengths == [2, 2, 2]
 
 
 def test_rlds_holds_the_episodes(written: Written) -> None:
-    features = tfds.builder_from_directory(written.rlds.folder).info.features
-    shards = sorted(written.rlds.folder.glob("*.tfrecord-*"))
-    assert [shard.name for shard in shards] == [f"{NAME}-train.tfrecord-0000{k}-of-00003" for k in range(3)]
+    features = tfds.builder_from_directory(written.version).info.features
+    shards = sorted(written.version.glob("*.tfrecord-*"))
+    assert [shard.name for shard in shards] == [f"{SET}-train.tfrecord-0000{k}-of-00003" for k in range(3)]
     stored = {shard.name: list(records(shard)) for shard in shards}
-    for episode_id, (shard, position) in written.rlds.locations.items():
+    for episode_id, place in written.rlds.record().places.items():
+        shard, position = place["rlds_shard"], place["rlds_index"]
         # The very bytes of every frame, not a second encoding.
         assert all(frame in stored[shard][position] for view in episode(episode_id).frames.values() for frame in view)
     examples = [features.deserialize_example_np(record) for shard in stored.values() for record in shard]
     assert_episodes([tf_readback.columns(example) for example in examples])
-    assert written.rlds.steps == sum(len(episode(episode_id)) for episode_id in IDS)
-    assert written.rlds.bytes == sum(map(len, files(written.rlds.folder).values()))
+    assert tfds.builder_from_directory(written.version).info.splits["train"].num_bytes == sum(
+        len(record) for shard in stored.values() for record in shard
+    )
     assert "tensorflow" not in sys.modules
 
 
@@ -227,7 +253,7 @@ def test_rlds_reads_with_tensorflow(written: Written, tmp_path: Path) -> None:
     requirements = ["--with", "tensorflow-cpu==2.21.0", "--with", "tensorflow-datasets==4.9.10"]
     script, target = Path(tf_readback.__file__), tmp_path / "read.npz"
     command = ["uv", "run", "--no-project", "--isolated", "--python", "3.11", *requirements, "python", str(script)]
-    done = subprocess.run([*command, str(written.rlds.folder), str(target)], capture_output=True, text=True)
+    done = subprocess.run([*command, str(written.version), str(target)], capture_output=True, text=True)
     if not done.stdout.startswith("tensorflow"):
         pytest.skip(f"TensorFlow cannot be installed here: {done.stderr[-500:]}")
     assert done.returncode == 0, done.stderr[-2000:]
@@ -266,9 +292,9 @@ def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
 
 
 def test_lerobot_holds_the_episodes(written: Written) -> None:
-    assert_lerobot_episodes(written.lerobot.folder)
-    assert written.lerobot.episode_index == {episode_id: index for index, episode_id in enumerate(IDS)}
-    info = json.loads((written.lerobot.folder / "meta" / "info.json").read_text())
+    assert_lerobot_episodes(written.lerobot.root)
+    assert lerobot_index(written.lerobot) == {episode_id: index for index, episode_id in enumerate(IDS)}
+    info = json.loads((written.lerobot.root / "meta" / "info.json").read_text())
     assert info["codebase_version"] == "v3.0"
     assert info["features"]["action"]["names"] == list(SCHEMA.action.names)
     assert info["features"]["observation.images.image"]["info"]["video.codec"] == "h264"
@@ -276,13 +302,13 @@ def test_lerobot_holds_the_episodes(written: Written) -> None:
 
 
 def test_lerobot_images_are_the_stored_frames(written: Written) -> None:
-    assert_lerobot_episodes(written.images.folder, exact=True)
-    assert written.images.episode_index == written.lerobot.episode_index
-    info = json.loads((written.images.folder / "meta" / "info.json").read_text())
+    assert_lerobot_episodes(written.images.root, exact=True)
+    assert lerobot_index(written.images) == lerobot_index(written.lerobot)
+    info = json.loads((written.images.root / "meta" / "info.json").read_text())
     assert info["features"]["observation.images.image"]["dtype"] == "image"
     assert info["splits"] == {"train": f"0:{len(IDS)}"}
-    assert {path.suffix for path in written.images.folder.rglob("*") if path.is_file()} == {".parquet", ".json"}
-    table = pq.read_table(written.images.folder / "data", columns=["observation.images.image2"])
+    assert {path.suffix for path in written.images.root.rglob("*") if path.is_file()} == {".parquet", ".json"}
+    table = pq.read_table(written.images.root / "data", columns=["observation.images.image2"])
     # Not a second encoding.
     found = [row["bytes"] for row in table["observation.images.image2"].to_pylist()]
     assert found == [frame for episode_id in IDS for frame in episode(episode_id).frames["wrist_image"]]
@@ -291,20 +317,20 @@ def test_lerobot_images_are_the_stored_frames(written: Written) -> None:
 def test_lerobot_images_read_when_they_spread_over_many_files(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
-        patch.setattr(lerobot_writer, "DATA_MB", 0.6)
-        patch.setattr(lerobot_writer, "EPISODES_MB", 0.001)
-        report = write_lerobot(tmp_path, frames="images")
-        assert len(list((report.folder / "data").rglob("*.parquet"))) > 2
-        assert_lerobot_episodes(report.folder, exact=True)
+        patch.setattr(lerobot_write, "DATA_MB", 0.6)
+        patch.setattr(lerobot_write, "EPISODES_MB", 0.001)
+        target = write_lerobot(tmp_path, frames="images")
+        assert len(list((target.root / "data").rglob("*.parquet"))) > 2
+        assert_lerobot_episodes(target.root, exact=True)
         # Merging finds the files by what the rows of meta/episodes say.
-        assert len(list((report.folder / "meta" / "episodes").rglob("*.parquet"))) == 3
-        lerobot.datasets.aggregate.aggregate_datasets([REPO], REPO, roots=[report.folder], aggr_root=tmp_path / "again")
+        assert len(list((target.root / "meta" / "episodes").rglob("*.parquet"))) == 3
+        lerobot.datasets.aggregate.aggregate_datasets([REPO], REPO, roots=[target.root], aggr_root=tmp_path / "again")
         assert_lerobot_episodes(tmp_path / "again", exact=True)
 
 
 def test_lerobot_provenance_has_a_row_for_each_episode(written: Written) -> None:
-    for report in (written.lerobot, written.images):
-        rows = pq.read_table(report.folder / "meta" / "provenance.parquet").to_pylist()
+    for target in (written.lerobot, written.images):
+        rows = pq.read_table(target.root / "meta" / "provenance.parquet").to_pylist()
         assert rows == [{"episode_index": k, **episode(episode_id).provenance} for k, episode_id in enumerate(IDS)]
     assert "level" in rows[0]
 
@@ -325,38 +351,39 @@ def assert_statistics(found: Mapping[str, Any], values: NDArray[Any], axes: int 
 
 
 def test_lerobot_statistics_are_exact(written: Written) -> None:
-    stats = LeRobotDataset(REPO, root=written.lerobot.folder, video_backend="pyav").meta.stats
+    stats = LeRobotDataset(REPO, root=written.lerobot.root, video_backend="pyav").meta.stats
     sources = [episode(episode_id) for episode_id in IDS]
     frames = [np.stack([pixels(frame) for frame in source.frames["image"]]) / 255 for source in sources]
     assert_statistics(stats["action"], np.concatenate([source.action for source in sources]).astype(np.float64), 0)
     assert_statistics(stats["observation.images.image"], np.concatenate(frames), (0, 1, 2))
     assert stats["observation.images.image"]["mean"].shape == (3, 1, 1)
     assert set(stats) >= {"observation.state", "observation.joint_state", "observation.images.image2", "timestamp"}
-    for report in (written.lerobot, written.images):
-        assert json.loads((report.folder / "meta" / "stats.json").read_text()) == json.loads(
-            (written.lerobot.folder / "meta" / "stats.json").read_text()
+    for target in (written.lerobot, written.images):
+        assert json.loads((target.root / "meta" / "stats.json").read_text()) == json.loads(
+            (written.lerobot.root / "meta" / "stats.json").read_text()
         )
-        for row, shown in zip(pq.read_table(report.folder / "meta" / "episodes").to_pylist(), frames, strict=True):
+        for row, shown in zip(pq.read_table(target.root / "meta" / "episodes").to_pylist(), frames, strict=True):
             of_episode = {name.rpartition("/")[2]: value for name, value in row.items() if "image/" in name}
             assert_statistics(of_episode, shown, (0, 1, 2))
 
 
 def test_lerobot_reads_when_videos_spread_over_many_files(written: Written, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lerobot_writer, "PART_VIDEO_MB", 0.05)
+        patch.setattr(lerobot_write, "PART_VIDEO_MB", 0.05)
         patch.setattr(lerobot.datasets.aggregate, "DEFAULT_VIDEO_FILE_SIZE_IN_MB", 0.15)
-        report = write_lerobot(tmp_path)
-    assert len(list(report.folder.rglob("*.mp4"))) > 2
-    assert_lerobot_episodes(report.folder)
+        target = write_lerobot(tmp_path)
+    assert len(list(target.root.rglob("*.mp4"))) > 2
+    assert_lerobot_episodes(target.root)
 
 
 def test_formats_carry_the_same_numbers(written: Written) -> None:
-    table = pq.read_table(written.lerobot.folder / "data").to_pydict()
-    features = tfds.builder_from_directory(written.rlds.folder).info.features
-    for episode_id, (shard, position) in written.rlds.locations.items():
-        record = list(records(written.rlds.folder / shard))[position]
+    table = pq.read_table(written.lerobot.root / "data").to_pydict()
+    features = tfds.builder_from_directory(written.version).info.features
+    for episode_id, place in written.rlds.record().places.items():
+        shard, position = place["rlds_shard"], place["rlds_index"]
+        record = list(records(written.version / shard))[position]
         steps = tf_readback.columns(features.deserialize_example_np(record))
-        index = written.lerobot.episode_index[episode_id]
+        index = lerobot_index(written.lerobot)[episode_id]
         rows = [row for row, found in enumerate(table["episode_index"]) if found == index]
         for name, key in (
             ("action", "action"),
@@ -416,7 +443,8 @@ def test_rlds_refuses_a_bad_episode(fault: str, tmp_path: Path) -> None:
     field, spoil = BAD[fault]
     with pytest.raises(PipelineError, match=rf"episode {IDS[-1]}: {field} "):
         write_rlds(tmp_path, load=partial(load_spoilt, spoil=spoil))
-    assert list(tmp_path.iterdir()) == []
+    assert not (tmp_path / "rlds").exists()
+    assert not (tmp_path / "rlds.json").exists()
 
 
 def test_lerobot_refuses_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) -> None:
@@ -425,8 +453,11 @@ def test_lerobot_refuses_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) 
     field, spoil = BAD["nan"]
     with pytest.raises(PipelineError, match=rf"episode {IDS[-1]}: {field} "):
         write_lerobot(tmp_path, load=partial(load_spoilt, spoil=spoil))
-    assert files(tmp_path) == {"lerobot/earlier": b"set"}
-    assert [path.name for path in tmp_path.iterdir()] == ["lerobot"]
+    assert files(tmp_path / "lerobot") == {"earlier": b"set"}
+    # Of the three parts the two that are whole stay, for the next time.
+    assert [path.name for path in sorted((tmp_path / ".work").rglob("part-*"))] == ["part-00000", "part-00001"]
+    write_lerobot(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["lerobot", "lerobot.json"]
 
 
 def test_split_keeps_order_and_balance() -> None:
@@ -440,8 +471,3 @@ def test_split_keeps_order_and_balance() -> None:
             split(wrong, 2)
     with pytest.raises(PipelineError):
         split(ids, 0)
-
-
-def test_rlds_refuses_a_name_tfds_would_not_find(tmp_path: Path) -> None:
-    with pytest.raises(PipelineError, match="not a TFDS name"):
-        rlds.write(IDS, episode, tmp_path, name="LIBERO-plus", shards=1, run=loop)

@@ -9,7 +9,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import jinja2
 import yaml
@@ -20,13 +20,10 @@ from pipeline.axes.base import Layer, Perturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.formats.base import Format
 from pipeline.publish.attribution import attributions
 from pipeline.publish.yields import LEVELS
 from pipeline.run import manifest
-from pipeline.writers.rlds import VERSION
-
-Format = Literal["rlds", "lerobot"]
-FORMATS: tuple[Format, ...] = get_args(Format)
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """What the card tells from, beside the manifest; in the run's folder."""
@@ -38,12 +35,16 @@ FREE = re.compile(r"(MIT|Apache-2\.0|CC0-1\.0|CC-BY-\d)")
 """How the licences begin under which a derived work may be CC BY 4.0."""
 
 
-def write(data: Path, lerobot: str) -> None:
+AnyFormat = Format[Any]
+
+
+def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
     """Write ``<data>/card/<format>/``: what goes to the root of a repository beside that format's files.
 
     Args:
         data: the run's folder, with manifest, reports, ``sheets`` and ``finetune``.
-        lerobot: name of the LeRobot dataset.
+        formats: the run's datasets.
+        name: what all of them together are called.
 
     Raises:
         PipelineError: when something it tells of is missing, or nothing was kept.
@@ -59,38 +60,41 @@ def write(data: Path, lerobot: str) -> None:
     axes = dict.fromkeys(row["axis"] for row in rows)
     sheets = [axis for axis in axes if (data / "sheets" / f"{axis}.png").is_file()]
     with replaced(data / "card") as folder:
-        for kind in FORMATS:
-            (folder / kind / "pictures").mkdir(parents=True)
+        for one in formats:
+            (folder / one.name / "pictures").mkdir(parents=True)
             for axis in sheets:
-                shutil.copyfile(data / "sheets" / f"{axis}.png", folder / kind / "pictures" / f"{axis}.png")
-            text = render(kind, rows, reports, clients, sheets=sheets, lerobot=lerobot)
-            (folder / kind / "README.md").write_text(text)
+                shutil.copyfile(data / "sheets" / f"{axis}.png", folder / one.name / "pictures" / f"{axis}.png")
+            others = [other.title for other in formats if other is not one]
+            text = render(one, others, rows, reports, clients, sheets=sheets, name=name)
+            (folder / one.name / "README.md").write_text(text)
 
 
 def render(
-    kind: Format,
+    shown: AnyFormat,
+    others: Sequence[str],
     rows: Sequence[Mapping[str, Any]],
     reports: Mapping[str, Mapping[str, Any]],
     clients: Mapping[str, Mapping[str, str]],
     *,
     sheets: Sequence[str],
-    lerobot: str,
+    name: str,
 ) -> str:
     """The card of one format, with the hub's metadata in front.
 
     Args:
-        kind: the format.
+        shown: the format.
+        others: titles of the other formats.
         rows: the manifest.
         reports: what the files of ``REPORTS`` hold.
         clients: the section of that name in ``finetune.yaml``: where and how each policy's code is called.
         sheets: the axes that have a picture.
-        lerobot: name of the LeRobot dataset.
+        name: what the run's datasets together are called.
     """
-    leakage, validation, statistics = (reports[name] for name in REPORTS)
+    leakage, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
     owed = attributions(row["perturbations"] for row in kept)
     free = all(FREE.match(one.licence) for one in owed)
-    axes = _axes(kept, kind)
+    axes = _axes(kept, shown)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pipeline.publish"),
         undefined=jinja2.StrictUndefined,
@@ -99,15 +103,15 @@ def render(
         keep_trailing_newline=True,
     )
     return environment.get_template("card.md.j2").render(
-        metadata=_metadata(kind, lerobot, free).to_yaml(),
-        rlds=kind == "rlds",
-        name=lerobot,
-        repository=REPOSITORY,
+        metadata=_metadata(shown, name, free).to_yaml(),
+        format=shown.title,
+        others=" and ".join(others),
+        key=shown.keys,
+        loading=shown.loading(name, REPOSITORY, kept),
+        name=name,
         kept=kept,
         origins=Counter({row["demo_id"]: row["demo_origin"] for row in kept}.values()),
         steps=sum(row["steps"] for row in kept),
-        datasets=sorted({manifest.rlds_dataset(row) for row in kept}),
-        version=VERSION,
         episodes=_episodes(rows),
         levels=table(
             ["axis", *(f"level {level}" for level in LEVELS)],
@@ -119,13 +123,13 @@ def render(
         leakage=leakage,
         distances=_distances(leakage),
         schema=SCHEMA,
-        statistics=[_statistics(name, figures["action"]) for name, figures in statistics.items()],
+        statistics=[_statistics(dataset, figures["action"]) for dataset, figures in statistics.items()],
         validation=table(
             ["check", "checked", "result"],
-            [[name, found["checked"], _result(found["findings"])] for name, found in validation.items()],
+            [[check, found["checked"], _result(found["findings"])] for check, found in validation.items()],
         ),
-        failed=[name for name, found in validation.items() if found["findings"]],
-        clients={name: client for name, client in clients.items() if (name == "openvla_oft") == (kind == "rlds")},
+        failed=[check for check, found in validation.items() if found["findings"]],
+        clients={client: call for client, call in clients.items() if client in shown.clients},
         # Any will do: whoever has the dataset can try the command as it stands.
         example=min(row["episode_id"] for row in kept),
         versions=manifest.made_with(kept[0]),
@@ -135,23 +139,20 @@ def render(
     )
 
 
-def _metadata(kind: Format, name: str, free: bool) -> DatasetCardData:
+def _metadata(shown: AnyFormat, name: str, free: bool) -> DatasetCardData:
     """What the hub files a dataset under, and what its viewer shows: frames' data, and the manifest."""
-    configs = [{"config_name": "manifest", "data_files": "manifest.parquet"}]
-    if kind == "lerobot":  # as lerobot's own upload has it
-        configs.insert(0, {"config_name": "default", "data_files": "data/*/*.parquet"})
     return DatasetCardData(
         language="en",
         license="cc-by-4.0" if free else "other",
         pretty_name=name,
         task_categories=["robotics"],
         source_datasets=["yifengzhu-hf/LIBERO-datasets"],
-        tags=["LeRobot" if kind == "lerobot" else "RLDS", "LIBERO", "LIBERO-Plus", "panda", "simulation"],
-        configs=configs,
+        tags=[shown.title, "LIBERO", "LIBERO-Plus", "panda", "simulation"],
+        configs=[*shown.viewer(), {"config_name": "manifest", "data_files": "manifest.parquet"}],
     )
 
 
-def _axes(kept: Iterable[Mapping[str, Any]], kind: Format) -> dict[str, dict[str, Any]]:
+def _axes(kept: Iterable[Mapping[str, Any]], shown: AnyFormat) -> dict[str, dict[str, Any]]:
     """Axis to what it is, and how many episodes show each of its components and levels, combinations included."""
     found: dict[str, dict[str, Any]] = {}
     for row in kept:
@@ -160,7 +161,7 @@ def _axes(kept: Iterable[Mapping[str, Any]], kind: Format) -> dict[str, dict[str
                 change.axis,
                 {
                     "what": (inspect.getdoc(type(change)) or "").partition("\n")[0],
-                    "changes": _changes(change, kind),
+                    "changes": _changes(change, shown),
                     "components": Counter(),
                     "levels": Counter(),
                 },
@@ -170,15 +171,11 @@ def _axes(kept: Iterable[Mapping[str, Any]], kind: Format) -> dict[str, dict[str
     return found
 
 
-def _changes(change: Perturbation, kind: Format) -> str:
+def _changes(change: Perturbation, shown: AnyFormat) -> str:
     """What differs between an episode and its twin."""
     if change.layer == Layer.TEXT:
         return "the instruction"
-    views = " and ".join(
-        f"`{view if kind == 'rlds' else spec.lerobot_key}`"
-        for view, spec in SCHEMA.views.items()
-        if view in change.views
-    )
+    views = " and ".join(f"`{shown.keys[view]}`" for view in SCHEMA.views if view in change.views)
     return f"{views}, state and length" if change.layer == Layer.PHYSICS else views
 
 

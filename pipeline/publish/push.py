@@ -15,14 +15,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError, XetError
 
 from pipeline.errors import PipelineError
-from pipeline.publish.card import REPORTS, REPOSITORY, Format
-from pipeline.run import manifest
-from pipeline.writers.rlds import VERSION
+from pipeline.formats.base import Format
+from pipeline.publish.card import REPORTS, REPOSITORY
 
 SCRIPTS = {".py", ".yaml", ".json"}
 """What of ``finetune/`` is uploaded; trying it leaves compiled Python there."""
@@ -34,7 +32,7 @@ class Upload:
 
     Attributes:
         files: path in the repository to file here.
-        tag: what the commit is tagged, as LeRobot's loader wants it; None for RLDS.
+        tag: what the commit is tagged, where a client's loader wants that.
     """
 
     files: Mapping[str, Path]
@@ -50,25 +48,25 @@ class Upload:
         return "\n".join([*lines, f"tag: {self.tag or 'none'}"])
 
 
-def prepare(data: Path, kind: Format, lerobot: str) -> Upload:
+def prepare(target: Format[Any]) -> Upload:
     """Gather what belongs to a dataset; nothing is sent.
 
     Args:
-        data: the run's folder.
-        kind: which of the two datasets.
-        lerobot: name of the LeRobot dataset.
+        target: the dataset.
 
     Raises:
         PipelineError: when files are missing, foreign, not validated, or failed validation.
     """
-    files, tag = _rlds(data) if kind == "rlds" else _lerobot(data / "lerobot" / lerobot)
-    _refuse_unvalidated(data, files, kind)
-    card = data / "card" / kind
+    data = target.data
+    dataset = _exactly(target.folder, set(target.record().files))
+    files = {target.repository_path(path): file for path, file in dataset.items()}
+    _refuse_unvalidated(data, files, target.name)
+    card = data / "card" / target.name
     files |= {file.relative_to(card).as_posix(): file for file in card.rglob("*") if file.is_file()}
     files |= {name: data / name for name in ("manifest.parquet", *REPORTS)}
     scripts = (file for file in (data / "finetune").rglob("*") if file.suffix in SCRIPTS)
     files |= {file.relative_to(data).as_posix(): file for file in scripts}
-    return Upload(dict(sorted(files.items())), tag)
+    return Upload(dict(sorted(files.items())), target.tag())
 
 
 def send(upload: Upload, repository: str, *, private: bool = False, endpoint: str | None = None) -> str:
@@ -132,35 +130,6 @@ def _content(path: str, file: Path, repository: str) -> Path | bytes:
     return file.read_text().replace(REPOSITORY, repository).encode() if path == "README.md" else file
 
 
-def _rlds(data: Path) -> tuple[dict[str, Path], None]:
-    """The shards that the manifest names and what TFDS needs beside them, at the place where ``finetune/`` looks."""
-    kept = [row for row in manifest.read(_there(data / "manifest.parquet")) if row["kept"]]
-    folders = {f"{manifest.rlds_dataset(row)}/{VERSION}" for row in kept}
-    wanted = {f"{manifest.rlds_dataset(row)}/{VERSION}/{row['rlds_shard']}" for row in kept}
-    wanted |= {f"{folder}/{name}" for folder in folders for name in ("dataset_info.json", "features.json")}
-    return {f"rlds/{path}": file for path, file in _exactly(data / "rlds", wanted).items()}, None
-
-
-def _lerobot(root: Path) -> tuple[dict[str, Path], str]:
-    """The files that ``meta/`` names, at the root of the repository, where lerobot looks for them."""
-    info: dict[str, Any] = json.loads(_there(root / "meta" / "info.json").read_text())
-    wanted = {f"meta/{name}" for name in ("info.json", "stats.json", "tasks.parquet", "provenance.parquet")}
-    for index in sorted((root / "meta" / "episodes").rglob("*.parquet")):
-        wanted.add(index.relative_to(root).as_posix())
-        wanted |= set(_named(info, pq.read_table(index).to_pylist()))
-    return _exactly(root, wanted), info["codebase_version"]
-
-
-def _named(info: Mapping[str, Any], episodes: list[dict[str, Any]]) -> Iterator[str]:
-    videos = [key for key, feature in info["features"].items() if feature["dtype"] == "video"]
-    for row in episodes:
-        data = {name: row[f"data/{name}"] for name in ("chunk_index", "file_index")}
-        yield info["data_path"].format(**data)
-        for key in videos:
-            video = {name: row[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            yield info["video_path"].format(video_key=key, **video)
-
-
 def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
     """The wanted files under ``root``, when there is nothing else, and nothing that leads elsewhere."""
     found = {file.relative_to(root).as_posix(): file for file in root.rglob("*") if file.is_symlink() or file.is_file()}
@@ -178,7 +147,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
     return found
 
 
-def _refuse_unvalidated(data: Path, files: Mapping[str, Path], kind: Format) -> None:
+def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> None:
     """Stop unless these very files passed validation, and the card tells of it."""
     report = _there(data / "validation.json")
     checks = json.loads(report.read_text())
@@ -193,7 +162,7 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], kind: Format) -> 
     steps = [
         max(*files.values(), data / "manifest.parquet", key=_written),
         report,
-        _there(data / "card" / kind / "README.md"),
+        _there(data / "card" / name / "README.md"),
     ]
     for before, after in pairwise(steps):
         if _written(after) < _written(before):

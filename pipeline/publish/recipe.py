@@ -17,8 +17,8 @@ import yaml
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced, schema_file
+from pipeline.formats.rlds_layout import dataset_of
 from pipeline.run import motion_statistics
-from pipeline.run.manifest import rlds_dataset
 
 SCHEMA_FILE = schema_file("finetune.json")
 TEMPLATES = Path(__file__).parent / "templates"
@@ -86,7 +86,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, 
     kept = [row for row in rows if row["kept"]]
     if not kept:
         raise PipelineError("no episode was kept", where=manifest_file, remedy="read its column reason")
-    suites = {row["suite"]: rlds_dataset(row) for row in kept}
+    suites = {row["suite"]: dataset_of(row) for row in kept}
     counts: dict[str, dict[str, int]] = {}
     for row in kept:
         by_axis = counts.setdefault(row["suite"], {})

@@ -44,13 +44,13 @@ class Settings(Frozen):
         return cls(source=config.demos.source, replay=config.replay, render=config.render)
 
 
-def build(run: Outcome, rlds: Mapping[str, tuple[str, int]], lerobot: Mapping[str, int]) -> pa.Table:
+def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequence[pa.Field]) -> pa.Table:
     """Join the plan with what became of it.
 
     Args:
         run: the plan, and what replay and rendering made of it.
-        rlds: episode id to its shard's file name and its place in it, for every kept episode.
-        lerobot: episode id to its ``episode_index``, for every kept episode.
+        places: episode id to where it lies in the datasets, for every kept episode.
+        columns: those of ``places``.
     """
     shared = {version_column(name): version for name, version in versions().items()}
     table = []
@@ -58,20 +58,16 @@ def build(run: Outcome, rlds: Mapping[str, tuple[str, int]], lerobot: Mapping[st
         verdict = run.verdicts[row.episode_id]
         replayed = run.trajectories.get(row.trajectory_id, {})
         rendered = run.frames.get(row.trajectory_id, {})
-        shard, index = rlds.get(row.episode_id, (None, None))
-        columns: dict[str, Any] = {
+        results: dict[str, Any] = {
             "kept": verdict.kept,
             "reason": verdict.reason,
             "replay_mode": replayed.get("mode"),
             "steps": replayed.get("steps"),
             "resolved": replayed.get("resolved"),
             "gl_device": rendered.get("device"),
-            "rlds_shard": shard,
-            "rlds_index": index,
-            "lerobot_episode_index": lerobot.get(row.episode_id),
         }
-        table.append(asdict(row) | columns | shared)
-    return pa.Table.from_pylist(table, schema=schema())
+        table.append({**asdict(row), **results, **places.get(row.episode_id, {}), **shared})
+    return pa.Table.from_pylist(table, schema=schema(columns))
 
 
 def version_column(name: str) -> str:
@@ -79,10 +75,12 @@ def version_column(name: str) -> str:
     return f"{name.replace('-', '_')}_version"
 
 
-def schema() -> pa.Schema:
-    """The manifest's columns, from ``schemas/manifest.json``."""
+def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
+    """The manifest's columns, from ``schemas/manifest.json``, and before the versions those of the output formats."""
     columns = json.loads(SCHEMA_FILE.read_text())["columns"]
-    return pa.schema([pa.field(c["name"], _TYPES[c["type"]], metadata={"meaning": c["meaning"]}) for c in columns])
+    fields = [pa.field(c["name"], _TYPES[c["type"]], metadata={"meaning": c["meaning"]}) for c in columns]
+    versions_from = next(k for k, field in enumerate(fields) if field.name.endswith("_version"))
+    return pa.schema([*fields[:versions_from], *places, *fields[versions_from:]])
 
 
 def write(table: pa.Table, path: Path, settings: Settings) -> None:
@@ -121,11 +119,6 @@ def made_with(row: Mapping[str, Any]) -> dict[str, str]:
         for column, version in row.items()
         if column.endswith("_version")
     }
-
-
-def rlds_dataset(row: Mapping[str, Any]) -> str:
-    """Name of the RLDS dataset that holds a kept episode: what its shard's name begins with."""
-    return str(row["rlds_shard"]).partition("-")[0]
 
 
 def asked(manifest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:

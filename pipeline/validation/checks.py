@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import SCHEMA
+from pipeline.formats.base import Copy, Fault, sampled
 from pipeline.libero.tasks import find_task
 from pipeline.rendering.jpeg import decode
 from pipeline.types import Episode, Frame, Trajectory
-from pipeline.validation.readback import Copy, sampled
 
 VIDEO_PSNR_DB = 32.0
 """Least PSNR of a video's frame to the stored JPEG; the least of 294 frames under five axes was 35 dB."""
@@ -37,23 +37,6 @@ DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|demo)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
-class Fault:
-    """Something off.
-
-    Attributes:
-        dataset: ``rlds``, ``lerobot``, ``manifest``, or ``frames`` for the store that both were made from.
-        episode: its id, or None when it is about the whole dataset.
-        what: the fault.
-        expected: what would have been right.
-    """
-
-    dataset: str
-    episode: str | None
-    what: str
-    expected: str
-
-
-@dataclass(frozen=True)
 class Case:
     """One episode and everything known of it.
 
@@ -61,8 +44,7 @@ class Case:
         row: of the manifest.
         made: as the episode store has it.
         trajectory: the replay that it was rendered from.
-        copies: as RLDS and LeRobot have it, as far as they could be read.
-        encoded: view to the JPEG files that RLDS has.
+        copies: as each dataset has it, as far as it could be read.
         bank: the run's own bank of rewrites.
     """
 
@@ -70,7 +52,6 @@ class Case:
     made: Episode
     trajectory: Trajectory
     copies: Sequence[Copy]
-    encoded: Mapping[str, Sequence[bytes]]
     bank: Path | None
 
     @property
@@ -148,24 +129,35 @@ def provenance(case: Case) -> Iterator[Fault]:
                 yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
 
 
+def place(case: Case) -> Iterator[Fault]:
+    """Where the manifest says."""
+    for copy in case.copies:
+        told = {column: case.row[column] for column in copy.place}
+        if told != copy.place:
+            yield case.finding("manifest", _listed(told), f"{_listed(copy.place)}, where it lies")
+
+
 def jpeg(case: Case) -> Iterator[Fault]:
-    """In RLDS, the very bytes of every stored frame."""
-    for view, frames in case.made.frames.items():
-        wrong = [t for t, (one, other) in enumerate(zip(case.encoded[view], frames, strict=False)) if one != other]
-        if wrong:
-            yield case.finding("rlds", f"{view} differs at {len(wrong)} steps, first at {wrong[0]}", "the stored JPEG")
+    """The very bytes of every stored frame, where a dataset has image files."""
+    for copy in case.copies:
+        for view, files in (copy.encoded or {}).items():
+            pairs = zip(files, case.made.frames[view], strict=False)
+            if wrong := [step for step, (one, other) in enumerate(pairs) if one != other]:
+                what = f"{view} differs at {len(wrong)} steps, first at {wrong[0]}"
+                yield case.finding(copy.dataset, what, "the stored JPEG")
 
 
 def video(case: Case) -> Iterator[Fault]:
-    """In LeRobot, frames within ``VIDEO_PSNR_DB`` of the stored ones."""
-    for copy, view, step, shown in _shown(case, "lerobot"):
-        if (reached := psnr_db(copy.frames[view, step], shown[view])) < VIDEO_PSNR_DB:
-            yield case.finding("lerobot", f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} dB or more")
+    """Frames within ``VIDEO_PSNR_DB`` of the stored ones, where a dataset has others than those image files."""
+    for copy, view, step, shown in _shown(case):
+        reached = psnr_db(copy.frames[view, step], shown[view])
+        if copy.encoded is None and reached < VIDEO_PSNR_DB:
+            yield case.finding(copy.dataset, f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} or more")
 
 
 def cameras(case: Case) -> Iterator[Fault]:
     """No view that shows what another camera saw."""
-    for copy, view, step, shown in _shown(case, "rlds", "lerobot"):
+    for copy, view, step, shown in _shown(case):
         for other in shown.keys() - {view}:
             if psnr_db(copy.frames[view, step], shown[other]) > VIDEO_PSNR_DB:
                 yield case.finding(copy.dataset, f"{view} of step {step} shows {other}", "its own camera")
@@ -197,45 +189,46 @@ def gripper(case: Case) -> Iterator[Fault]:
 
 
 def flags(case: Case) -> Iterator[Fault]:
-    """In RLDS, the first and the last step marked as such, and a reward for the last alone."""
+    """The first and the last step marked as such, and a reward for the last alone, where a dataset has such marks."""
     for copy in case.copies:
-        if copy.dataset == "rlds":
-            step = np.arange(len(copy))
-            first, last = step == 0, step == len(step) - 1
-            yield from _marked(
-                case,
-                copy,
-                {"is_first": first, "is_last": last, "is_terminal": last, "reward": last, "discount": step >= 0},
-            )
+        step = np.arange(len(copy))
+        first, last = step == 0, step == len(step) - 1
+        yield from _marked(
+            case,
+            copy,
+            {"is_first": first, "is_last": last, "is_terminal": last, "reward": last, "discount": step >= 0},
+        )
 
 
 def clock(case: Case) -> Iterator[Fault]:
-    """Steps at the frame rate: of the physics, and in LeRobot counted from 0 and timed."""
+    """Steps at the frame rate: of the physics, and counted from 0 and timed where a dataset has such marks."""
     taken = np.diff(case.trajectory.states[:, 0])
     if not np.allclose(taken, 1 / SCHEMA.fps_hz, rtol=0, atol=1e-6):
         yield case.finding("frames", f"steps take {taken.min():g} to {taken.max():g} s", f"{1 / SCHEMA.fps_hz:g} s")
     for copy in case.copies:
-        if copy.dataset == "lerobot":
-            step = np.arange(len(copy))
-            yield from _marked(case, copy, {"frame_index": step, "timestamp": step / SCHEMA.fps_hz})
+        step = np.arange(len(copy))
+        yield from _marked(case, copy, {"frame_index": step, "timestamp": step / SCHEMA.fps_hz})
 
 
 def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Iterator[Fault]:
-    for name, expected in wanted.items():
-        found = copy.marks[name]
-        for step in np.flatnonzero(~np.isclose(found, expected, rtol=0, atol=1e-4))[:1]:
-            what = f"{name} of step {step} is {float(found[step]):g}"
+    for name in sorted(copy.marks.keys() & wanted.keys()):
+        values, expected = copy.marks[name], wanted[name]
+        for step in np.flatnonzero(~np.isclose(values, expected, rtol=0, atol=1e-4))[:1]:
+            what = f"{name} of step {step} is {float(values[step]):g}"
             yield case.finding(copy.dataset, what, f"{float(expected[step]):g}")
 
 
-def _shown(case: Case, *datasets: str) -> Iterator[tuple[Copy, str, int, Mapping[str, Frame]]]:
+def _shown(case: Case) -> Iterator[tuple[Copy, str, int, Mapping[str, Frame]]]:
     """Copy, view, step, and what the store has in every view there, for the sampled steps."""
     for step in sampled(len(case.made)):
         shown = {view: decode(frames[step]) for view, frames in case.made.frames.items()}
         for copy in case.whole:
-            if copy.dataset in datasets:
-                for view in SCHEMA.views:
-                    yield copy, view, step, shown
+            for view in SCHEMA.views:
+                yield copy, view, step, shown
+
+
+def _listed(place: Mapping[str, Any]) -> str:
+    return ", ".join(f"{column} {value}" for column, value in place.items())
 
 
 Check = Callable[[Case], Iterable[Fault]]
@@ -248,6 +241,7 @@ CHECKS: Mapping[str, Check] = {
         instruction,
         wording,
         provenance,
+        place,
         jpeg,
         video,
         cameras,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,11 @@ from numpy.typing import NDArray
 
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
+from pipeline.export_config import RldsConfig
+from pipeline.formats.base import Episodes, Row
+from pipeline.formats.export import export
+from pipeline.formats.rlds import Rlds
+from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
 from pipeline.physics.replay import ReplayJob
 from pipeline.rendering.render import RenderJob
@@ -27,11 +31,6 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.frame_store import FrameStore
 from pipeline.run.streams import streams_of
 from pipeline.types import Verdict
-from pipeline.validation.shards import METADATA, columns, records
-from pipeline.writers import rlds
-
-Row = Mapping[str, Any]
-"""A row of the manifest."""
 
 
 def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | None = None) -> dict[str, Any]:
@@ -92,7 +91,7 @@ class _Record:
 
     @classmethod
     def read(cls, shard: Path, index: int) -> _Record:
-        data = next(islice(records(shard), index, None), None)
+        data = record_at(shard, index)
         if data is None:
             raise PipelineError(f"has no record {index}", where=shard, expected="as many as the manifest says")
         return cls(data, tfds.builder_from_directory(shard.parent).info.features)
@@ -139,8 +138,11 @@ def _rebuild(
     if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)
-    made = rlds.write([row["episode_id"]], load, out / "rlds", name="regenerated", shards=1, run=loop)
-    return _Record.read(made.folder / made.locations[row["episode_id"]].shard, 0), "kept"
+    rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1))
+    episode_id = row["episode_id"]
+    export(rebuilt, Episodes([episode_id], load, {episode_id: row["suite"]}, {episode_id: "regenerated"}), loop)
+    (shard,) = rebuilt.folder.rglob("*.tfrecord-*")
+    return _Record.read(shard, 0), "kept"
 
 
 def _root(settings: manifest.Settings, root: Path | None) -> Path | None:

@@ -9,10 +9,11 @@ import numpy as np
 
 from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.episode_schema import SCHEMA
+from pipeline.formats.base import Fault
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.streams import streams_of
 from pipeline.types import Frame, Trajectory
-from pipeline.validation.checks import Case, Fault, psnr_db
+from pipeline.validation.checks import Case, psnr_db
 
 PSNR_DB = 25.0
 """Least PSNR of a first frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""

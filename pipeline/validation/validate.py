@@ -1,4 +1,4 @@
-"""Reopen both datasets and the manifest of a finished run, as their readers would, and say what is off.
+"""Reopen the datasets and the manifest of a finished run, as their readers would, and say what is off.
 
 The datasets are compared with the stores that they were made from; those in turn are held against fresh renderings.
 """
@@ -6,30 +6,28 @@ The datasets are compared with the stores that they were made from; those in tur
 from __future__ import annotations
 
 import json
-import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import tensorflow_datasets as tfds
-from numpy.typing import NDArray
-
 from pipeline.config import Config
-from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.files import scratch
+from pipeline.formats.base import Fault, Format, Row
+from pipeline.formats.registry import formats_of
 from pipeline.run import manifest
 from pipeline.run.compute import Run
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.trajectory_store import TrajectoryStore
-from pipeline.validation import oft, set_checks
-from pipeline.validation.checks import CHECKS, Case, Fault
-from pipeline.validation.readback import UNREADABLE, Copy, LeRobotSet, from_lerobot, from_rlds, open_lerobot
+from pipeline.validation import oft, run_checks
+from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import rendered, witnesses
-from pipeline.validation.shards import METADATA, columns, records
-from pipeline.writers import rlds
+
+SLICE = 16
+"""So many episodes are checked in one call."""
 
 
 @dataclass
@@ -39,12 +37,10 @@ class Outcome:
     Attributes:
         checked: check to how often it was made.
         findings: check to what it found.
-        places: episode id to how often RLDS has it.
     """
 
     checked: Counter[str] = field(default_factory=Counter)
     findings: dict[str, list[Fault]] = field(default_factory=lambda: defaultdict(list))
-    places: Counter[str] = field(default_factory=Counter)
 
     def note(self, check: str, found: Iterable[Fault], checked: int = 1) -> None:
         self.checked[check] += checked
@@ -53,7 +49,6 @@ class Outcome:
     def add(self, other: Outcome) -> None:
         for check, checked in other.checked.items():
             self.note(check, other.findings[check], checked)
-        self.places += other.places
 
 
 def validate(config: Config, run: Run) -> dict[str, Any]:
@@ -69,28 +64,32 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
     data = config.data.resolve()
     rows = manifest.read(data / "manifest.parquet")
     kept = {row["episode_id"]: row for row in rows if row["kept"]}
-    root = data / "lerobot" / config.export.lerobot.name
-    sets = oft.datasets(data / "rlds")
     total = Outcome()
-    total.note("counts", set_checks.counts(data, rows), len(rows))
-    total.note("format", set_checks.rlds_format(sets), len(sets))
-    with tempfile.TemporaryDirectory(prefix=".validate.", dir=data) as cache:
-        opened = _opened(root, Path(cache))
-        if isinstance(opened, Fault):
-            total.note("readable", [opened])
-        else:
-            total.note("format", set_checks.lerobot_format(opened, config.export.lerobot.frames))
-            total.note("ids", set_checks.lerobot_ids(opened, kept), len(kept))
-        job = ShardJob(
-            config, data, None if isinstance(opened, Fault) else root, Path(cache), frozenset(witnesses(rows))
-        )
-        for outcome in run(job, sorted((data / "rlds").glob("*/*/*.tfrecord-*")), "validate"):
+    total.note("counts", run_checks.counts(data, rows), len(rows))
+    with scratch(data / ".work" / "validate") as cache:
+        opened = []
+        for one in formats_of(data, config.export):
+            try:
+                faults = list(one.check(kept, cache))
+            except PipelineError as error:
+                total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
+                continue
+            opened.append(one)
+            total.note("format", [fault for check, fault in faults if check == "format"])
+            total.note("ids", [fault for check, fault in faults if check == "ids"], len(kept))
+            total.note("readable", [fault for check, fault in faults if check == "readable"], 0)
+        job = EpisodesJob(config, data, opened, cache, frozenset(witnesses(rows)))
+        # Episodes that lie together are read together.
+        columns = [column.name for one in opened for column in one.columns]
+        ordered = sorted(kept.values(), key=lambda row: [row[column] for column in columns])
+        slices = [ordered[start : start + SLICE] for start in range(0, len(ordered), SLICE)]
+        for outcome in run(job, slices, "validate"):
             total.add(outcome)
-    total.note("ids", set_checks.rlds_ids(kept, total.places), len(kept))
     if not any(finding.dataset == "rlds" for finding in total.findings["readable"]):
         # OFT's reader stops at what is damaged.
+        sets = oft.datasets(data / "rlds")
         statistics = json.loads((data / "dataset_statistics.json").read_text())
-        trained = run(partial(set_checks.openvla_oft, statistics), sets, "read as OpenVLA-OFT")
+        trained = run(partial(run_checks.openvla_oft, statistics), sets, "read as OpenVLA-OFT")
         total.note("openvla_oft", [finding for found in trained for finding in found], len(sets))
     return {
         check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
@@ -99,47 +98,41 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class ShardJob:
-    """The checks of all episodes of one RLDS shard, wherever else they lie.
+class EpisodesJob:
+    """The checks of some episodes, wherever they lie.
 
     Attributes:
         config: of the run.
         data: its folder.
-        root: of its LeRobot dataset, where that can be opened.
-        cache: folder for the copies that ``datasets`` makes of what lerobot reads.
+        formats: the datasets that can be opened.
+        cache: folder for files that reading them needs.
         witnesses: ids of the episodes to render anew.
     """
 
     config: Config
     data: Path
-    root: Path | None
+    formats: Sequence[Format[Any]]
     cache: Path
     witnesses: frozenset[str]
 
-    def __call__(self, shard: Path) -> Outcome:
+    def __call__(self, rows: Sequence[Row]) -> Outcome:
         outcome = Outcome()
-        for index, read in enumerate(_episodes(shard)):
-            if isinstance(read, Fault):
-                outcome.note("readable", [read])
-            else:
-                self._check(read, f"record {index} of {shard.name}", outcome)
+        for row in rows:
+            self._check(row, outcome)
         return outcome
 
-    def _check(self, steps: Mapping[str, NDArray[Any]], place: str, outcome: Outcome) -> None:
-        episode_id = steps[f"{METADATA}episode_id"][0].decode()
-        outcome.places[episode_id] += 1
-        row = _rows(self.data / "manifest.parquet").get(episode_id)
-        if row is None:
-            return  # Told by "ids".
-        told = f"record {row['rlds_index']} of {row['rlds_shard']}"
-        outcome.note("place", [Fault("manifest", episode_id, told, place)] if told != place else [])
-        copies, unreadable = [], []
-        for dataset, reader in self._readers(steps, episode_id).items():
+    def _check(self, row: Row, outcome: Outcome) -> None:
+        episode_id = row["episode_id"]
+        copies, missing, unreadable = [], [], []
+        for one in self.formats:
             try:
-                copies.append(reader())
-            except UNREADABLE as error:
-                what = f"{type(error).__name__}: {error}"
-                unreadable.append(Fault(dataset, episode_id, what, "an episode that can be read"))
+                if (copy := one.read(row, self.cache)) is not None:
+                    copies.append(copy)
+                else:
+                    missing.append(Fault(one.name, episode_id, "is not in the dataset", "every kept episode"))
+            except PipelineError as error:
+                unreadable.append(Fault(one.name, episode_id, str(error), "an episode that can be read"))
+        outcome.note("ids", missing, 0)
         outcome.note("readable", unreadable)
         language = self.config.plan.axes.language
         case = Case(
@@ -147,44 +140,9 @@ class ShardJob:
             made=EpisodeLoader(self.data / "plan.parquet", self.data / "frames", self.config.render)(episode_id),
             trajectory=TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"]),
             copies=copies,
-            encoded={view: steps[f"observation/{view}"].tolist() for view in SCHEMA.views},
             bank=language.bank if language else None,
         )
         for name, check in CHECKS.items():
             outcome.note(name, check(case))
         if episode_id in self.witnesses:
             outcome.note("rendered", rendered(case))
-
-    def _readers(self, steps: Mapping[str, NDArray[Any]], episode_id: str) -> dict[str, Callable[[], Copy]]:
-        readers: dict[str, Callable[[], Copy]] = {"rlds": partial(from_rlds, steps)}
-        if self.root is not None:
-            readers["lerobot"] = partial(from_lerobot, open_lerobot(self.root, self.cache), episode_id)
-        return readers
-
-
-def _episodes(shard: Path) -> Iterator[dict[str, NDArray[Any]] | Fault]:
-    """The columns of every record, and a finding where it goes no further."""
-    info = tfds.builder_from_directory(shard.parent).info
-    split = info.splits[rlds.SPLIT]
-    expected = dict(zip(split.filenames, split.shard_lengths, strict=True)).get(shard.name)
-    found = 0
-    try:
-        for record in records(shard):
-            yield columns(record, info.features)
-            found += 1
-        if found != expected:
-            yield Fault("rlds", None, f"{shard.name} has {found} records", f"{expected}, as dataset_info.json says")
-    except PipelineError as error:
-        yield Fault("rlds", None, str(error), "a whole file")
-
-
-def _opened(root: Path, cache: Path) -> LeRobotSet | Fault:
-    try:
-        return open_lerobot(root, cache)
-    except UNREADABLE as error:
-        return Fault("lerobot", None, f"{type(error).__name__}: {error}", "a dataset that lerobot opens")
-
-
-@lru_cache(maxsize=1)
-def _rows(file: Path) -> dict[str, dict[str, Any]]:
-    return {row["episode_id"]: row for row in manifest.read(file) if row["kept"]}

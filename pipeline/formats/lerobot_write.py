@@ -1,20 +1,18 @@
-"""LeRobotDataset v3.0, written by lerobot 0.4.4 itself: parts in parallel, then merged.
+"""The parts of a LeRobot dataset, and their merge, by lerobot 0.4.4 itself.
 
-Two things of lerobot's are replaced: its video encoder (see ``video``), and its statistics, of frames (see ``levels``)
-and in ``meta/stats.json``, where merged quantiles are averages of per-episode quantiles (huggingface/lerobot#3804).
-Beside lerobot's own files there is ``meta/provenance.parquet``, one row per episode.
+Two things of lerobot's are replaced: its video encoder (see ``lerobot_video``), and its statistics: of frames (see
+``image_statistics``), and in ``meta/stats.json``, where merged quantiles are averages of per-episode quantiles
+(huggingface/lerobot#3804). Beside lerobot's own files there is ``meta/provenance.parquet``, one row per episode.
 """
 
 from __future__ import annotations
 
-import shutil
-import tempfile
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import av
 import cv2
@@ -34,15 +32,11 @@ from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA, check
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.formats.base import Load
+from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
+from pipeline.formats.lerobot_video import VideoEncoder
 from pipeline.run.motion_statistics import describe
 from pipeline.types import Episode, Floats, Frame
-from pipeline.writers.base import Load, folder_bytes, split
-from pipeline.writers.image_statistics import QUANTILES, Counts, count, statistics
-from pipeline.writers.video import VideoEncoder
-
-if TYPE_CHECKING:  # export imports no simulator, and this would
-    from pipeline.run.compute import Run
 
 Frames = Literal["video", "images"]
 """``video`` is H.264 made from the stored frames; ``images`` are the stored JPEG files, three times as large."""
@@ -58,88 +52,81 @@ EPISODES_MB = 2
 more than 100 in memory."""
 
 
-@dataclass(frozen=True)
-class LeRobotReport:
-    """What was written.
-
-    Attributes:
-        folder: the dataset's root, for ``LeRobotDataset(repo_id, root=folder)``.
-        episode_index: episode id to lerobot's ``episode_index``.
-        steps: over all episodes.
-        bytes: of all files.
-    """
-
-    folder: Path
-    episode_index: Mapping[str, int]
-    steps: int
-    bytes: int
+SUMMARY, DATASET = "summary.json", "dataset"
+"""In a part's folder: what the merge needs beside the dataset, and the dataset."""
 
 
-@dataclass(frozen=True)
-class _Part:
-    root: Path
-    episode_ids: Sequence[str]
+def write_part(path: Path, episode_ids: Sequence[str], load: Load, *, repo_id: str, frames: Frames) -> None:
+    """Write a dataset of some of the episodes, and a summary; a process writes one at a time.
 
-
-@dataclass(frozen=True)
-class _Written:
-    steps: int
-    provenance: Sequence[Mapping[str, str]]
-    counts: Mapping[str, Counts]
-
-
-def write(
-    episode_ids: Sequence[str],
-    load: Load,
-    out: Path,
-    *,
-    repo_id: str,
-    parts: int,
-    run: Run,
-    frames: Frames = "video",
-) -> LeRobotReport:
-    """Write a dataset whose root is ``out``, replacing what is there; episode i is ``episode_ids[i]``.
-
-    The bytes, videos included, depend on the episodes, their order, ``parts`` and the encoder's version alone.
+    The bytes, videos included, depend on the episodes, their order and the encoder's version alone.
 
     Args:
+        path: new folder.
         episode_ids: ids of the episodes to write.
-        load: reads one episode, in a worker; one at a time is in memory.
-        out: the dataset's root.
-        repo_id: its name on the hub, such as ``user/name``; nothing is sent or fetched.
-        parts: pieces written in parallel and merged (fewer when there are fewer episodes).
-        run: spreads the work; one call per part, and in a process one at a time.
+        load: reads one episode; one at a time is in memory.
+        repo_id: the dataset's name, as on the hub; nothing is sent or fetched.
         frames: how frames are stored.
 
     Raises:
-        PipelineError: when an episode breaks the schema or the ids are unfit. Nothing is left behind.
+        PipelineError: when an episode breaks the schema.
     """
-    slices = split(episode_ids, parts)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with replaced(out) as root, tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as scratch:
-        jobs = [_Part(Path(scratch) / f"part-{k:05d}", ids) for k, ids in enumerate(slices)]
-        written = run(partial(_write_part, load=load, repo_id=repo_id, frames=frames), jobs, "LeRobot parts")
-        with (
-            local_only(Path(scratch) / "cache"),
-            _set(lerobot.datasets.aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_MB),
-        ):
-            aggregate_datasets(
-                [repo_id] * len(jobs),
-                repo_id,
-                roots=[job.root for job in jobs],
-                aggr_root=root,
-                data_files_size_in_mb=DATA_MB,
-            )
-        _number_episode_files(root)
-        counts = {view: np.sum([part.counts[view] for part in written], axis=0) for view in SCHEMA.views}
-        _write_statistics(root, counts)
-        _write_provenance(root, [row for part in written for row in part.provenance])
-    return LeRobotReport(
-        folder=out,
-        episode_index={episode_id: index for index, episode_id in enumerate(episode_ids)},
-        steps=sum(part.steps for part in written),
-        bytes=folder_bytes(out),
+    datasets.disable_progress_bars()
+    av.logging.set_libav_level(av.logging.ERROR)  # lerobot restores FFmpeg's own log, which tells of every append
+    path.mkdir()
+    dataset = LeRobotDataset.create(
+        repo_id,
+        SCHEMA.fps_hz,
+        features(frames),
+        root=path / DATASET,
+        robot_type=SCHEMA.robot_type,
+        use_videos=frames == "video",
+        video_backend="pyav",
+        vcodec="h264",
     )
+    dataset.meta.update_chunk_settings(data_files_size_in_mb=DATA_MB, video_files_size_in_mb=PART_VIDEO_MB)
+    # The slot that streaming_encoding=True fills; it has no public name.
+    dataset._streaming_encoder = VideoEncoder() if frames == "video" else None
+    provenance = []
+    counts: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
+    try:
+        for episode_id in episode_ids:
+            episode = load(episode_id)
+            check(episode)
+            for view, counted in _add(dataset, episode).items():
+                counts[view] += counted
+            provenance.append(dict(episode.provenance))
+    finally:
+        dataset.finalize()
+    levels = {view: counted.tolist() for view, counted in counts.items()}
+    (path / SUMMARY).write_text(json.dumps({"provenance": provenance, "levels": levels}))
+
+
+def merge(parts: Sequence[Path], root: Path, cache: Path, *, repo_id: str) -> None:
+    """Merge parts, in their order, into a dataset with exact statistics and a table of provenance.
+
+    Args:
+        parts: folders of ``write_part``.
+        root: new folder of the dataset.
+        cache: folder for the copies that ``datasets`` makes of what lerobot reads.
+        repo_id: as of the parts.
+    """
+    with (
+        local_only(cache),
+        _set(lerobot.datasets.aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_MB),
+    ):
+        aggregate_datasets(
+            [repo_id] * len(parts),
+            repo_id,
+            roots=[part / DATASET for part in parts],
+            aggr_root=root,
+            data_files_size_in_mb=DATA_MB,
+        )
+    _number_episode_files(root)
+    summaries = [json.loads((part / SUMMARY).read_text()) for part in parts]
+    counts = {view: np.sum([summary["levels"][view] for summary in summaries], axis=0) for view in SCHEMA.views}
+    _write_statistics(root, counts)
+    _write_provenance(root, [row for summary in summaries for row in summary["provenance"]])
 
 
 def features(frames: Frames) -> dict[str, dict[str, Any]]:
@@ -150,39 +137,6 @@ def features(frames: Frames) -> dict[str, dict[str, Any]]:
     for vector in (SCHEMA.state, SCHEMA.joint_state, SCHEMA.action):
         columns[vector.lerobot_key] = {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
     return columns
-
-
-def _write_part(part: _Part, load: Load, repo_id: str, frames: Frames) -> _Written:
-    datasets.disable_progress_bars()
-    av.logging.set_libav_level(av.logging.ERROR)  # lerobot restores FFmpeg's own log, which tells of every append
-    shutil.rmtree(part.root, ignore_errors=True)  # of a worker that died
-    dataset = LeRobotDataset.create(
-        repo_id,
-        SCHEMA.fps_hz,
-        features(frames),
-        root=part.root,
-        robot_type=SCHEMA.robot_type,
-        use_videos=frames == "video",
-        video_backend="pyav",
-        vcodec="h264",
-    )
-    dataset.meta.update_chunk_settings(data_files_size_in_mb=DATA_MB, video_files_size_in_mb=PART_VIDEO_MB)
-    # The slot that streaming_encoding=True fills; it has no public name.
-    dataset._streaming_encoder = VideoEncoder() if frames == "video" else None
-    steps = 0
-    provenance = []
-    counts: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
-    try:
-        for episode_id in part.episode_ids:
-            episode = load(episode_id)
-            check(episode)
-            for view, counted in _add(dataset, episode).items():
-                counts[view] += counted
-            steps += len(episode)
-            provenance.append(dict(episode.provenance))
-    finally:
-        dataset.finalize()
-    return _Written(steps, provenance, counts)
 
 
 def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:

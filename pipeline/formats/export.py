@@ -1,0 +1,121 @@
+"""Bring a dataset up to date: what is finished stays, what a killed run had finished of it stays too.
+
+Pieces are written into ``data/<run>/.work/<format>/<identity>/``, each under a temporary name that is renamed once it
+is whole. The finished dataset then takes the place of the one before in one rename, and the work folder goes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.files import keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
+from pipeline.formats.base import Episodes, Export, Format, Load
+from pipeline.seeding import digest
+
+if TYPE_CHECKING:  # this package imports no simulator, and this would
+    from pipeline.run.compute import Run
+
+AnyFormat = Format[Any]
+
+
+def identity(target: AnyFormat, episodes: Episodes) -> str:
+    """A short digest of everything that the bytes of a dataset depend on."""
+    return digest(
+        "export",
+        target.name,
+        target.recipe,
+        {package: version(package) for package in target.packages},
+        SCHEMA.model_dump(mode="json"),
+        target.options.model_dump(mode="json"),
+        list(target.pieces(episodes).items()),
+        [episodes.content[episode_id] for episode_id in episodes.ids],
+    )[:16]
+
+
+def is_current(target: AnyFormat, episodes: Episodes) -> bool:
+    """Whether the dataset is there, whole and of these episodes.
+
+    Every file must be there and no younger than the record. What else lies in the folder, such as the statistics that
+    a client left, is removed then.
+    """
+    try:
+        record = target.record()
+        if record.identity != identity(target, episodes):
+            return False
+        files = {target.folder / name for name in record.files}
+        recorded = target.record_file.stat().st_mtime_ns
+        if any(file.stat().st_mtime_ns > recorded for file in files):
+            return False
+    except (PipelineError, OSError):
+        return False
+    keep_below(target.folder, files)
+    _clear_work(target)
+    return True
+
+
+def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
+    """Write a dataset, replacing the one before, and go on where a killed call with the same episodes was.
+
+    The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``run``, and not
+    on how often the work was interrupted.
+
+    Args:
+        target: the format.
+        episodes: what to write.
+        run: spreads the work; one call for each piece.
+
+    Raises:
+        PipelineError: when an episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that
+            are whole stay in the work folder.
+    """
+    pieces = target.pieces(episodes)
+    work = target.work / identity(target, episodes)
+    keep_only(target.work, {work.name})
+    finished = work / "record.json"
+    if not finished.is_file():
+        _write_pieces(target, work, pieces, episodes.load, run)
+        places = target.assemble(work, pieces)
+        dataset = work / "dataset"
+        sync(dataset)
+        files = sorted(file.relative_to(dataset).as_posix() for file in dataset.rglob("*") if file.is_file())
+        with replaced(finished) as temporary:
+            temporary.write_text(json.dumps(asdict(Export(work.name, files, places)), indent=0) + "\n")
+    target.record_file.unlink(missing_ok=True)  # It is about the dataset before.
+    if (work / "dataset").is_dir():
+        put_in_place(work / "dataset", target.folder)
+    finished.touch()  # No file of the dataset is younger than its record.
+    put_in_place(finished, target.record_file)
+    _clear_work(target)
+
+
+def _write_pieces(target: AnyFormat, work: Path, pieces: Mapping[str, Sequence[str]], load: Load, run: Run) -> None:
+    paths = {work / name: ids for name, ids in pieces.items()}
+    whole = {path for path in paths if path.exists()}
+    keep_below(work, whole)
+    for folder in {path.parent for path in paths}:
+        folder.mkdir(parents=True, exist_ok=True)
+    todo = [(path, ids) for path, ids in paths.items() if path not in whole]
+    run(_PieceJob(target, load), todo, f"{target.title} pieces")
+
+
+@dataclass(frozen=True)
+class _PieceJob:
+    target: AnyFormat
+    load: Load
+
+    def __call__(self, piece: tuple[Path, Sequence[str]]) -> None:
+        path, episode_ids = piece
+        with replaced(path) as temporary:
+            self.target.write_piece(temporary, episode_ids, self.load)
+
+
+def _clear_work(target: AnyFormat) -> None:
+    remove(target.work)
+    remove_if_empty(target.work.parent)

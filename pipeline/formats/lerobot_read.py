@@ -1,0 +1,149 @@
+"""LeRobot datasets read back through lerobot itself, without the hub."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import av
+import datasets
+import numpy as np
+import pyarrow.parquet as pq
+from datasets.exceptions import DatasetsError
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.formats.base import Copy, Fault, Row, sampled
+from pipeline.formats.lerobot_write import Frames, features, local_only
+
+UNREADABLE = (
+    AssertionError,
+    AttributeError,
+    DatasetsError,
+    IndexError,
+    KeyError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+"""What lerobot raises on files that are damaged, missing or do not belong together."""
+
+MARKS = ("frame_index", "timestamp")
+"""LeRobot's columns that tell steps apart."""
+
+
+@dataclass(frozen=True)
+class LeRobotSet:
+    """A LeRobot dataset opened.
+
+    Attributes:
+        data: as lerobot opens it.
+        provenance: episode id to its row of ``meta/provenance.parquet``, ``episode_index`` included.
+    """
+
+    data: LeRobotDataset
+    provenance: Mapping[str, Mapping[str, Any]]
+
+
+def check(root: Path, cache: Path, kept: Mapping[str, Row], frames: Frames) -> Iterator[tuple[str, Fault]]:
+    """Frame rate, robot, the columns' names and shapes, the videos' own frame rate; as many episodes as were kept.
+
+    Raises:
+        PipelineError: when the dataset cannot be opened.
+    """
+    with _readable(root):
+        opened = _open(root, cache)
+        meta = opened.data.meta
+        read: dict[str, Any] = {"fps": meta.fps, "robot_type": meta.robot_type}
+        wanted: dict[str, Any] = {"fps": SCHEMA.fps_hz, "robot_type": SCHEMA.robot_type}
+        for key, spec in features(frames).items():
+            has = meta.features.get(key, {})
+            read[key] = (has.get("dtype"), tuple(has.get("shape", ())), tuple(has.get("names") or ()))
+            wanted[key] = (spec["dtype"], tuple(spec["shape"]), tuple(spec["names"]))
+        for file in sorted(meta.root.glob("videos/**/*.mp4")):
+            name = str(file.relative_to(meta.root))
+            with av.open(str(file)) as video:
+                read[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
+        stored = (meta.total_episodes, opened.data.num_frames)
+    for key, expected in wanted.items():
+        if read[key] != expected:
+            yield "format", Fault("lerobot", None, f"{key} is {read[key]}", f"{expected}")
+    steps = sum(row["steps"] for row in kept.values())
+    if stored != (len(kept), steps):
+        yield "ids", Fault("lerobot", None, f"{stored[0]} episodes of {stored[1]} steps", f"{len(kept)} of {steps}")
+    # One that is missing is told where it is looked for.
+    for episode_id in sorted(opened.provenance.keys() - kept.keys()):
+        yield "ids", Fault("lerobot", episode_id, "is in the dataset", "kept episodes alone")
+
+
+def read(root: Path, cache: Path, episode_id: str) -> Copy | None:
+    """An episode; None when the dataset does not have it.
+
+    Raises:
+        PipelineError: when it cannot be read.
+    """
+    with _readable(root):
+        opened = _open(root, cache)
+        return _copy(opened, episode_id) if episode_id in opened.provenance else None
+
+
+@contextmanager
+def _readable(root: Path) -> Iterator[None]:
+    try:
+        yield
+    except UNREADABLE as error:
+        raise PipelineError(
+            f"{type(error).__name__}: {error}", where=root, expected="what lerobot reads", remedy="dvc repro"
+        ) from error
+
+
+def _open(root: Path, cache: Path) -> LeRobotSet:
+    return _opened(root, cache, (root / "meta" / "info.json").stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _opened(root: Path, cache: Path, modified_ns: int) -> LeRobotSet:
+    datasets.disable_progress_bars()
+    # lerobot decodes through it, and each worker would print that it will go.
+    warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
+    with local_only(cache):
+        data = LeRobotDataset(root.name, root=root, video_backend="pyav")
+    rows = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
+    return LeRobotSet(data, {row["episode_id"]: row for row in rows})
+
+
+def _copy(opened: LeRobotSet, episode_id: str) -> Copy:
+    data = opened.data
+    provenance = opened.provenance[episode_id]
+    index = provenance["episode_index"]
+    rows = data.meta.episodes[index]
+    start, stop = rows["dataset_from_index"], rows["dataset_to_index"]
+    vectors = {"action": SCHEMA.action, "state": SCHEMA.state, "joint_state": SCHEMA.joint_state}
+    # Without the images of every step, where they are not videos.
+    plain = [*(spec.lerobot_key for spec in vectors.values()), "episode_index", "task_index", *MARKS]
+    table = data.hf_dataset.select_columns(plain).with_format("numpy")[start:stop]
+    if set(table["episode_index"].tolist()) != {index} or len(table["action"]) != rows["length"]:
+        raise ValueError(f"rows {start} to {stop} are not the {rows['length']} steps of episode {index}")
+    frames = {}
+    for step in sampled(stop - start):
+        item = data[start + step]
+        for view, spec in SCHEMA.views.items():
+            # lerobot hands out floats in [0, 1], channels first.
+            pixels = np.rint(item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255)
+            frames[view, step] = np.ascontiguousarray(pixels, np.uint8)
+    return Copy(
+        dataset="lerobot",
+        motion={name: table[spec.lerobot_key] for name, spec in vectors.items()},
+        instructions=[str(data.meta.tasks.iloc[task].name) for task in table["task_index"].tolist()],
+        provenance=provenance,
+        frames=frames,
+        marks={name: table[name] for name in MARKS},
+        place={"lerobot_episode_index": index},
+    )

@@ -1,0 +1,41 @@
+"""The output formats: one line each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from pipeline.export_config import ExportConfig
+from pipeline.formats.base import Format
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.rlds import Rlds
+
+FORMATS: tuple[type[Format[Any]], ...] = (
+    Rlds,
+    LeRobot,
+)
+
+
+def formats_of(data: Path, options: ExportConfig) -> list[Format[Any]]:
+    """Every format's dataset of a run whose folder is ``data``."""
+    return [kind(data, getattr(options, kind.name)) for kind in FORMATS]
+
+
+def columns() -> list[pa.Field]:
+    """The manifest's columns of all formats."""
+    return [column for kind in FORMATS for column in kind.columns]
+
+
+def places(formats: list[Format[Any]]) -> dict[str, dict[str, Any]]:
+    """Episode id to where it lies in each format, by the manifest's columns.
+
+    Raises:
+        PipelineError: when one of the datasets is not finished.
+    """
+    merged: dict[str, dict[str, Any]] = {}
+    for one in formats:
+        for episode_id, place in one.record().places.items():
+            merged.setdefault(episode_id, {}).update(place)
+    return merged

@@ -1,0 +1,98 @@
+"""RLDS as OpenVLA and OpenVLA-OFT read it: TFDS folders of TFRecord shards, one for each suite, without TensorFlow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pyarrow as pa
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.export_config import RldsConfig
+from pipeline.formats.base import Copy, Episodes, Fault, Format, Load, Row, column, split
+from pipeline.formats.rlds_layout import SPLIT, VERSION, by_suite, dataset_of, shard_path
+
+
+class Rlds(Format[RldsConfig]):
+    """Shard k of a set has the k-th slice of its episodes; the ids come shuffled, so neighbours are strangers."""
+
+    name: ClassVar = "rlds"
+    title: ClassVar = "RLDS"
+    recipe: ClassVar = 1
+    packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
+    columns: ClassVar = (
+        column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
+        column("rlds_index", pa.int64(), "place in the shard, null when dropped"),
+    )
+    keys: ClassVar = {view: view for view in SCHEMA.views} | {v: v for v in ("state", "joint_state", "action")}
+    clients: ClassVar = ("openvla_oft",)
+
+    def pieces(self, episodes: Episodes) -> dict[str, list[str]]:
+        return {
+            f"dataset/{shard_path(name, shard, len(slices))}": ids
+            for name, slices in self._slices(episodes).items()
+            for shard, ids in enumerate(slices)
+        }
+
+    def _slices(self, episodes: Episodes) -> dict[str, list[list[str]]]:
+        """Set name to the episodes of each of its shards; shards are dealt out by the number of episodes."""
+        sets = by_suite(episodes.ids, episodes.suites, self.options.name)
+        shards = {name: max(1, round(self.options.shards * len(ids) / len(episodes.ids))) for name, ids in sets.items()}
+        return {name: split(ids, shards[name]) for name, ids in sets.items()}
+
+    def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
+        from pipeline.formats import rlds_write
+
+        rlds_write.write_shard(path, episode_ids, load)
+
+    def assemble(self, work: Path, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
+        from pipeline.formats import rlds_write
+
+        shards = {work / piece: ids for piece, ids in pieces.items()}
+        for folder in dict.fromkeys(path.parent for path in shards):
+            lengths = {path: len(ids) for path, ids in shards.items() if path.parent == folder}
+            rlds_write.write_metadata(folder, lengths)
+        return {
+            episode_id: {"rlds_shard": path.name, "rlds_index": index}
+            for path, ids in shards.items()
+            for index, episode_id in enumerate(ids)
+        }
+
+    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+        from pipeline.formats import rlds_read
+
+        return rlds_read.check(self.folder, kept)
+
+    def read(self, row: Row, cache: Path) -> Copy | None:
+        from pipeline.formats import rlds_read
+
+        return rlds_read.read(self.folder, row)
+
+    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+        builders = "".join(
+            f"""\
+builder = tfds.builder_from_directory(f"{{os.environ['DATA']}}/rlds/{dataset}/{VERSION}")
+for episode in builder.as_dataset(split="{SPLIT}"):
+    for step in episode["steps"]:
+        image, action, text = step["observation"]["image"], step["action"], step["language_instruction"]
+"""
+            for dataset in sorted({dataset_of(row) for row in kept})
+        )
+        return f"""\
+The repository is laid out as the folder that `finetune/` expects, here `$DATA`:
+
+```sh
+export DATA=$PWD/{name}
+hf download {repository} --repo-type dataset --local-dir $DATA
+```
+
+tfds:
+
+```python
+import os
+
+import tensorflow_datasets as tfds
+
+{builders}```
+"""

@@ -1,0 +1,125 @@
+"""RLDS sets read back without TensorFlow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import tensorflow_datasets as tfds
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.formats.base import Copy, Fault, Row, sampled
+from pipeline.formats.rlds_layout import SPLIT, VERSION, dataset_of
+from pipeline.formats.rlds_write import features
+from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans
+from pipeline.rendering.jpeg import decode
+
+MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")
+"""Columns that tell steps apart."""
+
+Place = tuple[Path, int]
+"""Shard, and place in it."""
+
+
+def check(root: Path, kept: Mapping[str, Row]) -> Iterator[tuple[str, Fault]]:
+    """The feature tree of this version, all shards there and whole, and as many episodes as were kept."""
+    stored = 0
+    present = {file.parent.parent.name for file in root.glob("*/*/dataset_info.json")}
+    for name in sorted(present | {dataset_of(row) for row in kept.values()}):
+        folder = root / name / VERSION
+        info = _info(folder)
+        if info.features.to_json() != features().to_json():
+            yield "format", Fault("rlds", None, f"features.json of {name} is another", "the one of this version")
+        lengths = dict(zip(info.splits[SPLIT].filenames, info.splits[SPLIT].shard_lengths, strict=True))
+        there = {path.name for path in folder.glob("*.tfrecord-*")}
+        if set(lengths) != there:
+            yield "format", Fault("rlds", None, f"{name} has the shards {sorted(there)}", f"{sorted(lengths)}")
+        for shard in sorted(there):
+            try:
+                count = sum(1 for _ in spans(folder / shard))
+                if count != lengths.get(shard):
+                    expected = f"{lengths.get(shard)}, as dataset_info.json says"
+                    yield "readable", Fault("rlds", None, f"{shard} has {count} records", expected)
+                stored += count
+            except PipelineError as error:
+                yield "readable", Fault("rlds", None, str(error), "a whole file")
+    # One that is missing is told where it is looked for.
+    if stored > len(kept):
+        yield "ids", Fault("rlds", None, f"has {stored} episodes, foreign ones or some twice", f"{len(kept)}")
+
+
+def read(root: Path, row: Row) -> Copy | None:
+    """A kept episode, from the place that the manifest says or, where that is wrong, from wherever it lies.
+
+    Raises:
+        PipelineError: when its record is damaged, or lacks a feature.
+    """
+    episode_id = row["episode_id"]
+    folder = root / dataset_of(row) / VERSION
+    place: Place | None = (folder / row["rlds_shard"], row["rlds_index"])
+    steps = _columns(place)
+    if steps is None or _id(steps) != episode_id:
+        shards = tuple(sorted((shard, shard.stat().st_mtime_ns) for shard in root.glob("*/*/*.tfrecord-*")))
+        place = _places(shards).get(episode_id)
+        steps = _columns(place)
+    try:
+        return None if place is None or steps is None else _copy(steps, place)
+    except KeyError as error:
+        raise PipelineError(f"has no feature {error}", where=f"episode {episode_id}") from error
+
+
+def _columns(place: Place | None) -> dict[str, Any] | None:
+    record = None if place is None else record_at(*place)
+    return None if place is None or record is None else columns(record, _info(place[0].parent).features)
+
+
+def _id(steps: Mapping[str, Any]) -> str:
+    return str(steps[f"{METADATA}episode_id"][0].decode())
+
+
+@lru_cache(maxsize=1)
+def _places(shards: tuple[tuple[Path, int], ...]) -> dict[str, Place]:
+    """Episode id to its place, from all records up to the first of a shard that is damaged."""
+    places: dict[str, Place] = {}
+    for shard, _ in shards:
+        try:
+            for index, record in enumerate(records(shard)):
+                places[_id(columns(record, _info(shard.parent).features))] = (shard, index)
+        except PipelineError:
+            continue  # Told by ``check``, or by ``read`` of the record.
+    return places
+
+
+def _info(folder: Path) -> Any:
+    try:
+        return _opened(folder, (folder / "dataset_info.json").stat().st_mtime_ns)
+    except (OSError, ValueError, KeyError) as error:
+        raise PipelineError(
+            f"{type(error).__name__}: {error}", where=folder, expected="a set that TFDS opens", remedy="dvc repro"
+        ) from error
+
+
+@lru_cache(maxsize=8)
+def _opened(folder: Path, modified_ns: int) -> Any:
+    return tfds.builder_from_directory(folder).info
+
+
+def _copy(steps: Mapping[str, Any], place: Place) -> Copy:
+    shard, index = place
+    return Copy(
+        dataset="rlds",
+        motion={"action": steps["action"]} | {name: steps[f"observation/{name}"] for name in ("state", "joint_state")},
+        instructions=[text.decode() for text in steps["language_instruction"]],
+        provenance={name: steps[METADATA + name][0].decode() for name in SCHEMA.provenance},
+        frames={
+            (view, step): decode(steps[f"observation/{view}"][step])
+            for view in SCHEMA.views
+            for step in sampled(len(steps["action"]))
+        },
+        marks={name: steps[name] for name in MARKS},
+        place={"rlds_shard": shard.name, "rlds_index": index},
+        encoded={view: steps[f"observation/{view}"].tolist() for view in SCHEMA.views},
+    )

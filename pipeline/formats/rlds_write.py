@@ -1,0 +1,127 @@
+"""Shards and metadata of RLDS sets, written without TensorFlow.
+
+Feature names, shapes and dtypes are those of the ``libero_*_no_noops`` sets that OpenVLA published (hub:
+``openvla/modified_libero_rlds``), plus provenance in ``episode_metadata``, which their loaders ignore.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tensorflow_datasets as tfds
+
+from pipeline.episode_schema import SCHEMA, VectorSpec, check
+from pipeline.formats.base import Load
+from pipeline.formats.rlds_layout import SPLIT, VERSION
+from pipeline.formats.tfrecord import OVERHEAD_BYTES, framed
+from pipeline.types import Episode
+
+
+def write_shard(path: Path, episode_ids: Sequence[str], load: Load) -> None:
+    """Write a TFRecord file of episodes.
+
+    Raises:
+        PipelineError: when an episode breaks the schema.
+    """
+    with path.open("wb") as file:
+        for episode_id in episode_ids:
+            episode = load(episode_id)
+            check(episode)
+            file.write(framed(_serialize(episode)))
+
+
+def write_metadata(folder: Path, lengths: Mapping[Path, int]) -> None:
+    """Write what TFDS reads beside the shards.
+
+    Args:
+        folder: ``<name>/1.0.0``.
+        lengths: each shard of it, in order, to its number of episodes.
+    """
+    template = tfds.core.ShardedFileTemplate(
+        data_dir=folder, dataset_name=folder.parent.name, split=SPLIT, filetype_suffix="tfrecord"
+    )
+    stored = sum(shard.stat().st_size - OVERHEAD_BYTES * length for shard, length in lengths.items())
+    info = tfds.core.SplitInfo(
+        name=SPLIT, shard_lengths=list(lengths.values()), num_bytes=stored, filename_template=template
+    )
+    tfds.folder_dataset.write_metadata(
+        data_dir=folder,
+        features=features(),
+        split_infos=[info],
+        version=VERSION,
+        filename_template=template,
+        check_data=False,  # the check needs TensorFlow
+        description="LIBERO demonstrations, perturbed, replayed in simulation and kept when they solve the task.",
+    )
+
+
+@cache
+def features() -> Any:
+    """The feature tree (``tfds.features.FeaturesDict``)."""
+    frame = partial(
+        tfds.features.Image,
+        shape=SCHEMA.frame.shape,
+        dtype=np.dtype(SCHEMA.frame.dtype),
+        encoding_format=SCHEMA.frame.encoding,
+    )
+    rotated = f"rotated by {SCHEMA.image_rotation_deg} degrees"
+    observation = {view: frame(doc=f"{spec.camera}, {rotated}") for view, spec in SCHEMA.views.items()}
+    observation |= {"state": _vector(SCHEMA.state), "joint_state": _vector(SCHEMA.joint_state)}
+    scalar = tfds.features.Scalar
+    step = {
+        "observation": observation,
+        "action": _vector(SCHEMA.action),
+        "discount": scalar(np.float32, doc="always 1"),
+        "reward": scalar(np.float32, doc="1 on the last step, else 0"),
+        "is_first": scalar(np.bool_, doc="first step of the episode"),
+        "is_last": scalar(np.bool_, doc="last step of the episode"),
+        "is_terminal": scalar(np.bool_, doc="last step: every episode ends in success"),
+        "language_instruction": tfds.features.Text(doc="what the policy is asked to do"),
+    }
+    metadata = {"file_path": tfds.features.Text(doc="the demonstration's source")}
+    metadata |= {column: tfds.features.Text() for column in SCHEMA.provenance}
+    return tfds.features.FeaturesDict({"steps": tfds.features.Dataset(step), "episode_metadata": metadata})
+
+
+def _vector(spec: VectorSpec) -> Any:
+    return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=", ".join(spec.names))
+
+
+def _serialize(episode: Episode) -> bytes:
+    """``tf.train.Example`` of an episode; left to itself, protobuf orders its map anew in every process."""
+    example = _serializer().get_tf_example(features().encode_example(_tree(episode)))
+    return bytes(example.SerializeToString(deterministic=True))
+
+
+@cache
+def _serializer() -> Any:
+    return tfds.core.ExampleSerializer(features().get_serialized_info())
+
+
+def _tree(episode: Episode) -> dict[str, Any]:
+    last = len(episode) - 1
+    steps = [
+        {
+            "observation": {
+                **{view: frames[t] for view, frames in episode.frames.items()},
+                "state": episode.state[t],
+                "joint_state": episode.joint_state[t],
+            },
+            "action": episode.action[t],
+            "discount": 1.0,
+            "reward": float(t == last),
+            "is_first": t == 0,
+            "is_last": t == last,
+            "is_terminal": t == last,
+            "language_instruction": episode.instruction,
+        }
+        for t in range(len(episode))
+    ]
+    return {
+        "steps": steps,
+        "episode_metadata": {"file_path": episode.provenance["demo_source"], **episode.provenance},
+    }

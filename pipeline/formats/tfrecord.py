@@ -1,0 +1,123 @@
+"""TFRecord files without TensorFlow: the framing of records, and examples as flat columns."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numpy as np
+import tensorflow_datasets as tfds
+from numpy.typing import NDArray
+
+from pipeline.errors import PipelineError
+
+METADATA = "episode_metadata/"
+"""What the names of columns with one value for the whole episode begin with."""
+
+
+OVERHEAD_BYTES = 16
+"""What the framing adds to a record."""
+
+
+def framed(data: bytes) -> bytes:
+    """One TFRecord: length, its checksum, data, its checksum."""
+    length = struct.pack("<Q", len(data))
+    return b"".join((length, checksum(length), data, checksum(data)))
+
+
+def checksum(data: bytes) -> bytes:
+    """TFRecord's masked CRC-32C (``tensorflow/core/lib/io/record_writer.h``)."""
+    crc = google_crc32c.value(data)
+    return struct.pack("<I", ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF)
+
+
+def records(shard: Path) -> Iterator[bytes]:
+    """The records of a TFRecord file: length (8 bytes), its checksum (4), data, its checksum (4).
+
+    Raises:
+        PipelineError: naming the file and the record, when a checksum is wrong.
+    """
+    for index, (start, length) in enumerate(spans(shard)):
+        yield _read(shard, index, start, length)
+
+
+def spans(shard: Path) -> Iterator[tuple[int, int]]:
+    """Where the data of each record begins and how long it is, in bytes; the data itself is not read.
+
+    Raises:
+        PipelineError: naming the file and the record, when a length is damaged or the file is cut short.
+    """
+    size, start = shard.stat().st_size, 0
+    with shard.open("rb") as file:
+        for index, head in enumerate(iter(partial(file.read, 12), b"")):
+            length = struct.unpack("<Q", head[:8])[0] if head[8:] == checksum(head[:8]) else size
+            end = start + length + OVERHEAD_BYTES
+            if end > size:
+                raise _damaged(shard, index)
+            yield start + 12, length
+            start = file.seek(end)
+
+
+def record_at(shard: Path, index: int) -> bytes | None:
+    """The record at a place, from 0; None where the file has none, or ends or breaks before it.
+
+    Raises:
+        PipelineError: when its data is damaged.
+    """
+    try:
+        span = next(islice(spans(shard), index, None), None)
+    except (OSError, PipelineError):
+        return None
+    return None if span is None else _read(shard, index, *span)
+
+
+def _read(shard: Path, index: int, start: int, length: int) -> bytes:
+    with shard.open("rb") as file:
+        file.seek(start)
+        data = file.read(length)
+        if file.read(4) != checksum(data):
+            raise _damaged(shard, index)
+    return data
+
+
+def _damaged(shard: Path, index: int) -> PipelineError:
+    return PipelineError(
+        f"record {index} is damaged", where=shard, expected="its checksum", remedy="write the dataset again"
+    )
+
+
+def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:
+    """An example's columns by path, such as ``observation/image`` or ``episode_metadata/axis``.
+
+    Args:
+        record: a serialised ``tf.train.Example``.
+        features: the dataset's feature tree (``tfds.features.FeaturesDict``).
+
+    Returns:
+        One entry per step, frames left encoded; one entry in all for ``episode_metadata/``. Text is bytes.
+
+    Raises:
+        PipelineError: when the record lacks a feature.
+    """
+    parser = tfds.core.example_parser.ExampleParserNp(features.get_serialized_info())
+    try:
+        example = parser.parse_example(record)
+    except KeyError as error:
+        raise PipelineError(
+            f"a record has no feature {error}", expected="what features.json names", remedy="write the dataset again"
+        ) from error
+    return dict(_flat(example["steps"])) | dict(_flat(example["episode_metadata"], METADATA))
+
+
+def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, NDArray[Any]]]:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{path}{name}/")
+        else:
+            # An object array keeps bytes whole; numpy's own strings drop final zeros.
+            yield path + name, np.array([value], object) if isinstance(value, bytes) else np.atleast_1d(value)

@@ -1,0 +1,159 @@
+"""A killed export goes on to the same bytes and leaves nothing behind; what is finished is left alone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from test_writers import IDS, episode, episodes, files, loop
+
+from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.formats.base import Format
+from pipeline.formats.export import export, is_current
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.rlds import Rlds
+from pipeline.types import Episode
+
+PIECES = 3
+KILLED = [
+    *(("rlds", where) for where in ("last piece", "metadata", "rename", "record")),
+    *(("lerobot", where) for where in ("last piece", "rename")),
+]
+"""Format, and when the process is killed: in a piece, or before the record of the work, the rename, its own rename."""
+
+
+def target(name: str, data: Path) -> Format[Any]:
+    if name == "rlds":
+        return Rlds(data, RldsConfig(name="synthetic", shards=PIECES))
+    return LeRobot(data, LeRobotConfig(name="synthetic", parts=PIECES))
+
+
+def kill() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def load_until(episode_id: str, last: str) -> Episode:
+    if episode_id == last:
+        kill()
+    return episode(episode_id)
+
+
+def killed_export(name: str, data: Path, where: str) -> None:
+    """In a process of its own: end without a chance to clean up."""
+    made, source = target(name, data), episodes()
+    if where == "last piece":
+        source = replace(source, load=partial(load_until, last=IDS[-1]))
+    patch = pytest.MonkeyPatch()
+    if where == "metadata":
+        patch.setattr("pipeline.formats.export.sync", lambda _: kill())
+    elif where in ("rename", "record"):
+        from pipeline.files import put_in_place
+
+        def put(whole: Path, path: Path) -> None:
+            if where == "rename" and path == made.folder:
+                kill()
+            put_in_place(whole, path)
+            if where == "record" and path == made.folder:
+                kill()
+
+        patch.setattr("pipeline.formats.export.put_in_place", put)
+    export(made, source, loop)
+
+
+def stamps(folder: Path) -> dict[str, tuple[int, int]]:
+    return {
+        str(file.relative_to(folder)): (file.stat().st_ino, file.stat().st_mtime_ns)
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    data = tmp_path_factory.mktemp("undisturbed")
+    for name in ("rlds", "lerobot"):
+        export(target(name, data), episodes(), loop)
+    return data
+
+
+@pytest.mark.parametrize(("name", "where"), KILLED)
+def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: Path) -> None:
+    made, source = target(name, tmp_path), episodes()
+    made.folder.mkdir()
+    (made.folder / "earlier").write_text("dataset")
+    code = f"import test_exports as t, pathlib; t.killed_export({name!r}, pathlib.Path({str(tmp_path)!r}), {where!r})"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(("tests", os.environ.get("PYTHONPATH", "")))},
+        cwd=Path(__file__).parent.parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert not is_current(made, source)
+    (work,) = made.work.iterdir()
+    whole = {path: path.stat() for piece in made.pieces(source) if (path := work / piece).exists()}
+    if where == "record":
+        assert not (made.folder / "earlier").exists()
+    else:
+        assert (made.folder / "earlier").exists(), "the dataset before stays until the new one is whole"
+        assert len(whole) == (2 if where == "last piece" else PIECES)
+    before = {} if where == "record" else stamps(work)
+    loaded: list[str] = []
+
+    def load(episode_id: str) -> Episode:
+        loaded.append(episode_id)
+        return episode(episode_id)
+
+    (work / "stray").write_text("of the killed run")
+    export(made, replace(source, load=load), loop)
+    expected = list(made.pieces(source).values())[2:] if where == "last piece" else []
+    assert loaded == [episode_id for ids in expected for episode_id in ids], "only the rest is made"
+    assert files(tmp_path) == {
+        path: data for path, data in files(undisturbed).items() if path.startswith((f"{name}/", f"{name}.json"))
+    }
+    if name == "rlds":
+        after = stamps(made.folder)
+        kept = {path.removeprefix("dataset/"): stamp for path, stamp in before.items() if "-of-" in Path(path).name}
+        finished = {path: stamp for path, stamp in kept.items() if not Path(path).name.startswith(".")}
+        assert finished.items() <= after.items(), "the very files"
+    assert not (tmp_path / ".work").exists()
+
+
+@pytest.mark.parametrize("name", ["rlds", "lerobot"])
+def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_path: Path) -> None:
+    made, source = target(name, tmp_path), episodes()
+    export(made, source, loop)
+    assert is_current(made, source)
+    # What a client leaves is no part of the dataset.
+    first = made.folder / made.record().files[0]
+    before = stamps(made.folder)
+    (first.parent / "dataset_statistics_0123.json").write_text("{}")
+    (made.work / "foreign").mkdir(parents=True)
+    assert is_current(made, source)
+    assert stamps(made.folder) == before
+    assert not (tmp_path / ".work").exists()
+
+    changed = replace(source, content={**source.content, IDS[0]: "second"})
+    assert not is_current(made, changed)
+    assert not is_current(made, replace(source, ids=source.ids[1:]))
+    other = type(made)(tmp_path, made.options.model_copy(update={"name": "other"}))
+    assert not is_current(other, source)
+    content = first.read_bytes()
+    first.write_bytes(content[:-1] + b"?")
+    assert not is_current(made, source), "a damaged file"
+    first.unlink()
+    assert not is_current(made, source), "a missing file"
+    (made.work / "0123456789abcdef").mkdir(parents=True)
+    export(made, changed, loop)
+    assert is_current(made, changed)
+    assert first.read_bytes() == content
+    assert sorted(path.name for path in tmp_path.iterdir()) == [name, f"{name}.json"]
