@@ -19,6 +19,7 @@ from pipeline.rewriting.language_model import LanguageModel
 from pipeline.rewriting.rewrite import extend
 from pipeline.run import doctor
 from pipeline.run.compute import runner
+from pipeline.run.stage import owned
 from pipeline.testset import benchmark
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
@@ -40,7 +41,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 
 def _preview(arguments: argparse.Namespace) -> int:
-    # Rendering starts OpenGL on import, which the other commands can do without.
+    # The simulator takes seconds to import, which the other commands can do without.
     from pipeline.publish import preview
 
     config = load(arguments.config)
@@ -87,7 +88,7 @@ def _check_oft(arguments: argparse.Namespace) -> int:
 
 
 def _regenerate(arguments: argparse.Namespace) -> int:
-    # Rendering starts OpenGL on import.
+    # As does what reads the dataset back.
     from pipeline.validation.regenerate import regenerate
 
     found = regenerate(arguments.episode_id, arguments.manifest, arguments.out, arguments.demos)
@@ -96,9 +97,10 @@ def _regenerate(arguments: argparse.Namespace) -> int:
 
 
 def _push(arguments: argparse.Namespace) -> int:
+    config = owned(arguments.config)
+    # What it needs takes seconds to import, which the other commands can do without.
     from pipeline.publish import push
 
-    config = load(arguments.config)
     upload = push.prepare(config.data, arguments.format, config.export.lerobot.name)
     print(upload.summary())
     if not arguments.really:

@@ -1,16 +1,16 @@
 """Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped."""
 
+from pipeline import gl
 from pipeline.config import Config
 from pipeline.files import keep_only
 from pipeline.rendering.render import render_plan
-from pipeline.rendering.renderer import GL
 from pipeline.run import plan
 from pipeline.run.compute import runner
 from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    print(GL)
+    print(gl.choose())
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "frames"
     with runner(config.compute) as workers:

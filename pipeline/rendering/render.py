@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,12 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import gl
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
 from pipeline.axes.light import exposure
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
 from pipeline.rendering.jpeg import encode, to_policy
-from pipeline.rendering.renderer import GL, Renderer
+from pipeline.rendering.renderer import Renderer
 from pipeline.run.compute import Run
 from pipeline.run.episode_loader import rejected, verdicts
 from pipeline.run.plan import Row, select
@@ -65,17 +68,37 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
 
 @dataclass(frozen=True)
 class RenderJob:
-    """One trajectory's share of the rendering, as it is sent to a worker."""
+    """One trajectory's share of the rendering, as it is sent to a worker.
+
+    Attributes:
+        trajectory_id, streams: what to render.
+        trajectories, frames: folders of the stores.
+        config: how frames are encoded.
+        device: what renders the run, as OpenGL names it.
+    """
 
     trajectory_id: str
     streams: tuple[Stream, ...]
     trajectories: Path
     frames: Path
     config: RenderConfig
+    device: str
 
     def __call__(self) -> None:
-        """Render what is missing and store it with what an earlier run already rendered."""
-        store = FrameStore(self.frames, self.config, GL.device)
+        """Render what is missing and store it with what an earlier run already rendered.
+
+        Raises:
+            PipelineError: when another device renders here: its pixels differ, and the run would never use them.
+        """
+        device = gl.choose().device
+        if device != self.device:
+            raise PipelineError(
+                f"this worker renders with {device}, the run with {self.device}",
+                where=f"worker on {platform.node()}",
+                expected="one device for all frames of a run, as devices differ by some grey levels",
+                remedy="start the stage and every worker on machines that render alike (MUJOCO_GL picks the back end)",
+            )
+        store = FrameStore(self.frames, self.config, device)
         there = store.streams(self.trajectory_id)
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
         rendered = render(trajectory, [s for s in self.streams if s.stream_id not in there], self.config)
@@ -99,7 +122,8 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     Returns:
         The trajectories that have a file in ``folder`` now.
     """
-    store = FrameStore(folder, config.render, GL.device)
+    device = gl.choose().device
+    store = FrameStore(folder, config.render, device)
     judged = verdicts(rows, trajectories)
     steps = {row.trajectory_id: row.demo_steps for row in rows}
     while True:
@@ -111,7 +135,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
                 shown = streams.setdefault(row.trajectory_id, {})
                 shown |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
         jobs = [
-            RenderJob(trajectory_id, tuple(shown.values()), trajectories, folder, config.render)
+            RenderJob(trajectory_id, tuple(shown.values()), trajectories, folder, config.render, device)
             for trajectory_id, shown in streams.items()
             if store.streams(trajectory_id) != set(shown)
         ]
