@@ -69,7 +69,7 @@ def _expand(arguments: argparse.Namespace) -> int:
     from pipeline.physics.expand import expand
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
-    with runner(ComputeConfig()) as run:
+    with runner(ComputeConfig(), arguments.out) as run:
         made = expand(arguments.out, demos, arguments.per_task, arguments.seed, benchmark.load(), run)
     print(
         f"{made.written} demonstrations in {len(made.files)} files: set demos.source: hdf5 and {arguments.out} as root"

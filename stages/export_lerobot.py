@@ -16,7 +16,7 @@ def run(config: Config) -> None:
     load = EpisodeLoader(plan_file, config.data / "frames", config.render)
     target = config.export.lerobot
     out = config.data / "lerobot" / target.name
-    with runner(config.compute) as workers:
+    with runner(config.compute, config.data) as workers:
         report = lerobot.write(
             ids, load, out, repo_id=target.name, parts=target.parts, run=workers, frames=target.frames
         )

@@ -20,7 +20,7 @@ def run(config: Config) -> None:
     sets = rlds.by_suite(ids, {row.episode_id: row.suite for row in rows}, target.name)
     out = config.data / "rlds"
     locations: dict[str, rlds.Location] = {}
-    with runner(config.compute) as workers:
+    with runner(config.compute, config.data) as workers:
         for name, members in sets.items():
             shards = max(1, round(target.shards * len(members) / len(ids)))
             locations |= rlds.write(members, load, out, name=name, shards=shards, run=workers).locations

@@ -13,7 +13,7 @@ def run(config: Config) -> None:
     print(gl.choose())
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "frames"
-    with runner(config.compute) as workers:
+    with runner(config.compute, config.data) as workers:
         rendered = render_plan(rows, config, config.data / "trajectories", folder, workers)
     keep_only(folder, {f"{trajectory_id}.h5" for trajectory_id in rendered})
     print(f"rendered {len(rendered)} trajectories into {folder}")

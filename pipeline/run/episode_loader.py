@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
+from pipeline.files import Edition, edition
 from pipeline.run import plan
 from pipeline.run.stores import FrameStore, TrajectoryStore
 from pipeline.run.streams import streams_of
@@ -35,7 +36,7 @@ class EpisodeLoader:
     config: RenderConfig
 
     def __call__(self, episode_id: str) -> Episode:
-        row = _rows_by_id(self.plan_file)[episode_id]
+        row = _rows_by_id(edition(self.plan_file))[episode_id]
         shown = streams_of(row.perturbations)
         rendered = FrameStore(self.frames, self.config).load(row.trajectory_id, [s.stream_id for s in shown.values()])
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
@@ -52,14 +53,14 @@ class EpisodeLoader:
 
     def motion(self, episode_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Action (T, 7) and state (T, 8) of an episode, without its frames."""
-        row = _rows_by_id(self.plan_file)[episode_id]
+        row = _rows_by_id(edition(self.plan_file))[episode_id]
         rendered = FrameStore(self.frames, self.config).load(row.trajectory_id, [])
         return rendered.action, rendered.state
 
 
 @lru_cache(maxsize=1)
-def _rows_by_id(plan_file: Path) -> dict[str, plan.Row]:
-    return {row.episode_id: row for row in plan.read(plan_file)}
+def _rows_by_id(plan_file: Edition) -> dict[str, plan.Row]:
+    return {row.episode_id: row for row in plan.read(plan_file.path)}
 
 
 def verdicts(rows: Sequence[plan.Row], trajectories: Path) -> dict[str, Verdict]:

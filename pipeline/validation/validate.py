@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.files import Edition, edition
 from pipeline.run import manifest
 from pipeline.run.compute import Run
 from pipeline.run.episode_loader import EpisodeLoader
@@ -128,7 +129,7 @@ class ShardJob:
     def _check(self, steps: Mapping[str, NDArray[Any]], place: str, outcome: Outcome) -> None:
         episode_id = steps[f"{METADATA}episode_id"][0].decode()
         outcome.places[episode_id] += 1
-        row = _rows(self.data / "manifest.parquet").get(episode_id)
+        row = _rows(edition(self.data / "manifest.parquet")).get(episode_id)
         if row is None:
             return  # Told by "ids".
         told = f"record {row['rlds_index']} of {row['rlds_shard']}"
@@ -186,5 +187,5 @@ def _opened(root: Path, cache: Path) -> LeRobotSet | Fault:
 
 
 @lru_cache(maxsize=1)
-def _rows(file: Path) -> dict[str, dict[str, Any]]:
-    return {row["episode_id"]: row for row in manifest.read(file) if row["kept"]}
+def _rows(file: Edition) -> dict[str, dict[str, Any]]:
+    return {row["episode_id"]: row for row in manifest.read(file.path) if row["kept"]}
