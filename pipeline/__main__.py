@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from pipeline.axes import Axes
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
@@ -31,7 +33,14 @@ def config_schema() -> dict[str, Any]:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    return doctor.run(arguments.data)
+    return doctor.run(load(arguments.config or _chosen()))
+
+
+def _chosen() -> Path:
+    """The configuration that ``dvc repro`` would run here."""
+    params = Path("params.yaml")
+    name = yaml.safe_load(params.read_text())["run"] if params.is_file() else "starter"
+    return Path("configs") / f"{name}.yaml"
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
@@ -135,8 +144,16 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    command = commands.add_parser("doctor", help="check versions, OpenGL, disk and demonstrations; changes nothing")
-    command.add_argument("--data", type=Path, default=Path("data"), help="folder the run writes to (default: data)")
+    command = commands.add_parser(
+        "doctor", help="check versions, OpenGL, disk, memory and demonstrations for a configuration; changes nothing"
+    )
+    command.add_argument(
+        "config",
+        type=Path,
+        nargs="?",
+        metavar="CONFIG",
+        help="of the run to come, such as configs/full.yaml (default: the one that params.yaml names)",
+    )
     command.set_defaults(run=_doctor)
 
     command = commands.add_parser(

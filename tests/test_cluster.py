@@ -76,11 +76,9 @@ def configuration(demos: str, cluster: str, seed: int) -> dict[str, object]:
             "axes": {
                 "background": {"sources": [{"folder": "textures", "licence": "ours"}], "image_share": 1.0},
                 "language": {"bank": "bank.yaml"},
-                "robot": {},
             },
-            "episodes": {"background": 1, "language": 1, "robot": 1},
+            "episodes": {"background": 1, "language": 1},
         },
-        "replay": {"mode": "auto"},
         "compute": {"cluster": cluster},
     }
 

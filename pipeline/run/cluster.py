@@ -85,17 +85,17 @@ def setup() -> dict[str, str]:
 
     A process keeps the code that it imported first, so this is found out once and not again.
     """
-    found = {"Python": platform.python_version()}
+    versions = {"Python": platform.python_version()}
     try:
         for name in (PACKAGE, *(Requirement(line).name for line in requires(PACKAGE) or [])):
-            found[name] = version(name)
+            versions[name] = version(name)
     except PackageNotFoundError as error:
-        found[str(error.name)] = "not installed"
+        versions[str(error.name)] = "not installed"
     package = Path(__file__).resolve().parent.parent
     files = [file for file in package.rglob("*") if file.suffix in SOURCES]
     files += schema_file("episode.json").parent.glob("*.json")
-    content = [(file.name, sha256(file.read_bytes()).hexdigest()) for file in sorted(files)]
-    return found | {f"code of {PACKAGE}": digest("code", content)[:16]}
+    content = sorted((file.name, sha256(file.read_bytes()).hexdigest()) for file in files)
+    return versions | {f"code of {PACKAGE}": digest("code", content)[:16]}
 
 
 @contextmanager
@@ -137,7 +137,7 @@ def _report(workplace: Workplace) -> tuple[bool, dict[str, str]]:
 
 def _faults(workplace: Workplace, report: Any, threads: int) -> list[str]:
     if isinstance(report, BaseException):
-        return [f"cannot import the code of the run ({type(report).__name__}: {report})"]
+        return [f"cannot execute this run's code ({type(report).__name__}: {report})"]
     seen, theirs = report
     faults = [] if seen else [_not_shared(workplace)]
     for name, ours in setup().items():
