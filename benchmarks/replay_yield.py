@@ -54,7 +54,7 @@ def main() -> None:
         episodes = {axis: len(entries) * arguments.draws}
         drawn = PlanConfig.model_validate({"seed": 1, "axes": {axis: {"levels": [level]}}, "episodes": episodes})
         rows |= {row.episode_id: row for row in plan.make(entries, drawn, REPLAY, test)}
-    with tempfile.TemporaryDirectory() as temporary, runner(ComputeConfig()) as run:
+    with tempfile.TemporaryDirectory() as temporary, runner(ComputeConfig(), Path("data")) as run:
         store = TrajectoryStore(arguments.folder or Path(temporary))
         replay_plan(list(rows.values()), demos, REPLAY, store.root, run)
         replayed = store.rows()

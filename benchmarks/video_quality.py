@@ -52,7 +52,7 @@ def main() -> None:
     arguments = parser.parse_args()
     measured: dict[str, list[NDArray[np.float64]]] = defaultdict(list)
     demos = DemosConfig(tasks=tuple(arguments.tasks), per_task=1)
-    with runner(ComputeConfig()) as run:
+    with runner(ComputeConfig(), Path("data")) as run:
         for rows in run(partial(_measured, demos=demos), demos.index().entries, "demonstrations"):
             for name, of_demo in rows.items():
                 measured[name].append(of_demo)

@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from pipeline.axes import Axes
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
@@ -20,6 +22,7 @@ from pipeline.rewriting.language_model import LanguageModel
 from pipeline.rewriting.rewrite import extend
 from pipeline.run import doctor
 from pipeline.run.compute import runner
+from pipeline.run.stage import owned
 from pipeline.testset import benchmark
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
@@ -31,7 +34,14 @@ def config_schema() -> dict[str, Any]:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
-    return doctor.run(arguments.data)
+    return doctor.run(load(arguments.config or _chosen()))
+
+
+def _chosen() -> Path:
+    """The configuration that ``dvc repro`` would run here."""
+    params = Path("params.yaml")
+    name = yaml.safe_load(params.read_text())["run"] if params.is_file() else "starter"
+    return Path("configs") / f"{name}.yaml"
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
@@ -41,7 +51,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 
 def _preview(arguments: argparse.Namespace) -> int:
-    # Rendering starts OpenGL on import, which the other commands can do without.
+    # The simulator takes seconds to import, which the other commands can do without.
     from pipeline.publish import preview
 
     config = load(arguments.config)
@@ -69,7 +79,7 @@ def _expand(arguments: argparse.Namespace) -> int:
     from pipeline.physics.expand import expand
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
-    with runner(ComputeConfig()) as run:
+    with runner(ComputeConfig(), arguments.out) as run:
         made = expand(arguments.out, demos, arguments.per_task, arguments.seed, benchmark.load(), run)
     print(
         f"{made.written} demonstrations in {len(made.files)} files: set demos.source: hdf5 and {arguments.out} as root"
@@ -88,7 +98,7 @@ def _check_oft(arguments: argparse.Namespace) -> int:
 
 
 def _regenerate(arguments: argparse.Namespace) -> int:
-    # Rendering starts OpenGL on import.
+    # As does what reads the dataset back.
     from pipeline.validation.regenerate import regenerate
 
     found = regenerate(arguments.episode_id, arguments.manifest, arguments.out, arguments.demos)
@@ -97,9 +107,10 @@ def _regenerate(arguments: argparse.Namespace) -> int:
 
 
 def _push(arguments: argparse.Namespace) -> int:
+    config = owned(arguments.config)
+    # What it needs takes seconds to import, which the other commands can do without.
     from pipeline.publish import push
 
-    config = load(arguments.config)
     (target,) = (one for one in formats_of(config.data, config.export) if one.name == arguments.format)
     upload = push.prepare(target)
     print(upload.summary())
@@ -135,8 +146,16 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    command = commands.add_parser("doctor", help="check versions, OpenGL, disk and demonstrations; changes nothing")
-    command.add_argument("--data", type=Path, default=Path("data"), help="folder the run writes to (default: data)")
+    command = commands.add_parser(
+        "doctor", help="check versions, OpenGL, disk, memory and demonstrations for a configuration; changes nothing"
+    )
+    command.add_argument(
+        "config",
+        type=Path,
+        nargs="?",
+        metavar="CONFIG",
+        help="of the run to come, such as configs/full.yaml (default: the one that params.yaml names)",
+    )
     command.set_defaults(run=_doctor)
 
     command = commands.add_parser(

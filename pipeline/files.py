@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 
 def schema_file(name: str) -> Path:
@@ -14,6 +15,25 @@ def schema_file(name: str) -> Path:
     package = Path(__file__).resolve().parent
     inside = package / "schemas" / name
     return inside if inside.exists() else package.parent / "schemas" / name
+
+
+class Edition(NamedTuple):
+    """One content of a file, for what is kept in memory of it: another content at the same path is another edition."""
+
+    path: Path
+    inode: int
+    size_bytes: int
+    mtime_ns: int
+
+
+def edition(path: Path) -> Edition:
+    """The file as it lies there now; its path absolute.
+
+    Raises:
+        OSError: when it is not there.
+    """
+    status = path.stat()
+    return Edition(path.resolve(), status.st_ino, status.st_size, status.st_mtime_ns)
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Which OpenGL renders: a GPU through EGL, else Mesa in software through EGL, else OSMesa.
 
-mujoco and robosuite read ``MUJOCO_GL`` when they are imported, so choose before importing either; worker processes
-inherit the choice. Two renderers may differ by some grey levels, so the choice is said aloud and worth recording.
+The choice is made when the first renderer of a process is made, and never by an import: physics needs no OpenGL. Worker
+processes inherit it. Two renderers may differ by some grey levels, so the choice is printed and recorded.
 """
 
 from __future__ import annotations
@@ -10,7 +10,10 @@ import functools
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from pipeline.errors import PipelineError
@@ -76,6 +79,37 @@ def choose() -> GlChoice:
         expected=" or ".join(working) or f"{' or '.join(BACKENDS)}, though neither works on this machine",
         remedy="unset MUJOCO_GL" if working else REMEDY,
     )
+
+
+def prepare() -> GlChoice:
+    """Choose, and have MuJoCo render with the choice, also where it was imported before without OpenGL.
+
+    Raises:
+        PipelineError: when nothing renders here, as in ``choose``.
+    """
+    choice = choose()
+    # mujoco.Renderer looks its context class up here; MuJoCo itself fills it in by MUJOCO_GL, but only when imported.
+    vars(import_module("mujoco.gl_context"))["GLContext"] = import_module(f"mujoco.{choice.backend}").GLContext
+    return choice
+
+
+def import_mujoco() -> None:
+    """Import MuJoCo without OpenGL: left to itself, it loads what ``MUJOCO_GL`` names, and fails where that is not."""
+    with left_out():
+        import mujoco  # noqa: F401
+
+
+@contextmanager
+def left_out() -> Iterator[None]:
+    """For a moment, have MuJoCo and robosuite load no OpenGL when they are imported, whatever ``MUJOCO_GL`` names."""
+    asked = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if asked is not None:
+            os.environ["MUJOCO_GL"] = asked
 
 
 class _NoDeviceError(Exception):

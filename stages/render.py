@@ -1,8 +1,8 @@
 """Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped."""
 
+from pipeline import gl
 from pipeline.config import Config
 from pipeline.rendering.render import render_plan
-from pipeline.rendering.renderer import GL
 from pipeline.run import plan
 from pipeline.run.compute import runner
 from pipeline.run.frame_store import FrameStore
@@ -10,10 +10,10 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    print(GL)
+    print(gl.choose())
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "frames"
-    with runner(config.compute) as workers:
+    with runner(config.compute, config.data) as workers:
         rendered = render_plan(rows, config, config.data / "trajectories", folder, workers)
     FrameStore(folder, config.render).keep(rendered)
     print(f"rendered {len(rendered)} trajectories into {folder}")

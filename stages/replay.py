@@ -13,7 +13,7 @@ from pipeline.run.trajectory_store import TrajectoryStore
 def run(config: Config) -> None:
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "trajectories"
-    with runner(config.compute) as workers:
+    with runner(config.compute, config.data) as workers:
         verdicts = replay_plan(rows, config.demos, config.replay, folder, workers)
     TrajectoryStore(folder).keep(verdicts)
     kept = sum(verdict.kept for verdict in verdicts.values())

@@ -10,7 +10,7 @@ from pipeline.validation.validate import validate
 
 
 def run(config: Config) -> None:
-    with runner(config.compute) as workers:
+    with runner(config.compute, config.data) as workers:
         report = validate(config, workers)
     file = config.data / "validation.json"
     file.write_text(json.dumps(report, indent=1) + "\n")

@@ -16,20 +16,15 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipeline import gl
-
-# Before anything imports MuJoCo.
-gl.choose()
-
-from pipeline.config import ReplayConfig  # noqa: E402
-from pipeline.libero import hdf5  # noqa: E402
-from pipeline.libero.demonstrations import StarterSource  # noqa: E402
-from pipeline.libero.tasks import find_task  # noqa: E402
-from pipeline.physics.environment import Environment  # noqa: E402
-from pipeline.physics.replay import replay  # noqa: E402
-from pipeline.testset import benchmark  # noqa: E402
-from pipeline.testset.benchmark import fetch_testset  # noqa: E402
-from pipeline.types import Demo, Task, Trajectory  # noqa: E402
+from pipeline.config import ReplayConfig
+from pipeline.libero import hdf5
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
+from pipeline.physics.environment import Environment
+from pipeline.physics.replay import replay
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import fetch_testset
+from pipeline.types import Demo, Task, Trajectory
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -129,7 +124,8 @@ def link_testset(folder: Path) -> None:
 
 def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = STAGES) -> str:
     """Run stages as DVC does, in ``folder``; returns what they printed."""
-    file = folder / "tiny.yaml"
+    file = folder / "configs" / "tiny.yaml"
+    file.parent.mkdir(exist_ok=True)
     file.write_text(yaml.safe_dump(config))
     printed = ""
     for stage in stages:

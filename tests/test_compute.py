@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -27,9 +28,9 @@ def refuse(number: int) -> int:
     return number
 
 
-def test_local_processes_and_a_scheduler_by_address() -> None:
+def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
     numbers = list(range(20))
-    with runner(ComputeConfig(cluster="local", workers=2)) as run:
+    with runner(ComputeConfig(cluster="local", workers=2), tmp_path) as run:
         assert run(square, numbers, "squares") == [n * n for n in numbers] == loop(square, numbers, "squares")
         workers = set(run(process, numbers, "processes"))
         assert len(workers) == 2
@@ -41,18 +42,19 @@ def test_local_processes_and_a_scheduler_by_address() -> None:
         from distributed import get_client
 
         address = get_client().scheduler.address
-        with runner(ComputeConfig(cluster=address)) as elsewhere:
+        with runner(ComputeConfig(cluster=address), tmp_path) as elsewhere:
             assert set(elsewhere(process, numbers, "processes")) == workers
+        assert list(tmp_path.iterdir()) == []
 
 
-def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import dask
 
     monkeypatch.setattr("pipeline.run.compute.CONNECT_S", 1)
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),
-        runner(ComputeConfig(cluster="tcp://127.0.0.1:9")),
+        runner(ComputeConfig(cluster="tcp://127.0.0.1:9"), tmp_path),
     ):
         pass
 

@@ -14,10 +14,11 @@ import pytest
 from conftest import served
 
 from pipeline.errors import PipelineError
-from pipeline.libero.fetch import REPOSITORY, fetch
+from pipeline.libero.fetch import REPOSITORY, REVISION, fetch
 from pipeline.libero.tasks import tasks
 
-COMMIT = "0123456789abcdef0123456789abcdef01234567"
+LATER = "0123456789abcdef0123456789abcdef01234567"
+"""What the repository has come to since."""
 
 
 class Hub:
@@ -43,11 +44,13 @@ class Hub:
                 self._answer(body=True)
 
             def _answer(self, body: bool) -> None:
+                commit = REVISION if REVISION in self.path else LATER
                 if self.path.startswith(f"/api/datasets/{REPOSITORY}"):
                     siblings = [{"rfilename": name} for name in hub.files]
-                    self._send(json.dumps({"id": REPOSITORY, "sha": COMMIT, "siblings": siblings}).encode(), body)
+                    self._send(json.dumps({"id": REPOSITORY, "sha": commit, "siblings": siblings}).encode(), body)
                     return
-                name = self.path.removeprefix(f"/datasets/{REPOSITORY}/resolve/{COMMIT}/")
+                # The later commit has none of the files.
+                name = self.path.removeprefix(f"/datasets/{REPOSITORY}/resolve/{REVISION}/")
                 content = hub.files.get(name)
                 if content is None:
                     self.send_error(404)
@@ -67,7 +70,7 @@ class Hub:
             ) -> None:
                 self.send_response(206 if first else 200)
                 self.send_header("Content-Length", str(len(part) if length is None else length))
-                self.send_header("X-Repo-Commit", COMMIT)
+                self.send_header("X-Repo-Commit", REVISION if REVISION in self.path else LATER)
                 self.send_header("ETag", f'"{hashlib.sha256(of).hexdigest()}"')
                 self.send_header("Accept-Ranges", "bytes")
                 if first:

@@ -10,23 +10,29 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import robosuite.utils.transform_utils as transform
 from conftest import MILK, STOVE
-from libero.libero.envs import OffScreenRenderEnv
 
-from pipeline.axes.camera import CameraPerturbation
-from pipeline.axes.light import LightPerturbation
-from pipeline.axes.noise import NoiseAxis
-from pipeline.config import RenderConfig
-from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.jpeg import decode, encode, to_policy
-from pipeline.rendering.render import render
-from pipeline.rendering.renderer import Renderer
-from pipeline.run.frame_store import FrameStore, stream_ids
-from pipeline.run.streams import Stream, streams_of
-from pipeline.scenes.compiled import proprioception
-from pipeline.seeding import rng
-from pipeline.types import Frame, Task, Trajectory
+from pipeline import gl
+
+# LIBERO's environment renders with what robosuite finds in MUJOCO_GL when it is imported.
+gl.choose()
+
+import robosuite.utils.transform_utils as transform  # noqa: E402
+from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
+
+from pipeline.axes.camera import CameraPerturbation  # noqa: E402
+from pipeline.axes.light import LightPerturbation  # noqa: E402
+from pipeline.axes.noise import NoiseAxis  # noqa: E402
+from pipeline.config import RenderConfig  # noqa: E402
+from pipeline.episode_schema import SCHEMA  # noqa: E402
+from pipeline.rendering.jpeg import decode, encode, to_policy  # noqa: E402
+from pipeline.rendering.render import render  # noqa: E402
+from pipeline.rendering.renderer import Renderer  # noqa: E402
+from pipeline.run.frame_store import FrameStore, stream_ids  # noqa: E402
+from pipeline.run.streams import Stream, streams_of  # noqa: E402
+from pipeline.scenes.compiled import proprioception  # noqa: E402
+from pipeline.seeding import rng  # noqa: E402
+from pipeline.types import Frame, Task, Trajectory  # noqa: E402
 
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
 

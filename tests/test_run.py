@@ -202,7 +202,7 @@ def test_killed_and_resumed_with_another_number_of_workers(finished: Path, short
     data = tmp_path / "data" / "tiny"
     for stage in ("replay", "render"):
         folder = data / {"replay": "trajectories", "render": "frames"}[stage]
-        command = [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(tmp_path / "tiny.yaml")]
+        command = [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(tmp_path / "configs" / "tiny.yaml")]
         killed = subprocess.Popen(
             command, cwd=tmp_path, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )

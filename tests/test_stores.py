@@ -12,7 +12,7 @@ import h5py
 import pytest
 from conftest import BOWL, tiny_config
 
-from pipeline import identity
+from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.robot import RobotPerturbation
@@ -21,7 +21,6 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.physics.replay import replay_plan
 from pipeline.rendering.render import render_plan
-from pipeline.rendering.renderer import GL
 from pipeline.run import outcome, plan
 from pipeline.run.compute import loop
 from pipeline.run.frame_store import FrameStore, Rendered
@@ -182,7 +181,7 @@ def test_a_rejection_that_is_no_longer_planned_is_forgotten(
     store.save(
         trajectory_id,
         Rendered(twin.replay_mode, twin.state, twin.joint_state, twin.action, twin.streams, {"earlier": "too_dark"}),
-        GL.device,
+        gl.choose().device,
     )
     render_plan(rows[:1], config, replayed, tmp_path, loop)
     row = store.rows()[trajectory_id]

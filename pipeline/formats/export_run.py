@@ -18,7 +18,7 @@ def export_run(target: Format[Any], config: Config) -> None:
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
         return
-    with runner(config.compute) as workers:
+    with runner(config.compute, config.data) as workers:
         export(target, episodes, workers)
     print(f"wrote {len(episodes.ids)} episodes to {target.folder}")
 

@@ -12,11 +12,15 @@ from pipeline.libero.tasks import tasks
 
 REPOSITORY = "yifengzhu-hf/LIBERO-datasets"
 
+REVISION = "f13aa24a3da8c43c7225569f28c562979fa0e35a"
+"""Commit of the repository, of 2025-05-18: a later one must not change what a run starts from."""
+
 
 def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list[Path]:
     """Download whole suites to ``<out>/<suite>/<task>_demo.hdf5``: 10 files of 0.3 to 1 GB for each suite of 10 tasks.
 
-    A download that was cut short goes on where it stopped, and files that are there are not fetched again.
+    A download that was cut short goes on where it stopped, and files that are there are not fetched again. The
+    revision is fixed.
 
     Args:
         out: the folder to use as ``demos.root`` afterwards.
@@ -35,6 +39,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         snapshot_download(
             REPOSITORY,
             repo_type="dataset",
+            revision=REVISION,
             allow_patterns=wanted,
             local_dir=out,
             # Or else a note of the revision lands in the user's home.
@@ -44,7 +49,9 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
             token=False,
         )
     except OSError as error:
-        raise PipelineError(f"the download of {REPOSITORY} stopped ({error})", where=out, remedy=remedy) from error
+        raise PipelineError(
+            f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
+        ) from error
     # Without a connection the hub's library is content with any folder that is not empty.
     missing = [name for name in wanted if not (out / name).is_file()]
     if missing:

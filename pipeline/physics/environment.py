@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import logging
-import os
+import sys
 import xml.etree.ElementTree as ET
 from functools import lru_cache
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.stepping import ControlStep
@@ -19,19 +22,33 @@ from pipeline.types import Floats, Task
 
 
 def _control_env() -> Any:
-    """LIBERO's ``ControlEnv`` class, imported without GL when none was chosen and without robosuite's banner."""
+    """LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner."""
     logging.disable(logging.WARNING)
     try:
-        if "MUJOCO_GL" not in os.environ:
-            # Physics needs no GL: without this, robosuite loads EGL on import and fails on a node without it.
-            os.environ["MUJOCO_GL"] = "disable"
-            import robosuite.macros
-
-            robosuite.macros.MUJOCO_GPU_RENDERING = False
-        from libero.libero.envs.env_wrapper import ControlEnv
+        with gl.left_out():
+            if "robosuite" not in sys.modules:
+                _turn_off_rendering()
+            from libero.libero.envs.env_wrapper import ControlEnv
     finally:
         logging.disable(logging.NOTSET)
     return ControlEnv
+
+
+def _turn_off_rendering() -> None:
+    """Unset robosuite's ``MUJOCO_GPU_RENDERING``, by which it loads EGL when it is imported, even where disabled.
+
+    The flag lies in a module of the package, and importing that module would import the package first.
+    """
+    package = find_spec("robosuite")
+    if package is None or package.origin is None:
+        raise PipelineError("robosuite is not installed", remedy="bash setup.sh")
+    spec = spec_from_file_location("robosuite.macros", Path(package.origin).with_name("macros.py"))
+    if spec is None or spec.loader is None:
+        raise PipelineError("robosuite has no macros.py", where=package.origin, remedy="rm -rf .venv && bash setup.sh")
+    macros = module_from_spec(spec)
+    spec.loader.exec_module(macros)
+    macros.MUJOCO_GPU_RENDERING = False  # type: ignore[attr-defined]
+    sys.modules[spec.name] = macros
 
 
 def _without_textures(model_xml: str) -> str:

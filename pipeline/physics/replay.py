@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.axes import PhysicsPerturbation, from_json, of_layer
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import RefusedError
+from pipeline.files import Edition, edition
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.reference import Reference
 from pipeline.physics.roll_out import roll_out
@@ -129,8 +130,10 @@ class ReplayJob:
         environment = shared(demo.task)
 
         def reference() -> Reference | None:
-            if self.twin != self.trajectory_id and (found := _twin(self.folder, self.twin)):
-                return found
+            if self.twin != self.trajectory_id:
+                twin = TrajectoryStore(self.folder).path(self.twin)
+                if (followed := _twin(edition(twin))) is not None:
+                    return followed
             if demo.states is None:
                 return None
             mask = kept_actions(demo.actions, self.config.noops)
@@ -194,9 +197,9 @@ def _replay(
 
 
 @lru_cache(maxsize=1)
-def _twin(folder: Path, trajectory_id: str) -> Reference | None:
+def _twin(file: Edition) -> Reference | None:
     """What a twin did, if it reached its goal."""
-    trajectory = TrajectoryStore(folder).load(trajectory_id)
+    trajectory = TrajectoryStore(file.path.parent).load(file.path.stem)
     if not trajectory.verdict.kept:
         return None
     return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)

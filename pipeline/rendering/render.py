@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,13 +10,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import gl
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
 from pipeline.axes.light import exposure
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.rendering.jpeg import encode, to_policy
-from pipeline.rendering.renderer import GL, Renderer
+from pipeline.rendering.renderer import Renderer
 from pipeline.run.compute import Run
 from pipeline.run.frame_store import FrameStore, Rendered, stream_ids
 from pipeline.run.outcome import rejections, replayed
@@ -67,17 +69,37 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
 
 @dataclass(frozen=True)
 class RenderJob:
-    """One trajectory's share of the rendering, as it is sent to a worker."""
+    """One trajectory's share of the rendering, as it is sent to a worker.
+
+    Attributes:
+        trajectory_id, streams: what to render.
+        trajectories, frames: folders of the stores.
+        config: how frames are encoded.
+        device: what renders the run, as OpenGL names it.
+    """
 
     trajectory_id: str
     streams: tuple[Stream, ...]
     trajectories: Path
     frames: Path
     config: RenderConfig
+    device: str
 
     def __call__(self) -> None:
-        """Render what is missing and store it with what an earlier run already rendered."""
-        store, device = FrameStore(self.frames, self.config), GL.device
+        """Render what is missing and store it with what an earlier run already rendered.
+
+        Raises:
+            PipelineError: when another device renders here: its pixels differ, and the run would never use them.
+        """
+        device = gl.choose().device
+        if device != self.device:
+            raise PipelineError(
+                f"this worker renders with {device}, the run with {self.device}",
+                where=f"worker on {platform.node()}",
+                expected="one device for all frames of a run, as devices differ by some grey levels",
+                remedy="start the stage and every worker on machines that render alike (MUJOCO_GL picks the back end)",
+            )
+        store = FrameStore(self.frames, self.config)
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
         earlier = self._earlier(store, device)
         known = {*earlier.streams, *earlier.rejected} if earlier else set()
@@ -111,7 +133,8 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     Raises:
         PipelineError: when a trajectory is missing, or rendering leaves the same work undone.
     """
-    store, device = FrameStore(folder, config.render), GL.device
+    device = gl.choose().device
+    store = FrameStore(folder, config.render)
     judged = verdicts(replayed(rows, trajectories))
     steps = {row.trajectory_id: row.demo_steps for row in rows}
     undone: set[str] = set()
@@ -126,7 +149,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
                 streams = needed.setdefault(row.trajectory_id, {})
                 streams |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
         jobs = [
-            RenderJob(trajectory_id, tuple(streams.values()), trajectories, folder, config.render)
+            RenderJob(trajectory_id, tuple(streams.values()), trajectories, folder, config.render, device)
             for trajectory_id, streams in needed.items()
             if trajectory_id not in stored or stream_ids(stored[trajectory_id]) != set(streams)
         ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,20 +14,19 @@ from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.types import Frame
 
-GL = gl.choose()
-"""What renders in this process; chosen here because MuJoCo reads the choice when it is imported."""
-
-import mujoco  # noqa: E402
-
 
 class Renderer:
     """Renders one scene through one GL context; close it before the next is made.
 
     Args:
         model_xml: MJCF of the scene.
+
+    Raises:
+        PipelineError: when nothing renders on this machine.
     """
 
     def __init__(self, model_xml: str):
+        gl.prepare()
         height, width, _ = SCHEMA.frame.shape
         self.model = mujoco.MjModel.from_xml_string(model_xml)
         self.data = mujoco.MjData(self.model)

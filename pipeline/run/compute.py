@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 from rich.console import Console
@@ -12,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
+from pipeline.run.cluster import InPlace, Workplace, joined
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -37,8 +39,16 @@ def loop(fn: Callable[[Item], Result], items: Sequence[Item], description: str) 
 
 
 @contextmanager
-def runner(config: ComputeConfig) -> Iterator[Run]:
-    """Open what ``config.cluster`` names and yield the function that runs work on it."""
+def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
+    """Open what ``config.cluster`` names and yield the function that runs work on it.
+
+    Args:
+        config: where to run.
+        folder: what the work writes into; the workers of a cluster elsewhere must see it too.
+
+    Raises:
+        PipelineError: when no scheduler answers, or a worker cannot work for this run.
+    """
     if config.cluster == "loop":
         yield loop
         return
@@ -67,16 +77,16 @@ def runner(config: ComputeConfig) -> Iterator[Run]:
             raise PipelineError(
                 "no Dask scheduler answers", where=config.cluster, remedy="start one, or set compute.cluster: local"
             ) from error
-        with client:
-            yield _on(client)
+        with client, joined(client, folder) as workplace:
+            yield _on(client, workplace)
 
 
-def _on(client: Any) -> Run:
+def _on(client: Any, workplace: Workplace | None = None) -> Run:
     from distributed import as_completed
 
     def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         # Not pure: equal items are still separate work, and the scheduler must not remember earlier runs.
-        futures = client.map(fn, items, pure=False)
+        futures = client.map(fn if workplace is None else InPlace(fn, workplace), items, pure=False)
         with _progress(description, len(items)) as advance:
             for future in as_completed(futures):
                 if future.status == "error":

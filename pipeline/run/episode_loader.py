@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
+from pipeline.files import Edition, edition
 from pipeline.identity import versions
 from pipeline.run import plan
 from pipeline.run.frame_store import FrameStore
@@ -30,7 +31,7 @@ class EpisodeLoader:
     config: RenderConfig
 
     def __call__(self, episode_id: str) -> Episode:
-        row = _rows_by_id(self.plan_file)[episode_id]
+        row = _rows_by_id(edition(self.plan_file))[episode_id]
         shown = streams_of(row.perturbations)
         rendered = FrameStore(self.frames, self.config).load(row.trajectory_id, [s.stream_id for s in shown.values()])
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
@@ -47,5 +48,5 @@ class EpisodeLoader:
 
 
 @lru_cache(maxsize=1)
-def _rows_by_id(plan_file: Path) -> dict[str, plan.Row]:
-    return {row.episode_id: row for row in plan.read(plan_file)}
+def _rows_by_id(plan_file: Edition) -> dict[str, plan.Row]:
+    return {row.episode_id: row for row in plan.read(plan_file.path)}

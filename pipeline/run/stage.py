@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
+
+OWNER = "configuration.json"
+"""File of a run's folder that says which configuration file the folder belongs to."""
 
 
 def main(stage: Callable[[Config], None], description: str) -> None:
@@ -17,6 +22,62 @@ def main(stage: Callable[[Config], None], description: str) -> None:
     parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
     arguments = parser.parse_args()
     try:
-        stage(load(arguments.config))
+        stage(claimed(arguments.config))
     except PipelineError as error:
         sys.exit(f"error: {error}")
+
+
+def claimed(file: Path) -> Config:
+    """Load a configuration that is about to be run; a run's folder that is new belongs to it from now on.
+
+    A stage deletes what its plan does not name, so two configurations must never share a folder. The same file may
+    change as it likes.
+
+    Raises:
+        PipelineError: when the configuration is not valid, or the folder belongs to another file.
+    """
+    config = load(file)
+    config.data.mkdir(parents=True, exist_ok=True)
+    # "x" fails where the file exists: of two stages that start at the same time, only one writes it.
+    with suppress(FileExistsError), (config.data / OWNER).open("x") as mark:
+        mark.write(json.dumps({"configuration": _named(file), "name": config.name}, indent=1) + "\n")
+    _refuse_foreign(config, file)
+    return config
+
+
+def owned(file: Path) -> Config:
+    """Load a configuration whose finished run is to be read; nothing is written.
+
+    Raises:
+        PipelineError: as ``claimed``.
+    """
+    config = load(file)
+    if (config.data / OWNER).exists():
+        _refuse_foreign(config, file)
+    return config
+
+
+def _refuse_foreign(config: Config, file: Path) -> None:
+    mark, own = config.data / OWNER, _named(file)
+    try:
+        owner = str(json.loads(mark.read_text())["configuration"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise PipelineError(
+            f"cannot read which configuration the folder belongs to ({error})",
+            where=mark,
+            remedy=f"delete the file if the folder is that of {own}",
+        ) from error
+    if owner != own:
+        raise PipelineError(
+            f"the folder belongs to {owner}, and {own} has the same name: {config.name}",
+            where=config.data,
+            expected="a folder for each configuration file, as a run deletes what it did not plan",
+            remedy=f"change `name:` in {own}, or rename or delete the folder; if you renamed {owner} to {own}, delete "
+            f"{mark}, and the folder goes with the new name",
+        )
+
+
+def _named(file: Path) -> str:
+    """The file's path from the folder that ``data`` lies in, or in full where it is not below that."""
+    file, here = file.resolve(), Path.cwd().resolve()
+    return file.relative_to(here).as_posix() if file.is_relative_to(here) else file.as_posix()

@@ -14,6 +14,7 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
+from pipeline import gl
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
@@ -24,7 +25,6 @@ from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
 from pipeline.physics.replay import ReplayJob
 from pipeline.rendering.render import RenderJob
-from pipeline.rendering.renderer import GL
 from pipeline.run import manifest, plan
 from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
@@ -60,6 +60,7 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
         )
     if out.exists() and any(out.iterdir()):
         raise PipelineError("is not empty", where=out, remedy="name a new folder with --out")
+    device = gl.choose().device
     rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), out, root)
     dataset = next(manifest_file.parent.glob(f"rlds/*/*/{row['rlds_shard']}"), None)
     stored = None if dataset is None else _Record.read(dataset, row["rlds_index"])
@@ -72,7 +73,7 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
             for name, here in versions().items()
             if row[column := manifest.version_column(name)] != here
         },
-        "gl_device": {} if row["gl_device"] == GL.device else {"manifest": row["gl_device"], "here": GL.device},
+        "gl_device": {} if row["gl_device"] == device else {"manifest": row["gl_device"], "here": device},
         "differs": _differences(stored.columns, rebuilt.columns) if stored and rebuilt else {},
     }
 
@@ -134,7 +135,7 @@ def _rebuild(
     verdict = replay(row)
     if not verdict.kept:
         return None, verdict.reason
-    RenderJob(trajectory_id, streams, trajectories, frames, settings.render)()
+    RenderJob(trajectory_id, streams, trajectories, frames, settings.render, gl.choose().device)()
     if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)

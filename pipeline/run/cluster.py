@@ -1,0 +1,171 @@
+"""What the workers of a cluster elsewhere must have in common with the run, checked before they do anything.
+
+A worker may have been started in another folder, on another machine, with other packages or before the code was last
+edited, and it may have served other runs. None of this may change a result or write where nobody looks.
+"""
+
+from __future__ import annotations
+
+import platform
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import chdir, contextmanager
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+from uuid import uuid4
+
+from packaging.requirements import Requirement
+
+from pipeline.errors import PipelineError
+from pipeline.files import schema_file
+from pipeline.seeding import digest
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+PACKAGE = "pipeline"
+SOURCES = (".py", ".yaml", ".j2")
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """Where a run works, and with what.
+
+    Attributes:
+        folder: absolute path of the folder that the run was started in, from which its relative paths start.
+        token: absolute path of a file that the run wrote for its workers to find.
+        setup: digest of ``setup()``.
+    """
+
+    folder: Path
+    token: Path
+    setup: str
+
+    def enter(self) -> None:
+        """Make sure that this process may work for the run, and forget what it knows of earlier ones.
+
+        Raises:
+            PipelineError: when the run's folder is not here, or other code or packages are.
+        """
+        global _entered
+        if _entered == self:
+            return
+        if not self.token.is_file():
+            raise _refusal(f"worker on {platform.node()}", [_not_shared(self)])
+        if digest("setup", setup()) != self.setup:
+            raise _refusal(f"worker on {platform.node()}", ["has other packages or other code than the run"])
+        _forget()
+        _entered = self
+
+
+_entered: Workplace | None = None
+"""The run that this process worked for last."""
+
+
+@dataclass(frozen=True)
+class InPlace(Generic[Item, Result]):
+    """A function that runs in a worker as it would where the run was started."""
+
+    fn: Callable[[Item], Result]
+    workplace: Workplace
+
+    def __call__(self, item: Item) -> Result:
+        self.workplace.enter()
+        with chdir(self.workplace.folder):
+            return self.fn(item)
+
+
+@cache
+def setup() -> dict[str, str]:
+    """What a result may depend on beside its input: versions of Python and the packages, and a digest of the code.
+
+    A process keeps the code that it imported first, so this is found out once and not again.
+    """
+    versions = {"Python": platform.python_version()}
+    try:
+        for name in (PACKAGE, *(Requirement(line).name for line in requires(PACKAGE) or [])):
+            versions[name] = version(name)
+    except PackageNotFoundError as error:
+        versions[str(error.name)] = "not installed"
+    package = Path(__file__).resolve().parent.parent
+    files = [file for file in package.rglob("*") if file.suffix in SOURCES]
+    files += schema_file("episode.json").parent.glob("*.json")
+    content = sorted((file.name, sha256(file.read_bytes()).hexdigest()) for file in files)
+    return versions | {f"code of {PACKAGE}": digest("code", content)[:16]}
+
+
+@contextmanager
+def joined(client: Any, folder: Path) -> Iterator[Workplace]:
+    """Check every worker that a Dask client has now; later ones are checked when they get their first work.
+
+    Args:
+        client: of a running cluster.
+        folder: what the run writes into.
+
+    Raises:
+        PipelineError: naming every worker that cannot work for this run, and why.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    token = folder.absolute() / f".cluster-{uuid4().hex}"
+    workplace = Workplace(Path.cwd(), token, digest("setup", setup()))
+    token.touch()
+    try:
+        reports = client.run(_report, workplace, on_error="return")
+        threads = {address: worker["nthreads"] for address, worker in client.scheduler_info()["workers"].items()}
+        addresses: dict[str, list[str]] = {}
+        for address, report in reports.items():
+            for fault in _faults(workplace, report, threads.get(address, 1)):
+                addresses.setdefault(fault, []).append(address)
+        if addresses:
+            refused = {address for of_fault in addresses.values() for address in of_fault}
+            # Three addresses of each fault are enough to find the machines by.
+            faults = [f"{', '.join(named[:3])} {fault}" for fault, named in addresses.items()]
+            raise _refusal(f"{len(refused)} of {len(reports)} workers", faults)
+        yield workplace
+    finally:
+        token.unlink(missing_ok=True)
+
+
+def _report(workplace: Workplace) -> tuple[bool, dict[str, str]]:
+    """In a worker: whether the run's folder is seen, and the setup."""
+    return workplace.token.is_file() and workplace.folder.is_dir(), setup()
+
+
+def _faults(workplace: Workplace, report: Any, threads: int) -> list[str]:
+    if isinstance(report, BaseException):
+        return [f"cannot execute this run's code ({type(report).__name__}: {report})"]
+    seen, theirs = report
+    faults = [] if seen else [_not_shared(workplace)]
+    for name, ours in setup().items():
+        if theirs.get(name) != ours:
+            faults.append(f"has {name} {theirs.get(name, 'not installed')}, the run has {ours}")
+    if threads != 1:
+        faults.append(f"runs {threads} threads, and the simulator needs a process for itself")
+    return faults
+
+
+def _not_shared(workplace: Workplace) -> str:
+    return f"does not see {workplace.token.parent}, or another folder lies at that path there"
+
+
+def _refusal(where: str, faults: list[str]) -> PipelineError:
+    return PipelineError(
+        "; ".join(faults),
+        where=where,
+        expected="workers that share the run's folders, packages and code, with one thread each",
+        remedy="mount the repository and its data at the same path everywhere, install the same requirements.lock, and "
+        "start the workers again with `dask worker ADDRESS --nthreads 1`",
+    )
+
+
+def _forget() -> None:
+    """Empty every cache of this package: what lies at a path, such as a bank of rewrites, may be another file now."""
+    for name, module in list(sys.modules.items()):
+        if name.startswith(f"{PACKAGE}.") and name != __name__:
+            for value in list(vars(module).values()):
+                if hasattr(value, "cache_clear"):
+                    value.cache_clear()

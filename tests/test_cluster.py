@@ -1,0 +1,155 @@
+"""Workers of a cluster that was started elsewhere: the same bytes, nothing of an earlier run, or a clear refusal."""
+
+from __future__ import annotations
+
+import os
+import runpy
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from conftest import REPOSITORY, STOVE, link_testset, tiny_config
+from PIL import Image
+
+from pipeline import gl
+from pipeline.config import ComputeConfig, RenderConfig
+from pipeline.errors import PipelineError
+from pipeline.rendering.render import RenderJob
+from pipeline.run.compute import runner
+
+Start = Callable[..., str]
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Start]:
+    """Starts a scheduler, and workers that know nothing of the test's folder; returns the scheduler's address."""
+    with ExitStack() as stack:
+        elsewhere = tmp_path / "elsewhere"
+        elsewhere.mkdir()
+        logs = stack.enter_context((tmp_path / "cluster.log").open("w"))
+
+        def spawn(command: str, *options: str, **environment: str) -> None:
+            process = subprocess.Popen(
+                [sys.executable, "-m", f"distributed.cli.{command}", *options],
+                cwd=elsewhere,
+                env=os.environ | {"PYTHONPATH": str(REPOSITORY)} | environment,
+                stdout=logs,
+                stderr=logs,
+            )
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+
+        def start(*workers: tuple[int, dict[str, str]]) -> str:
+            from distributed import Client
+
+            file = tmp_path / "scheduler.json"
+            spawn(
+                "dask_scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)
+            )
+            deadline = time.monotonic() + 120
+            while not file.exists() and time.monotonic() < deadline:
+                time.sleep(0.1)
+            # With a nanny, a worker would be a process of a process, and outlive the test.
+            options = ("--scheduler-file", str(file), "--no-nanny", "--no-dashboard", "--memory-limit", "0")
+            for threads, environment in workers:
+                spawn("dask_worker", *options, "--nthreads", str(threads), **environment)
+            with Client(scheduler_file=str(file), timeout=60) as client:
+                client.wait_for_workers(len(workers), timeout=240)
+                return str(client.scheduler.address)
+
+        yield start
+
+
+def configuration(demos: str, cluster: str, seed: int) -> dict[str, object]:
+    """A run with every kind of path that a user may give, all relative."""
+    return tiny_config(Path(demos)) | {
+        "demos": {"source": "hdf5", "root": demos, "tasks": [f"{STOVE.suite}/{STOVE.name}"]},
+        "plan": {
+            "seed": seed,
+            "axes": {
+                "background": {"sources": [{"folder": "textures", "licence": "ours"}], "image_share": 1.0},
+                "language": {"bank": "bank.yaml"},
+            },
+            "episodes": {"background": 1, "language": 1},
+        },
+        "compute": {"cluster": cluster},
+    }
+
+
+def run(folder: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> dict[str, bytes]:
+    """Run the stages up to RLDS in ``folder``, from this process; returns what they wrote."""
+    file = folder / "configs" / "tiny.yaml"
+    file.parent.mkdir(exist_ok=True)
+    file.write_text(yaml.safe_dump(config))
+    monkeypatch.chdir(folder)
+    for stage in ("plan", "replay", "render", "export_rlds"):
+        monkeypatch.setattr(sys, "argv", [stage, "configs/tiny.yaml"])
+        runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"), run_name="__main__")
+    data = folder / "data" / "tiny"
+    return {str(path.relative_to(data)): path.read_bytes() for path in sorted(data.rglob("*")) if path.is_file()}
+
+
+def inputs(folder: Path, demos: Path, text: str) -> None:
+    shutil.copytree(demos, folder / "demos")
+    (folder / "textures").mkdir()
+    pixels = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    Image.fromarray(pixels).save(folder / "textures" / "wall of ours.png")
+    (folder / "bank.yaml").write_text(yaml.safe_dump({STOVE.suite: {STOVE.name: {"paraphrase": [text]}}}))
+    link_testset(folder)
+
+
+def test_two_runs_on_one_cluster_are_what_they_are_without_it(
+    cluster: Start, short_demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    address = cluster((1, {}))
+    here, there = tmp_path / "here", tmp_path / "there"
+    for folder in (here, there):
+        folder.mkdir()
+        inputs(folder, short_demos, "please switch on the stove now")
+    # The second run has its plan, its frames and its datasets where the first had them.
+    made = [run(there, configuration("demos", address, seed), monkeypatch) for seed in (7, 8)]
+    alone = run(here, configuration("demos", "loop", 8), monkeypatch)
+    assert made[0].keys() != made[1].keys()
+    assert made[1] == alone
+    assert sorted(path.name for path in (tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(cluster: Start, tmp_path: Path) -> None:
+    edited = tmp_path / "edited"
+    for name in ("pipeline", "schemas"):
+        shutil.copytree(REPOSITORY / name, edited / name, ignore=shutil.ignore_patterns("__pycache__"))
+    with (edited / "pipeline" / "seeding.py").open("a") as file:
+        file.write("# edited\n")
+    address = cluster((1, {}), (1, {"PYTHONPATH": str(edited)}), (2, {}))
+    # Every process has its own folder at this path.
+    folder = Path("/proc/self/cwd") / "data"
+    with pytest.raises(PipelineError) as caught, runner(ComputeConfig(cluster=address), folder):
+        pass
+    message = str(caught.value)
+    assert "3 of 3 workers" in message
+    assert f"does not see {folder}" in message
+    assert "has code of pipeline " in message
+    assert "runs 2 threads" in message
+    assert "dask worker ADDRESS --nthreads 1" in message
+    assert not list((tmp_path / "elsewhere").rglob("data"))
+
+
+def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path) -> None:
+    # The device's name tells the width of its vectors.
+    address = cluster((1, {"MUJOCO_GL": "osmesa", "LP_NATIVE_VECTOR_WIDTH": "128"}))
+    device = gl.choose().device
+    job = RenderJob("0123", (), tmp_path / "trajectories", tmp_path / "frames", RenderConfig(), device)
+    with (
+        runner(ComputeConfig(cluster=address), tmp_path / "data") as work,
+        pytest.raises(PipelineError, match="this worker renders with") as caught,
+    ):
+        work(RenderJob.__call__, [job], "render")
+    assert device in str(caught.value)
+    assert not (tmp_path / "frames").exists()

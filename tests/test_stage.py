@@ -1,0 +1,85 @@
+"""A run's folder belongs to one configuration file: a copy of the file with the old name cannot touch it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import REPOSITORY, STOVE, tiny_config
+
+from pipeline import __main__ as command_line
+from pipeline.errors import PipelineError
+from pipeline.run.stage import OWNER, claimed, owned
+
+
+@pytest.fixture
+def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a configuration, which the process works in."""
+    demos = {"source": "starter", "tasks": [f"{STOVE.suite}/{STOVE.name}"]}
+    file = tmp_path / "configs" / "tiny.yaml"
+    file.parent.mkdir()
+    file.write_text(yaml.safe_dump(tiny_config(tmp_path) | {"demos": demos}))
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_copy_with_the_old_name_is_refused_before_anything_else(clone: Path) -> None:
+    claimed(Path("configs/tiny.yaml"))
+    trajectory = clone / "data" / "tiny" / "trajectories" / "0123.h5"
+    trajectory.parent.mkdir()
+    trajectory.write_bytes(b"hours of work")
+    shutil.copy("configs/tiny.yaml", "configs/copy.yaml")
+    before = {file: file.stat().st_mtime_ns for file in clone.rglob("*")}
+    command = [sys.executable, str(REPOSITORY / "stages" / "replay.py"), "configs/copy.yaml"]
+    done = subprocess.run(command, cwd=clone, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: data/tiny: the folder belongs to configs/tiny.yaml")
+    assert "change `name:` in configs/copy.yaml" in done.stderr
+    assert {file: file.stat().st_mtime_ns for file in clone.rglob("*")} == before
+
+
+def test_push_refuses_it_too(clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    claimed(Path("configs/tiny.yaml"))
+    shutil.copy("configs/tiny.yaml", "configs/copy.yaml")
+    monkeypatch.setattr(sys, "argv", ["pipeline", "push", "configs/copy.yaml", "rlds", "somebody/tiny"])
+    assert command_line.main() == 1
+    assert "belongs to configs/tiny.yaml" in capsys.readouterr().err
+
+
+def test_an_edited_file_keeps_its_folder_however_it_is_named(clone: Path) -> None:
+    claimed(Path("configs/tiny.yaml"))
+    file = clone / "configs" / "tiny.yaml"
+    config = yaml.safe_load(file.read_text())
+    config["plan"]["seed"] = 8
+    file.write_text(yaml.safe_dump(config))
+    assert claimed(file).plan.seed == owned(Path("configs/../configs/tiny.yaml")).plan.seed == 8
+
+
+def test_a_renamed_file_gets_the_folder_when_the_mark_is_deleted(clone: Path) -> None:
+    claimed(Path("configs/tiny.yaml"))
+    (clone / "configs" / "tiny.yaml").rename("configs/renamed.yaml")
+    with pytest.raises(PipelineError, match=r"configs/tiny\.yaml, and configs/renamed\.yaml") as caught:
+        claimed(Path("configs/renamed.yaml"))
+    mark = clone / "data" / "tiny" / OWNER
+    assert f"delete {mark.relative_to(clone)}" in str(caught.value.remedy)
+    mark.unlink()
+    claimed(Path("configs/renamed.yaml"))
+    assert json.loads(mark.read_text())["configuration"] == "configs/renamed.yaml"
+
+
+def test_reading_a_run_writes_nothing(clone: Path) -> None:
+    owned(Path("configs/tiny.yaml"))
+    assert not (clone / "data").exists()
+
+
+def test_a_mark_that_cannot_be_read_is_named(clone: Path) -> None:
+    claimed(Path("configs/tiny.yaml"))
+    mark = Path("data/tiny") / OWNER
+    mark.write_text("")
+    with pytest.raises(PipelineError, match=f"{mark}: cannot read which configuration"):
+        claimed(Path("configs/tiny.yaml"))
