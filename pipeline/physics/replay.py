@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -110,7 +110,7 @@ def _perturbed(
     environment.restore(scene.model_xml, scene.state)
     try:
         for perturbation in perturbations:
-            scene = perturbation.apply(scene, demo, roll_out)
+            scene = perturbation.apply(scene, demo, partial(roll_out, noops=config.noops))
     except RefusedError as error:
         return scene, Verdict(False, error.reason)
     return scene, None
