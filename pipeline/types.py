@@ -104,7 +104,8 @@ class Trajectory:
         actions: (K, 7) executed actions.
         kept_mask: (T,) which of the demonstration's actions were executed.
         site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
-        resolved: JSON of what physics perturbations came to in this scene.
+        resolved: JSON of what physics perturbations came to in this scene, by axis; or under ``fault`` why the
+            demonstration could not be simulated.
         verdict: the judge's word after the last action.
     """
 

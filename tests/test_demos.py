@@ -244,6 +244,14 @@ SPOILT: dict[str, tuple[Callable[[h5py.Group], object], str]] = {
     "text for actions": (lambda demo: replace(demo, "actions", "none"), "holds object"),
     "no steps": (lambda demo: replace(demo, "actions", np.zeros((0, 7))), r"shape \(0, 7\)"),
     "fewer states": (lambda demo: replace(demo, "states", demo["states"][:-1]), "do not agree"),
+    "model of bytes that are not UTF-8": (
+        lambda demo: demo.attrs.create("model_file", b"<mujoco model='\xff'/>", dtype=h5py.string_dtype()),
+        "'model_file' is not UTF-8",
+    ),
+    "huge states": (
+        lambda demo: replace(demo, "states", with_value(demo["states"][()], 1e200)),
+        "states reach 1e\\+200",
+    ),
     "NaN": (lambda demo: replace(demo, "states", with_value(demo["states"][()], np.nan)), "NaN"),
     "large actions": (lambda demo: replace(demo, "actions", with_value(demo["actions"][()], 1.5)), "actions reach 1.5"),
     "other init_state": (lambda demo: demo.attrs.modify("init_state", demo["states"][1]), "do not agree"),
@@ -280,6 +288,32 @@ def test_a_bad_demo_is_named_and_does_not_cost_the_others(root: Path, case: str)
     with pytest.raises(PipelineError, match=what):
         source.load(f"{NAME}/demo_3")
     assert [entry.key for entry in source.index([TASK], per_task=4).entries][-1] == "demo_4"
+
+
+def test_an_exact_copy_is_left_out_and_both_are_named(root: Path, model_file: str) -> None:
+    other = tasks("libero_goal")[0]
+    with h5py.File(file_in(root), "r+") as file:
+        file.copy("data/demo_1", file["data"], "demo_2a")
+        del file["data/demo_2"]
+        file["data"].move("demo_2a", "demo_2")
+    # Also where it is said to solve another task: an episode's id is a hash of the content alone.
+    hdf5.write(file_in(root, other), other, [recording(model_file, seed=1), recording(model_file, seed=99)])
+    index = HDF5Source(root).index([TASK, other])
+    assert [entry.key for entry in index.entries if entry.task == TASK] == [f"demo_{n}" for n in range(11) if n != 2]
+    assert [entry.key for entry in index.entries if entry.task == other] == ["demo_1"]
+    assert [problem.name for problem in index.problems] == [f"{NAME}/demo_2", f"{other.suite}/{other.name}/demo_0"]
+    for problem in index.problems:
+        assert f"the same actions, states and model as {NAME}/demo_1" in str(problem.error)
+        assert f"data/{problem.name.rpartition('/')[2]}" in str(problem.error)
+    assert len(HDF5Source(root).index([TASK], per_task=3).entries) == 3
+
+
+def test_a_name_that_is_not_utf_8_costs_that_demonstration_only(root: Path) -> None:
+    with h5py.File(file_in(root), "r+") as file:
+        file["data"].create_group(b"demo_\xff")
+    index = HDF5Source(root).index([TASK])
+    assert len(index.entries) == 11
+    assert [problem.name for problem in index.problems] == [f"{NAME}/demo_\\xff"]
 
 
 def truncate(path: Path) -> None:

@@ -10,22 +10,26 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import pytest
-from conftest import MILK, REPOSITORY, STOVE
+from conftest import MILK, REPOSITORY, STOVE, starter_demo
 from PIL import Image
 
 from pipeline import __main__ as command_line
-from pipeline.axes import Axes, PhysicsPerturbation, RenderPerturbation
-from pipeline.axes.base import Axis
+from pipeline.axes import Axes, PhysicsPerturbation, RenderPerturbation, to_json
+from pipeline.axes.base import Axis, Nearest
 from pipeline.axes.language import LanguageAxis
-from pipeline.config import load
+from pipeline.config import PlanConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
+from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.environment import Environment
 from pipeline.publish import preview, sheets
 from pipeline.rendering.jpeg import decode
 from pipeline.rendering.render import render
+from pipeline.run import plan
 from pipeline.run.compute import loop
 from pipeline.run.streams import streams_of
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, RollOut, Scene, Task, Trajectory, Verdict
 
 if TYPE_CHECKING:
@@ -33,6 +37,7 @@ if TYPE_CHECKING:
 
 STARTER = load(REPOSITORY / "configs" / "starter.yaml")
 VIEWS = tuple(SCHEMA.views)
+NO_TESTS = TestSet(())
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +51,10 @@ class Dimming(RenderPerturbation):
     component: Literal["lamp", "window"] = "lamp"
     views: ClassVar[frozenset[str]] = frozenset(VIEWS)
     fields: ClassVar[tuple[str, ...]] = ("light_diffuse",)
+    clearance: ClassVar[float] = 0.0
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        return Nearest(np.inf, 0)
 
     def apply(self, model: mujoco.MjModel) -> None:
         model.light_diffuse[:] *= 1 - self.level / 5
@@ -56,6 +65,10 @@ class Lift(PhysicsPerturbation):
 
     axis: Literal["lift"] = "lift"
     component: Literal["lamp", "window"] = "lamp"
+    clearance: ClassVar[float] = 0.0
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        return Nearest(np.inf, 0)
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         if self.level == 5:
@@ -100,7 +113,7 @@ def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_
     if not preview.configured(name, STARTER).applies(stage.demo.task):
         pytest.skip("the axis does not apply to this task")
     before = stage.frames(VIEWS)
-    for perturbation in reversed(preview.variants(name, preview.configured(name, STARTER), stage.demo, 1)):
+    for perturbation in reversed(preview.variants(name, preview.configured(name, STARTER), stage.demo, 1, NO_TESTS)):
         try:
             after = stage.frames(VIEWS, perturbation)
             break
@@ -118,9 +131,9 @@ def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_
 @pytest.mark.parametrize("name", ["camera", "noise", "language"])
 def test_variants_cover_components_and_levels(stage: preview.Stage, name: str) -> None:
     axis = preview.configured(name, STARTER)
-    drawn = preview.variants(name, axis, stage.demo, 1)
-    assert drawn == preview.variants(name, axis, stage.demo, 1)
-    assert drawn != preview.variants(name, axis, stage.demo, 2) or name == "language"
+    drawn = preview.variants(name, axis, stage.demo, 1, NO_TESTS)
+    assert drawn == preview.variants(name, axis, stage.demo, 1, NO_TESTS)
+    assert drawn != preview.variants(name, axis, stage.demo, 2, NO_TESTS) or name == "language"
     assert len({p.model_dump_json() for p in drawn}) == preview.VARIANTS
     counts = Counter(p.component for p in drawn)
     kinds = get_args(type(drawn[0]).model_fields["component"].annotation)
@@ -129,9 +142,23 @@ def test_variants_cover_components_and_levels(stage: preview.Stage, name: str) -
     assert {p.level for p in drawn} == {1, 2, 3, 4, 5}
 
 
+@pytest.mark.parametrize("name", ["language", "pose", "camera"])
+def test_what_is_shown_is_what_the_plan_draws(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the benchmark's tasks, which the plan keeps clear of: the last displacement is drawn anew."""
+    monkeypatch.chdir(REPOSITORY)
+    for count in ("CANDIDATES", "VARIANTS", "PHYSICS_VARIANTS"):
+        monkeypatch.setattr(preview, count, 12)
+    test, demo, axis = benchmark.load(), starter_demo(MILK), preview.configured(name, STARTER)
+    config = PlanConfig.model_validate({"seed": 5, "axes": {name: axis}, "episodes": {name: 12}})
+    entry = DemoEntry(MILK, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
+    rows = [row for row in plan.make([entry], config, STARTER.replay, test) if row.role == "perturbed"]
+    shown = preview.variants(name, axis, demo, 5, test)
+    assert {to_json([perturbation]) for perturbation in shown} == {row.perturbations for row in rows}
+
+
 def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Dimming))
-    original, *variants = tiles(preview.draw(stage, "dimming", STARTER), 2)
+    original, *variants = tiles(preview.draw(stage, "dimming", STARTER, NO_TESTS), 2)
     # Two components at five levels are all that there is.
     brightness = [variant.mean() for variant in variants[:10]]
     assert brightness[0] < original.mean()
@@ -149,7 +176,7 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
         return sheets.Tile(picture, caption[:20])
 
     monkeypatch.setattr(preview, "Tile", tile)
-    sheet = preview.draw(stage, "lift", STARTER)
+    sheet = preview.draw(stage, "lift", STARTER, NO_TESTS)
     assert captions[1:] == [
         "lamp, level 1",
         "refused, too_high: lamp, level 5",

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from conftest import BOWL, MILK, STOVE
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
@@ -20,7 +24,7 @@ from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
 from pipeline.physics.success import verdict
 from pipeline.scenes.noops import NOOP_NORM, kept_actions
-from pipeline.types import Floats, Task, Trajectory
+from pipeline.types import Demo, Floats, RollOut, Scene, Task, Trajectory
 
 ACTIONS = st.lists(st.tuples(st.sampled_from([0.0, 5e-5, 0.3]), st.sampled_from([-1.0, 1.0])), min_size=1, max_size=30)
 
@@ -111,6 +115,30 @@ def test_replay_starts_from_the_recorded_state_and_reaches_the_recorded_goal(
     assert len(trajectory.states) == len(trajectory.actions) + 1 == trajectory.kept_mask.sum() + 1
     control_step_s = np.diff(trajectory.states[:, 0])
     assert np.allclose(control_step_s, 1 / 20)
+
+
+class PathSeen(PhysicsPerturbation):
+    """Changes nothing, and records the path that a perturbation is told of."""
+
+    axis: Literal["path"] = "path"
+    component: Literal["path"] = "path"
+
+    def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
+        return replace(scene, resolved={"path": roll_out(scene, demo).tolist()})
+
+
+@pytest.mark.parametrize("noops", ["drop", "trim_ends", "keep"])
+def test_perturbations_keep_clear_of_the_path_that_is_replayed(
+    short_demos: Path, noops: Literal["drop", "trim_ends", "keep"]
+) -> None:
+    demo = HDF5Source(short_demos).load(f"{STOVE.suite}/{STOVE.name}/demo_0")
+    actions = demo.actions.copy()
+    # Two pauses: at the start, where the gripper stays as it is, and on the way.
+    actions[[0, 1, 5, 6], :6], actions[[0, 1, 5, 6], 6] = 0.0, actions[4, 6]
+    demo = replace(demo, actions=actions)
+    trajectory = replay(Environment(STOVE), demo, "t", ReplayConfig(noops=noops), (PathSeen(level=1),))
+    assert len(trajectory.actions) == {"drop": 10, "trim_ends": 12, "keep": 14}[noops]
+    assert np.array_equal(json.loads(trajectory.resolved)["path"], trajectory.states)
 
 
 def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> None:

@@ -22,6 +22,9 @@ from pipeline.libero.assets import package_folder, relocate
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Demo, Floats, Task
 
+LARGEST_STATE = 1e10
+"""MuJoCo calls a simulation unstable when a position or a velocity passes this (``mjMAXVAL`` in ``mjmodel.h``)."""
+
 HUMAN, EXPANDED = "human", "expanded"
 """Who made a demonstration."""
 
@@ -136,6 +139,7 @@ class HDF5Source:
         wanted = list(wanted)
         entries: list[DemoEntry] = []
         problems = [stray for suite in dict.fromkeys(task.suite for task in wanted) for stray in self._strays(suite)]
+        first_with: dict[str, DemoEntry] = {}
         for task in wanted:
             name, usable = f"{task.suite}/{task.name}", 0
             try:
@@ -144,7 +148,11 @@ class HDF5Source:
                         if usable == per_task:
                             break
                         try:
-                            entries.append(_entry(self._read(task, key, data)))
+                            entry = _entry(self._read(task, key, data))
+                            first = first_with.setdefault(entry.sha256, entry)
+                            if first is not entry:
+                                raise _copy_of(first, f"{self._path(task)} data/{key}")
+                            entries.append(entry)
                             usable += 1
                         except PipelineError as error:
                             problems.append(Problem(f"{name}/{key}", error))
@@ -234,8 +242,10 @@ def _demo(
         fault = "actions or states hold NaN or infinity"
     elif np.abs(actions).max() > 1 + 1e-6:
         fault = f"actions reach {np.abs(actions).max():.6g}"
+    elif np.abs(states).max() > LARGEST_STATE:
+        fault = f"states reach {np.abs(states).max():.6g}"
     if fault:
-        expected = "actions (T, 7) in [-1, 1] and states (T, S), all finite"
+        expected = f"actions (T, 7) in [-1, 1] and states (T, S), all finite and none beyond {LARGEST_STATE:.0e}"
         raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.AGAIN)
     # Hash the model as recorded: relocated, it would differ from machine to machine.
     content = hashlib.sha256()
@@ -250,6 +260,13 @@ def _demo(
 
 def _entry(demo: Demo) -> DemoEntry:
     return DemoEntry(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
+
+
+def _copy_of(first: DemoEntry, where: str) -> PipelineError:
+    # Episodes are identified by content: two copies would make two rows with one id.
+    return PipelineError(
+        f"holds the same actions, states and model as {first.demo_id}", where=where, remedy="delete one of the two"
+    )
 
 
 def _parse(demo_id: str) -> tuple[Task, str]:

@@ -59,7 +59,9 @@ def opened(path: Path) -> Iterator[h5py.File]:
 def names(group: h5py.Group, where: str) -> list[str]:
     """A group's member names in natural order, ``demo_2`` before ``demo_10``."""
     with _undamaged(where):
-        return sorted(group, key=lambda name: [part.zfill(20) for part in re.split(r"(\d+)", name)])
+        # h5py gives a name that is not UTF-8 as bytes.
+        text = [name if isinstance(name, str) else name.decode(errors="backslashreplace") for name in group]
+        return sorted(text, key=lambda name: [part.zfill(20) for part in re.split(r"(\d+)", name)])
 
 
 def member(group: h5py.Group, name: str, kind: type[_Node], where: str) -> _Node:
@@ -108,6 +110,9 @@ def text(group: h5py.Group, name: str, where: str) -> str:
             expected="LIBERO's own files, which record the scene of every demonstration in model_file",
             remedy="use the published files, not a re-rendered or converted copy of them",
         )
+    # h5py reads bytes that are not UTF-8 as lone surrogates, which nothing can encode again.
+    if not value.isascii() and any("\ud800" <= character <= "\udfff" for character in value):
+        raise PipelineError(f"attribute {name!r} is not UTF-8", where=where, remedy=AGAIN)
     return value
 
 

@@ -10,15 +10,37 @@ from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipeline import gl
-from pipeline.errors import PipelineError
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.stepping import ControlStep
+from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Task
+
+
+class UnusableSceneError(PipelineError):
+    """A scene or a state that cannot be simulated.
+
+    Args:
+        reason: ``scene_refused`` or ``state_mismatch``, as the manifest says it.
+        what: the fault, as in ``PipelineError``.
+        task: whose scene it should be.
+    """
+
+    def __init__(self, reason: str, what: str, task: Task):
+        super().__init__(
+            what,
+            where=f"{task.suite}/{task.name}",
+            expected="the scene of this task, and time, qpos and qvel of the same model",
+            remedy="use demonstrations recorded with this LIBERO version, or ones that carry their model_file",
+        )
+        self.reason = reason
 
 
 def _control_env() -> Any:
@@ -112,11 +134,22 @@ class Environment:
         Args:
             model_xml: MJCF of the scene.
             state: (S,) flattened MuJoCo state: time, qpos, qvel.
+
+        Raises:
+            UnusableSceneError: when MuJoCo or LIBERO refuses the scene, or the state is not of its model.
         """
         env = self._env.env
         if model_xml != self._scene:
             self._scene = None
-            env.reset_from_xml_string(_without_textures(model_xml))
+            try:
+                env.reset_from_xml_string(_without_textures(model_xml))
+            except (ValueError, KeyError, mujoco.FatalError) as error:
+                # What MuJoCo raises when it compiles, and robosuite when a name that it looks up is not in the model.
+                env.deterministic_reset = False
+                raise UnusableSceneError(
+                    "scene_refused", f"the scene is refused ({error!s:.300})", self.task
+                ) from error
+            self._check_names()
             self._scene, self._site_rgba = model_xml, env.sim.model.site_rgba.copy()
         else:
             # What of the model LIBERO changes while it steps: a burner's site is lit.
@@ -127,14 +160,7 @@ class Environment:
         # The gripper model survives the reset with its last command, which the next command is added to.
         env.robots[0].gripper.current_action = np.zeros(env.robots[0].gripper.dof)
         env.sim.reset()
-        expected = 1 + env.sim.model.nq + env.sim.model.nv
-        if len(state) != expected:
-            raise PipelineError(
-                f"the recorded state has {len(state)} numbers, the scene's has {expected}",
-                where=f"{self.task.suite}/{self.task.name}",
-                expected="time, qpos and qvel of the same model",
-                remedy="use demonstrations recorded with this LIBERO version, or ones that carry their model_file",
-            )
+        self._check_state(state)
         env.sim.set_state_from_flattened(state)
         env.sim.forward()
         # As after a reset in an evaluation: the controller knows where the arm is, and its null space holds the arm to
@@ -144,9 +170,39 @@ class Environment:
         env._post_process()
         self._control_step = ControlStep(env)
 
+    def _check_names(self) -> None:
+        """What is looked up by name later, besides what LIBERO's own reset has looked up already."""
+        env, model = self._env.env, self._env.env.sim.model
+        needed = {view.camera: model.camera_names for view in SCHEMA.views.values()}
+        needed |= {joint: model.joint_names for thing in env.objects_dict.values() for joint in thing.joints}
+        missing = [name for name, names in needed.items() if name not in names]
+        if not set(SURFACES) & set(model.body_names):
+            missing.append(" or ".join(SURFACES))
+        if missing:
+            raise UnusableSceneError("scene_refused", f"the scene has no {', '.join(missing)}", self.task)
+
+    def _check_state(self, state: Floats) -> None:
+        model = self.sim.model._model
+        expected = 1 + model.nq + model.nv
+        if len(state) != expected:
+            what = f"the recorded state has {len(state)} numbers, the scene's has {expected}"
+            raise UnusableSceneError("state_mismatch", what, self.task)
+        for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+            first = 1 + model.jnt_qposadr[joint] + 3
+            if not state[first : first + 4].any():
+                what = f"the recorded state gives {model.joint(joint).name} a rotation of length 0"
+                raise UnusableSceneError("state_mismatch", what, self.task)
+
     def step(self, action: Floats) -> None:
-        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1]."""
-        self._control_step(action)
+        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1].
+
+        Raises:
+            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
+        """
+        try:
+            self._control_step(action)
+        except (np.linalg.LinAlgError, mujoco.FatalError) as error:
+            raise RefusedError("simulation_unstable") from error
 
     @property
     def sim(self) -> Any:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.axes import PhysicsPerturbation, from_json, of_layer
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.files import Edition, edition
-from pipeline.physics.environment import Environment, shared
+from pipeline.physics.environment import Environment, UnusableSceneError, shared
 from pipeline.physics.reference import Reference
 from pipeline.physics.roll_out import roll_out
 from pipeline.physics.success import verdict
@@ -37,6 +39,8 @@ def replay(
 ) -> Trajectory:
     """Replay a demonstration from its exact first state, or a perturbed one, in the configured mode.
 
+    A demonstration whose scene or state cannot be simulated makes a trajectory that is dropped, not an error.
+
     Args:
         environment: of the demonstration's task.
         demo: what to replay.
@@ -47,7 +51,11 @@ def replay(
             ``tracked``; the result says how its actions came about.
     """
     mask = kept_actions(demo.actions, config.noops)
-    scene, refused = _perturbed(environment, demo, config, perturbations)
+    try:
+        scene, refused = _perturbed(environment, demo, config, perturbations)
+    except UnusableSceneError as error:
+        print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
+        return _not_simulated(demo, trajectory_id, error, mask)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         environment.restore(scene.model_xml, scene.state)
@@ -94,14 +102,34 @@ def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats
 def _perturbed(
     environment: Environment, demo: Demo, config: ReplayConfig, perturbations: Sequence[PhysicsPerturbation]
 ) -> tuple[Scene, Verdict | None]:
-    """Where the replay starts, and the reason if a perturbation cannot be made there."""
+    """Where the replay starts, and the reason if a perturbation cannot be made there.
+
+    Raises:
+        UnusableSceneError: when the demonstration cannot be simulated at all.
+    """
     scene = Scene(demo.model_xml or environment.place_fixtures(config.fixture_seed), demo.init_state)
+    # Before perturbations compile it themselves, which would fail in ways of their own.
+    environment.restore(scene.model_xml, scene.state)
     try:
         for perturbation in perturbations:
-            scene = perturbation.apply(scene, demo, roll_out)
+            scene = perturbation.apply(scene, demo, partial(roll_out, noops=config.noops))
     except RefusedError as error:
         return scene, Verdict(False, error.reason)
     return scene, None
+
+
+def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError, mask: NDArray[np.bool_]) -> Trajectory:
+    return Trajectory(
+        trajectory_id=trajectory_id,
+        mode="open_loop",
+        model_xml=demo.model_xml or "",
+        states=demo.init_state[None],
+        actions=np.empty((0, 7)),
+        kept_mask=mask,
+        site_alpha=np.empty((1, 0), np.float32),
+        resolved=json.dumps({"fault": str(error)}),
+        verdict=Verdict(False, error.reason),
+    )
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Preview: what an axis does to a task, as a contact sheet in the manner of the paper's appendix; no replay.
 
 Every picture shows the demonstration's first state. The draws are those that a plan with the same seed makes for the
-demonstration, without the benchmark's test tasks being asked.
+demonstration.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import get_args
 
@@ -36,13 +38,15 @@ from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
 from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.compute import Run
-from pipeline.seeding import rng
+from pipeline.run.plan import draws_of
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task
 
 VARIANTS, PHYSICS_VARIANTS = 11, 5
 """With the original, three rows of four; a row and a half where each variant is a scene of its own to compile."""
 CANDIDATES = 200
-"""Draws that the variants are chosen from; a draw takes well under a millisecond."""
+"""The plan's first draws, from which the variants are chosen; most draws take well under a millisecond."""
 
 SIDE_PX = {1: 256, 2: 192}
 """Width of a frame, by how many views a tile shows."""
@@ -54,10 +58,16 @@ class Stage:
     """A task set up to be looked at: one demonstration's first state, and the renderer of the scene shown last.
 
     Only one GL context is open at a time; it is kept for as long as perturbations leave the scene's model alone.
+
+    Attributes:
+        demo: the demonstration.
+        scene: its first state.
+        noops: how a run treats the demonstration's no-ops; see ``kept_actions``.
     """
 
     demo: Demo
     scene: Scene
+    noops: str = "drop"
     _renderer: Renderer | None = None
     _rendered_xml: str | None = None
 
@@ -70,7 +80,7 @@ class Stage:
         changes = () if perturbation is None else (perturbation,)
         scene = self.scene
         for physics in of_layer(changes, PhysicsPerturbation):
-            scene = physics.apply(scene, self.demo, roll_out)
+            scene = physics.apply(scene, self.demo, partial(roll_out, noops=self.noops))
         renderer = self._of(scene.model_xml)
         shown = []
         with renderer.perturbed(of_layer(changes, RenderPerturbation)):
@@ -120,7 +130,7 @@ def staged(tasks: Iterable[Task], config: Config) -> Iterator[Stage]:
         environment = Environment(demo.task)
         model_xml = environment.place_fixtures(config.replay.fixture_seed)
         environment.close()
-    stage = Stage(demo, Scene(model_xml, demo.init_state))
+    stage = Stage(demo, Scene(model_xml, demo.init_state), config.replay.noops)
     try:
         yield stage
     finally:
@@ -142,13 +152,10 @@ def configured(name: str, config: Config) -> AnyAxis:
     return axis
 
 
-def variants(name: str, axis: AnyAxis, demo: Demo, seed: int) -> list[AnyPerturbation]:
-    """Different draws that cover the axis's components, and within each component its levels."""
-    drawn: dict[str, AnyPerturbation] = {}
-    for variant in range(CANDIDATES):
-        perturbation = axis.sample(rng(seed, name, demo.demo_id, variant, 0), demo.task, variant)
-        drawn.setdefault(perturbation.model_dump_json(), perturbation)
-    left = list(drawn.values())
+def variants(name: str, axis: AnyAxis, demo: Demo, seed: int, test: TestSet) -> list[AnyPerturbation]:
+    """Draws of the plan's that cover the axis's components, and within each component its levels."""
+    draws = draws_of(name, (axis,), demo.demo_id, demo.task, seed, test)
+    left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
     chosen: list[AnyPerturbation] = []
     count = PHYSICS_VARIANTS if isinstance(left[0], PhysicsPerturbation) else VARIANTS
 
@@ -164,13 +171,19 @@ def variants(name: str, axis: AnyAxis, demo: Demo, seed: int) -> list[AnyPerturb
     return sorted(chosen, key=lambda p: (p.component, p.level))
 
 
-def draw(stage: Stage, name: str, config: Config) -> Image.Image:
+def draw(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
     """The sheet of one axis: the original top left, then the variants with what was drawn.
 
     What a scene refuses is a grey tile with the reason.
+
+    Args:
+        stage: the demonstration to show.
+        name: the axis.
+        config: its ranges, and the seed.
+        test: the benchmark's test tasks, which the plan's draws keep clear of.
     """
     demo, seed = stage.demo, config.plan.seed
-    drawn = variants(name, configured(name, config), demo, seed)
+    drawn = variants(name, configured(name, config), demo, seed, test)
     changed = frozenset[str]().union(*(p.views for p in drawn)) or {"image"}
     views = [view for view in SCHEMA.views if view in changed]
     side = SIDE_PX[len(views)]
@@ -196,17 +209,18 @@ def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
     by_suite: dict[str, list[Task]] = {}
     for task in select_tasks(config.demos.tasks):
         by_suite.setdefault(task.suite, []).append(task)
+    test = benchmark.load()
     with replaced(folder) as temporary:
-        jobs = [(tasks, config, temporary / suite) for suite, tasks in by_suite.items()]
+        jobs = [(tasks, config, temporary / suite, test) for suite, tasks in by_suite.items()]
         run(_draw_all, jobs, "previews")
     return {suite: folder / suite for suite in by_suite}
 
 
-def _draw_all(job: tuple[list[Task], Config, Path]) -> None:
-    tasks, config, folder = job
+def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
+    tasks, config, folder, test = job
     folder.mkdir(parents=True)
     with staged(tasks, config) as stage:
         for name in Axes.model_fields:
             axis: AnyAxis | None = getattr(config.plan.axes, name)
             if axis is not None and axis.applies(stage.demo.task):
-                draw(stage, name, config).save(folder / f"{name}.png")
+                draw(stage, name, config, test).save(folder / f"{name}.png")

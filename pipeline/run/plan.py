@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from itertools import count
 from math import ceil
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from pipeline.files import replaced
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Verdict
+from pipeline.types import Task, Verdict
 
 _ATTEMPTS = 100
 
@@ -133,23 +134,41 @@ def _candidates(
 
     There are fewer than wanted when no more different draws are left that keep clear of the test set.
     """
-    first = {demo.demo_id: int(rng(plan.seed, name, demo.demo_id).integers(2**31)) for demo in group}
-    seen: set[str] = set()
+    draws = [draws_of(name, axes, demo.demo_id, demo.task, plan.seed, test) for demo in group]
     for rank in range(wanted + ceil(wanted * plan.reserve)):
-        demo, variant = group[rank % len(group)], rank // len(group)
+        variant, number = divmod(rank, len(group))
+        perturbations = next(draws[number], None)
+        if perturbations is None:
+            return
+        yield _row(group[number], perturbations, plan.seed, variant, rank, rank < wanted, replay)
+
+
+def draws_of(
+    name: str, axes: Sequence[AnyAxis], demo_id: str, task: Task, seed: int, test: TestSet
+) -> Iterator[tuple[AnyPerturbation, ...]]:
+    """What a plan draws for one demonstration, variant after variant: all different, and clear of the test set.
+
+    Args:
+        name: of the axis or combination, as in ``plan.episodes``.
+        axes: what it draws from.
+        seed: of the plan.
+
+    Yields:
+        One perturbation of each axis, until no different draw is left.
+    """
+    first = int(rng(seed, name, demo_id).integers(2**31))
+    drawn: set[tuple[str, ...]] = set()
+    for variant in count():
         for attempt in range(_ATTEMPTS):
-            key = rng(plan.seed, name, demo.demo_id, variant, attempt)
-            place = first[demo.demo_id] + variant + attempt
-            draws = tuple(axis.sample(key, demo.task, place) for axis in axes)
-            row = _row(demo, draws, plan.seed, variant, rank, rank < wanted, replay)
-            if row.episode_id not in seen and all(
-                draw.nearest(test, demo.task).distance >= draw.clearance for draw in draws
-            ):
+            key = rng(seed, name, demo_id, variant, attempt)
+            perturbations = tuple(axis.sample(key, task, first + variant + attempt) for axis in axes)
+            content = tuple(p.model_dump_json() for p in perturbations)
+            if content not in drawn and all(p.nearest(test, task).distance >= p.clearance for p in perturbations):
                 break
         else:
             return
-        seen.add(row.episode_id)
-        yield row
+        drawn.add(content)
+        yield perturbations
 
 
 def _row(
