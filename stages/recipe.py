@@ -1,17 +1,17 @@
-"""Stage recipe: the fine-tuning manifest, and what each policy's code needs to train on the datasets as they are."""
+"""Stage recipe: the fine-tuning recipe, and what each policy's code needs to train on the datasets as they are."""
 
 from pipeline.config import Config
-from pipeline.publish import recipe
+from pipeline.publish.recipe import build, write
 from pipeline.run import manifest
 from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
     file, name = config.data / "manifest.parquet", config.export.lerobot.name
-    made = recipe.build(file, manifest.read(file), name=config.export.rlds.name, lerobot=name)
+    recipe = build(file, manifest.read(file), name=config.export.rlds.name, lerobot=name)
     folder = config.data / "finetune"
-    recipe.write(made, config.data / "lerobot" / name, folder)
-    print(f"{folder / 'finetune.yaml'} has the recipe and a command line for each of {', '.join(made['clients'])}")
+    write(recipe, config.data / "lerobot" / name, folder)
+    print(f"{folder / 'finetune.yaml'} has the recipe and a command line for each of {', '.join(recipe['clients'])}")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import MILK, STOVE, starter_demo
-from pipeline.run.trajectory_store import TrajectoryStore
 
 from pipeline.axes import Axes
 from pipeline.axes.layout import LayoutAxis
@@ -23,6 +22,7 @@ from pipeline.physics.environment import Environment, UnusableSceneError
 from pipeline.physics.replay import replay_plan
 from pipeline.run import plan
 from pipeline.run.compute import loop
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
 

@@ -86,7 +86,9 @@ def test_no_rewrite_is_stored_twice(task: Task) -> None:
         ("set the bowl down on the caf\u00e9 plate", "characters"),
         ("set the bowl down (on the plate)", "characters"),
         ("plate it", "2 words"),
-        ("go " * 60 + "on", "61 words"),
+        ("go " * 38 + "on", "39 words and marks"),
+        ("go, " * 19 + "on", "39 words and marks"),
+        ("go understandingly " * 9 + "on", "173 characters"),
         ("put the bowl, on the plate", "original"),
     ],
 )

@@ -1,4 +1,4 @@
-"""The fine-tuning manifest, and the clients' scripts: run as a user would, in stand-ins for the clients' checkouts.
+"""The fine-tuning recipe, and the clients' scripts: run as a user would, in stand-ins for the clients' checkouts.
 
 OpenVLA-OFT and openpi cannot be installed here. A stand-in has the names that the scripts touch, and a training script
 that writes down what it was given.
@@ -6,6 +6,7 @@ that writes down what it was given.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -16,13 +17,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from test_writers import REPO, write_lerobot
 
 from pipeline.errors import PipelineError
-from pipeline.publish import recipe
+from pipeline.publish.recipe import build, check, write
 from pipeline.publish.templates.lerobot_v3 import LeRobotV3
+from pipeline.publish.templates.run_openvla_oft import read_schedule, set_optimiser
 
 NAME = "libero_tiny"
 SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}
@@ -42,10 +45,10 @@ ROWS = [
 ]
 
 
-def build(folder: Path, name: str = NAME, rows: list[dict[str, Any]] = ROWS) -> dict[str, Any]:
+def tiny_recipe(folder: Path, name: str = NAME, rows: list[dict[str, Any]] = ROWS) -> dict[str, Any]:
     file = folder / "manifest.parquet"
     file.write_bytes(b"rows")
-    return recipe.build(file, rows, name=name, lerobot="tiny")
+    return build(file, rows, name=name, lerobot="tiny")
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +56,13 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run's data folder with a LeRobot dataset and what the recipe stage writes."""
     data = tmp_path_factory.mktemp("data")
     write_lerobot(data, name="tiny")
-    recipe.write(build(data), data / "lerobot" / "tiny", data / "finetune")
+    write(tiny_recipe(data), data / "lerobot" / "tiny", data / "finetune")
     return data
 
 
-def test_manifest_counts_what_was_kept(tmp_path: Path) -> None:
-    made = build(tmp_path)
-    dataset = {name: field["value"] for name, field in made["dataset"].items()}
+def test_recipe_counts_what_was_kept(tmp_path: Path) -> None:
+    recipe = tiny_recipe(tmp_path)
+    dataset = {name: field["value"] for name, field in recipe["dataset"].items()}
     assert (dataset["episodes"], dataset["steps"]) == (4, 400)
     assert dataset["episodes_by_suite_and_axis"] == {
         "libero_spatial": {"clean": 1, "camera": 2},
@@ -67,55 +70,55 @@ def test_manifest_counts_what_was_kept(tmp_path: Path) -> None:
     }
     assert dataset["suites"] == SUITES
     assert dataset["mixtures"] == {NAME: dict.fromkeys(sorted(SUITES.values()), 1.0)}
-    values = {name: field["value"] for name, field in made["recipe"].items()}
+    values = {name: field["value"] for name, field in recipe["training"].items()}
     assert values["effective_batch_size"] == values["gpus"] * values["batch_size_per_gpu"]
-    assert all(field["source"] for field in (*made["dataset"].values(), *made["recipe"].values()))
+    assert all(field["source"] for field in (*recipe["dataset"].values(), *recipe["training"].values()))
 
 
-def test_manifest_changes_with_the_dataset(tmp_path: Path) -> None:
+def test_recipe_changes_with_the_dataset(tmp_path: Path) -> None:
     (tmp_path / "other.parquet").write_bytes(b"other rows")
-    other = recipe.build(tmp_path / "other.parquet", ROWS, name=NAME, lerobot="tiny")
-    assert other["dataset"]["sha256"] != build(tmp_path)["dataset"]["sha256"]
+    other = build(tmp_path / "other.parquet", ROWS, name=NAME, lerobot="tiny")
+    assert other["dataset"]["sha256"] != tiny_recipe(tmp_path)["dataset"]["sha256"]
 
 
 @pytest.mark.parametrize("name", ["my_set", "libero_aloha"])
 def test_names_that_openvla_oft_takes_for_another_robot_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match=r"export\.rlds\.name"):
-        build(tmp_path, name=name)
+        tiny_recipe(tmp_path, name=name)
 
 
 def test_nothing_kept_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="no episode was kept"):
-        build(tmp_path, rows=[row("libero_10", "camera", kept=False)])
+        tiny_recipe(tmp_path, rows=[row("libero_10", "camera", kept=False)])
 
 
 @pytest.mark.parametrize(
     ("section", "field", "value"),
     [
-        ("recipe", "learning_rate", {"value": 0, "source": "x"}),
-        ("recipe", "weight_decay", {"value": 0.1}),
-        ("recipe", "schedule", {"value": "step", "source": "x"}),
+        ("training", "learning_rate", {"value": 0, "source": "x"}),
+        ("training", "weight_decay", {"value": 0.1}),
+        ("training", "schedule", {"value": "step", "source": "x"}),
         ("dataset", "sha256", {"value": "short", "source": "x"}),
         ("dataset", "extra", {"value": 1, "source": "x"}),
     ],
 )
 def test_schema_refuses(section: str, field: str, value: object, tmp_path: Path) -> None:
-    made = build(tmp_path)
-    made[section] = made[section] | {field: value}
+    recipe = tiny_recipe(tmp_path)
+    recipe[section] = recipe[section] | {field: value}
     with pytest.raises(PipelineError, match=field):
-        recipe.check(made, "finetune.yaml")
+        check(recipe, "finetune.yaml")
 
 
-def test_written_manifest_is_read_back_and_its_commands_can_be_copied(data: Path) -> None:
+def test_written_recipe_is_read_back_and_its_commands_can_be_copied(data: Path) -> None:
     text = (data / "finetune" / "finetune.yaml").read_text()
-    manifest = yaml.safe_load(text)
-    assert manifest == build(data)
-    assert all(client["command"] in text for client in manifest["clients"].values())
+    recipe = yaml.safe_load(text)
+    assert recipe == tiny_recipe(data)
+    assert all(client["command"] in text for client in recipe["clients"].values())
 
 
 def run(folder: Path, script: Path, *arguments: str) -> dict[str, Any]:
     """Run a client's script in a stand-in checkout; returns what its training script wrote down."""
-    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    environment = {**os.environ, "PYTHONPATH": str(folder), "HOME": str(folder / "home")}
     command = [sys.executable, str(script), *arguments]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -143,30 +146,60 @@ def libero_dataset_transform(trajectory): ...
 OXE_STANDARDIZATION_TRANSFORMS = {}
 """,
     f"{OFT_DATA}/oxe/mixtures.py": "OXE_NAMED_MIXTURES = {'bridge': [('bridge_orig', 1.0)]}",
+    f"{OFT_DATA}/dataset.py": f"""
+from {OFT_DATA.replace("/", ".")}.utils.data_utils import get_dataset_statistics
+def make_dataset_from_rlds(name, data_dir):
+    info, folder = "counts and sizes of " + name, data_dir + "/" + name + "/1.0.0"
+    return get_dataset_statistics([name], hash_dependencies=(info, "state"), save_dir=folder)
+""",
     f"{OFT_DATA}/utils/data_utils.py": """
-import json
+import hashlib, json, os
+def get_dataset_statistics(dataset, hash_dependencies, save_dir=None):
+    name = hashlib.sha256("".join(hash_dependencies).encode()).hexdigest()
+    path = os.path.join(save_dir, "dataset_statistics_" + name + ".json")
+    if not os.path.exists(path):
+        with open(path, "w") as file:
+            json.dump({"num_trajectories": len(dataset)}, file)
+    with open(path) as file:
+        return json.load(file)
 def save_dataset_statistics(statistics, folder):
     (folder / "dataset_statistics.json").write_text(json.dumps(statistics))
 """,
+    # Its loop counts, warms up and stops as OFT's does.
     "vla-scripts/finetune.py": f"""
 import json, sys
 from pathlib import Path
 import torch
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import MultiStepLR
+from {OFT_DATA.replace("/", ".")}.dataset import make_dataset_from_rlds
 from {OFT_DATA.replace("/", ".")}.oxe import configs, mixtures, transforms
 from {OFT_DATA.replace("/", ".")}.utils.data_utils import save_dataset_statistics
 
 if __name__ == "__main__":
-    optimizer = AdamW([torch.nn.Parameter(torch.zeros(1))], lr=5e-4)
-    scheduler = MultiStepLR(optimizer, milestones=[100000], gamma=0.1)
-    rates = []
-    for _ in range(500):
-        rates.append(optimizer.param_groups[0]["lr"])
+    arguments = {{}}
+    for word in " ".join(sys.argv[1:]).replace("=", " ").split():
+        if word.startswith("--"):
+            name = word
+        else:
+            arguments[name] = word
+    optimizer = AdamW([torch.nn.Parameter(torch.zeros(1))], lr=float(arguments["--learning_rate"]))
+    scheduler = MultiStepLR(optimizer, milestones=[int(arguments["--num_steps_before_decay"])], gamma=0.1)
+    warmup, steps = int(arguments["--lr_warmup_steps"]), int(arguments["--max_steps"])
+    step = int(arguments["--resume_step"]) if arguments.get("--resume") == "True" else 0
+    rates = {{}}
+    while step <= steps:
+        if warmup > 0:
+            for group in optimizer.param_groups:
+                group["lr"] = 5e-4 * (0.1 + 0.9 * min((step + 1) / warmup, 1.0))
+        rates[step] = optimizer.param_groups[0]["lr"]
+        optimizer.step()
         scheduler.step()
+        step += 1
+    make_dataset_from_rlds("{NAME}_10", arguments["--data_root_dir"])
     save_dataset_statistics({{"{NAME}_spatial": 1, "{NAME}_10": 2}}, Path("."))
     Path("seen.json").write_text(json.dumps({{
-        "arguments": dict(zip(sys.argv[1::2], sys.argv[2::2])),
+        "arguments": arguments,
         "weight_decay": optimizer.param_groups[0]["weight_decay"],
         "rates": rates,
         "configs": configs.OXE_DATASET_CONFIGS,
@@ -177,14 +210,21 @@ if __name__ == "__main__":
 }
 
 
-def test_openvla_oft_is_given_datasets_recipe_and_schedule(data: Path, tmp_path: Path) -> None:
-    checkout = stand_in(tmp_path / "oft", OFT)
+@pytest.fixture
+def trained(data: Path, tmp_path: Path) -> Path:
+    """A run's data folder of which the training steps of the recipe are few, with an empty RLDS dataset."""
     folder = tmp_path / "data" / "finetune"
     shutil.copytree(data / "finetune", folder)
     shorter = yaml.safe_load((folder / "finetune.yaml").read_text())
-    shorter["recipe"]["steps"]["value"], shorter["recipe"]["warmup_steps"]["value"] = 500, 100
+    shorter["training"]["steps"]["value"], shorter["training"]["warmup_steps"]["value"] = 500, 100
     (folder / "finetune.yaml").write_text(yaml.safe_dump(shorter))
-    seen = run(checkout, folder / "run_openvla_oft.py", "--dataset_name", f"{NAME}_spatial")
+    (folder.parent / "rlds" / f"{NAME}_10" / "1.0.0").mkdir(parents=True)
+    return folder.parent
+
+
+def test_openvla_oft_is_given_datasets_recipe_and_schedule(trained: Path, tmp_path: Path) -> None:
+    checkout = stand_in(tmp_path / "oft", OFT)
+    seen = run(checkout, trained / "finetune" / "run_openvla_oft.py", "--dataset_name", f"{NAME}_spatial")
     assert seen["mixtures"] == {
         "bridge": [["bridge_orig", 1.0]],
         NAME: [[f"{NAME}_10", 1.0], [f"{NAME}_spatial", 1.0]],
@@ -203,7 +243,7 @@ def test_openvla_oft_is_given_datasets_recipe_and_schedule(data: Path, tmp_path:
     assert given.items() <= arguments.items()
     assert arguments["--lr_warmup_steps"] == "0", "OFT's own warm-up would undo the cosine"
     assert seen["weight_decay"] == 0.1
-    rates = np.array(seen["rates"])
+    rates = np.array(list(seen["rates"].values()))
     assert np.allclose(rates[[0, 49, 99, 300]], [5e-6, 2.5e-4, 5e-4, 2.5e-4])
     assert rates[-1] < 1e-8
     assert (np.diff(rates[100:]) <= 0).all()
@@ -212,13 +252,47 @@ def test_openvla_oft_is_given_datasets_recipe_and_schedule(data: Path, tmp_path:
     assert (statistics["libero_spatial"], statistics["libero_10"]) == (1, 2)
 
 
-def test_scripts_say_where_to_call_them(data: Path, tmp_path: Path) -> None:
-    for script, where in (("run_openvla_oft.py", "a checkout of OpenVLA-OFT"), ("run_openpi.py", "scripts/train.py")):
-        command = [sys.executable, str(data / "finetune" / script)]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 1
-        assert where in done.stderr
-        assert "Traceback" not in done.stderr
+def test_openvla_oft_resumes_by_its_arguments_and_changes_no_file_of_the_run(trained: Path, tmp_path: Path) -> None:
+    checkout, script = stand_in(tmp_path / "oft", OFT), trained / "finetune" / "run_openvla_oft.py"
+    files = sorted(trained.rglob("*"))
+    words = ["--max_steps=900", "--lr_warmup_steps", "80", "--resume", "True", "--resume_step", "50"]
+    rates = {int(step): rate for step, rate in run(checkout, script, *words)["rates"].items()}
+    assert (min(rates), max(rates)) == (50, 900)
+    assert np.allclose([rates[50], rates[79], rates[490], rates[900]], [5e-4 * 51 / 80, 5e-4, 2.5e-4, 0])
+    assert sorted(trained.rglob("*")) == files
+    (statistics,) = (checkout / "home" / ".cache").rglob("dataset_statistics_*.json")
+    # Not by counts and sizes alone, which another export may share.
+    sha256 = tiny_recipe(tmp_path)["dataset"]["sha256"]["value"]
+    known_by = f"counts and sizes of {NAME}_10" + "state" + sha256
+    assert statistics.stem.endswith(hashlib.sha256(known_by.encode()).hexdigest())
+
+
+@pytest.mark.parametrize(
+    ("words", "first", "shares"),
+    [
+        ([], 0, {0: 0.05, 19: 1, 20: 1, 1010: 0.5, 2000: 0}),
+        (["--max_steps", "400"], 0, {0: 0.25, 3: 1, 4: 1, 202: 0.5, 400: 0}),
+        (["--max_steps=200", "--lr_warmup_steps=0"], 0, {0: 1, 100: 0.5, 200: 0}),
+        (["--max_steps", "1_000", "--lr_warmup_steps", "10"], 0, {0: 0.1, 9: 1, 10: 1, 505: 0.5, 1000: 0}),
+        (["--resume", "true", "--resume_step", "1010"], 1010, {1010: 0.5, 2000: 0}),
+        (["--resume=True", "--resume_step=4", "--max_steps=900"], 4, {4: 5 / 9, 8: 1, 9: 1, 900: 0}),
+        (["--resume", "False", "--resume_step", "300"], 0, {0: 0.05, 19: 1, 1010: 0.5, 2000: 0}),
+    ],
+)
+def test_the_rate_follows_steps_warm_up_and_resumption(
+    words: list[str], first: int, shares: dict[int, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module, name in ((torch.optim, "AdamW"), (torch.optim.lr_scheduler, "MultiStepLR")):
+        monkeypatch.setattr(module, name, getattr(module, name))  # restored after the test
+    set_optimiser(0.1, read_schedule(words, steps=2000, warmup_steps=20))
+    optimizer = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=5e-4)
+    scheduler = torch.optim.lr_scheduler.MultiStepLR(optimizer, milestones=[100_000], gamma=0.1)
+    rates = {}
+    for step in range(first, max(shares) + 1):
+        rates[step] = optimizer.param_groups[0]["lr"]
+        optimizer.step()
+        scheduler.step()
+    assert {step: rates[step] for step in shares} == pytest.approx({k: 5e-4 * v for k, v in shares.items()}, abs=1e-12)
 
 
 OPENPI = {
@@ -270,6 +344,29 @@ if __name__ == "__main__":
         "other": loader.create_data_loader(config.get_config("pi05_libero"), 10),
     }))
 """,
+    # Its types are resolved by name in the running script, as tyro does.
+    "scripts/serve_policy.py": """
+import dataclasses, json, pathlib, sys, typing
+import openpi.training.config as config
+@dataclasses.dataclass
+class Checkpoint:
+    config: str
+    dir: str
+@dataclasses.dataclass
+class Args:
+    policy: "Checkpoint | None" = None
+if __name__ == "__main__":
+    typing.get_type_hints(Args)
+    words = dict(word.split("=") for word in sys.argv[2:])
+    checkpoint = Checkpoint(words["--policy.config"], words["--policy.dir"])
+    chosen = config.get_config(checkpoint.config)
+    pathlib.Path("seen.json").write_text(json.dumps({
+        "mode": sys.argv[1],
+        "repo_id": chosen.data.repo_id,
+        "asset_id": chosen.data.assets.asset_id,
+        "dir": checkpoint.dir,
+    }))
+""",
 }
 
 
@@ -288,6 +385,19 @@ def test_openpi_is_given_configuration_dataset_and_statistics(data: Path, tmp_pa
         },
         "statistics": ["actions", "state"],
         "other": "openpi's own",
+    }
+
+
+def test_openpi_serves_what_was_trained_by_the_command_of_the_recipe(data: Path, tmp_path: Path) -> None:
+    command = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]["openpi_serve"]["command"]
+    runner, interpreter, script, *words = command.replace("$DATA", str(data)).removeprefix("uv ").split()
+    assert (runner, interpreter) == ("run", "python")
+    # The statistics of a checkpoint lie under the asset's name, as openpi stores them when it trains.
+    assert run(stand_in(tmp_path, OPENPI), Path(script), *words) == {
+        "mode": "policy:checkpoint",
+        "repo_id": "tiny",
+        "asset_id": "openpi_assets",
+        "dir": "checkpoints/pi05_tiny/tiny/29999",
     }
 
 

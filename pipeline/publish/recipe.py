@@ -1,4 +1,4 @@
-"""The fine-tuning manifest and, beside it, what OpenVLA-OFT, openpi and lerobot need to train on a run's datasets."""
+"""The fine-tuning recipe and, beside it, what OpenVLA-OFT, openpi and lerobot need to train on a run's datasets."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ COPIED = ("run_openvla_oft.py", "run_openpi.py", "lerobot_v3.py")
 PAPER = "LIBERO-Plus (arXiv:2510.13626), fine-tuning details"
 OFT = "OpenVLA-OFT's command for LIBERO (github.com/moojink/openvla-oft, LIBERO.md)"
 BOTH = f"{PAPER}; the same in {OFT}"
-MADE = "manifest.parquet of this run"
+MANIFEST = "manifest.parquet of this run"
 
 
 def sourced(value: Any, source: str) -> dict[str, Any]:
-    """A field of the fine-tuning manifest."""
+    """A field of the recipe."""
     return {"value": value, "source": source}
 
 
-RECIPE = {
+TRAINING = {
     "base_weights": sourced(
         "openvla/openvla-7b",
         OFT + "; LIBERO-Plus's repository names what came of it, openvla-7b-oft-finetuned-libero-plus-mixdata",
@@ -53,7 +53,9 @@ RECIPE = {
         "cosine_with_warmup",
         PAPER + "; OpenVLA-OFT has only a division by 10 after 100,000 steps: run_openvla_oft.py replaces it",
     ),
-    "warmup_steps": sourced(1000, "this project: 1 % of the steps, for want of a published length"),
+    "warmup_steps": sourced(
+        1000, "this project: 1 % of the steps, also of those that --max_steps gives, for want of a published length"
+    ),
     "images": sourced(len(SCHEMA.views), BOTH),
     "proprioception": sourced(True, BOTH),
     "action_head": sourced("l1_regression", BOTH),
@@ -65,7 +67,7 @@ RECIPE = {
 
 
 def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, lerobot: str) -> dict[str, Any]:
-    """The fine-tuning manifest of a run.
+    """The fine-tuning recipe of a run.
 
     Args:
         manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
@@ -91,58 +93,58 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, 
     for row in kept:
         by_axis = counts.setdefault(row["suite"], {})
         by_axis[row["axis"]] = by_axis.get(row["axis"], 0) + 1
-    made = {
+    recipe = {
         "name": name,
         "dataset": {
-            "sha256": sourced(hashlib.sha256(manifest_file.read_bytes()).hexdigest(), "hash of " + MADE),
-            "episodes": sourced(len(kept), MADE),
-            "steps": sourced(sum(row["steps"] for row in kept), MADE),
-            "episodes_by_suite_and_axis": sourced(counts, MADE),
-            "suites": sourced(suites, MADE + ": the RLDS dataset that holds each suite"),
+            "sha256": sourced(hashlib.sha256(manifest_file.read_bytes()).hexdigest(), "hash of " + MANIFEST),
+            "episodes": sourced(len(kept), MANIFEST),
+            "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
+            "episodes_by_suite_and_axis": sourced(counts, MANIFEST),
+            "suites": sourced(suites, MANIFEST + ": the RLDS dataset that holds each suite"),
             "mixtures": sourced(
                 {name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
                 "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
             ),
             "lerobot": sourced(lerobot, "the run's configuration, export.lerobot.name"),
         },
-        "recipe": RECIPE,
+        "training": TRAINING,
         "clients": _clients(name, lerobot),
     }
-    check(made, manifest_file)
-    return made
+    check(recipe, manifest_file)
+    return recipe
 
 
-def write(manifest: Mapping[str, Any], lerobot: Path, folder: Path) -> None:
+def write(recipe: Mapping[str, Any], lerobot: Path, folder: Path) -> None:
     """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``folder``.
 
     Args:
-        manifest: what ``build`` made.
+        recipe: what ``build`` returned.
         lerobot: root of the LeRobot dataset, whose actions and states are measured.
         folder: where to write; the scripts look for ``rlds`` and ``lerobot`` beside it.
     """
     columns = [SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key]
     table = pq.read_table(lerobot / "data", columns=columns)
     actions, states = (np.stack(table[column].to_numpy()) for column in columns)
-    with replaced(folder) as made:
-        (made / "openpi_assets").mkdir(parents=True)
-        (made / "openpi_assets" / "norm_stats.json").write_text(
+    with replaced(folder) as unfinished:
+        (unfinished / "openpi_assets").mkdir(parents=True)
+        (unfinished / "openpi_assets" / "norm_stats.json").write_text(
             json.dumps(motion_statistics.openpi(actions, states), indent=1) + "\n"
         )
         # One line for each field: a folded command could not be copied.
-        text = yaml.dump(dict(manifest), Dumper=_Dumper, sort_keys=False, width=10_000)
-        (made / "finetune.yaml").write_text(text)
+        text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
+        (unfinished / "finetune.yaml").write_text(text)
         for file in COPIED:
-            shutil.copyfile(TEMPLATES / file, made / file)
+            shutil.copyfile(TEMPLATES / file, unfinished / file)
 
 
-def check(manifest: Mapping[str, Any], where: object) -> None:
-    """Validate a fine-tuning manifest.
+def check(recipe: Mapping[str, Any], where: object) -> None:
+    """Validate a recipe.
 
     Raises:
         PipelineError: naming the first field that breaks ``schemas/finetune.json``.
     """
     validator = jsonschema.Draft202012Validator(json.loads(SCHEMA_FILE.read_text()))
-    if error := jsonschema.exceptions.best_match(validator.iter_errors(manifest)):
+    if error := jsonschema.exceptions.best_match(validator.iter_errors(recipe)):
         raise PipelineError(
             f"{'.'.join(map(str, error.path)) or 'top level'}: {error.message}",
             where=where,
@@ -169,14 +171,22 @@ def _clients(name: str, lerobot: str) -> dict[str, dict[str, str]]:
     return {
         "openvla_oft": {
             "where": "a checkout of github.com/moojink/openvla-oft, in its environment",
-            "command": "torchrun --standalone --nnodes 1 --nproc-per-node 8 $DATA/finetune/run_openvla_oft.py",
-            "source": "the recipe above; --dataset_name NAME trains on one suite, see dataset.suites",
+            "command": "WANDB_MODE=offline torchrun --standalone --nnodes 1 --nproc-per-node 8 "
+            "$DATA/finetune/run_openvla_oft.py",
+            "source": "training above; --dataset_name NAME trains on one suite, see dataset.suites; with an account, "
+            "--wandb_entity NAME --wandb_project NAME in place of WANDB_MODE=offline",
         },
         "openpi": {
             "where": "a checkout of github.com/Physical-Intelligence/openpi",
             "command": "uv run python $DATA/finetune/run_openpi.py scripts/train.py "
             f"pi05_{lerobot} --exp-name={lerobot}",
             "source": "openpi's configuration pi05_libero, with this dataset",
+        },
+        "openpi_serve": {
+            "where": "the checkout of openpi, after training",
+            "command": "uv run python $DATA/finetune/run_openpi.py scripts/serve_policy.py policy:checkpoint "
+            f"--policy.config=pi05_{lerobot} --policy.dir=checkpoints/pi05_{lerobot}/{lerobot}/29999",
+            "source": "openpi's command for serving a checkpoint; the last of pi05_libero's 30,000 steps is 29999",
         },
         "lerobot_act": {
             "where": "an environment with lerobot",

@@ -17,7 +17,7 @@ from pathlib import Path
 import yaml
 from pydantic import TypeAdapter, ValidationError
 
-from pipeline.axes.language import CLASSES, MAX_WORDS, MIN_WORDS, REMEDY, Bank, Component, lint, load_bank, normalise
+from pipeline.axes.language import CLASSES, LENGTH, REMEDY, Bank, Component, lint, load_bank, normalise
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.bddl import Fact, read
@@ -102,8 +102,8 @@ def prompt(told: Brief, component: Component, count: int, have: list[str], refus
             "Each rewrite must ask for exactly this and nothing more, must be natural, and must leave only one "
             "reading in this scene: the same thing, the same place, the same relation, the same order. "
             "Vary length and form from one to the next.",
-            f"Write them in lower case, letters only with , . ? ! ; : ' - between words, no digits, no underscores, no "
-            f"quotation marks, no full stop at the end, {MIN_WORDS} to {MAX_WORDS} words each.",
+            "Write them in lower case, letters only with , . ? ! ; : ' - between words, no digits, no underscores, no "
+            f"quotation marks, no full stop at the end; each has {LENGTH}.",
             *(["Do not repeat any of these:", *(f"- {text}" for text in have)] if have else []),
             *(
                 [f"Earlier answers were refused for: {'; '.join(reason for reason, _ in refused.most_common(5))}."]

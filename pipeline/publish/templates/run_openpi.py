@@ -1,8 +1,13 @@
-"""Fine-tune pi-0.5 on the LeRobot dataset beside this folder with openpi.
+"""Fine-tune pi-0.5 on the LeRobot dataset beside this folder with openpi, and serve it.
 
 Call it in a checkout of openpi, which stays as it is; NAME is the dataset's:
 
     uv run python DATA/finetune/run_openpi.py scripts/train.py pi05_NAME --exp-name=first
+
+It serves a checkpoint too, such as the last one of the training above:
+
+    uv run python DATA/finetune/run_openpi.py scripts/serve_policy.py policy:checkpoint --policy.config=pi05_NAME \\
+        --policy.dir=checkpoints/pi05_NAME/first/29999
 
 It adds the configuration ``pi05_NAME`` (openpi's own ``pi05_libero`` with this dataset), reads LeRobot v3.0, which
 openpi's lerobot cannot, and runs the script. Exact normalisation statistics lie in ``openpi_assets/``, so that

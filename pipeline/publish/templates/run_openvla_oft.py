@@ -2,23 +2,27 @@
 
 Call it in a checkout of OpenVLA-OFT, which stays as it is:
 
-    torchrun --standalone --nnodes 1 --nproc-per-node 8 DATA/finetune/run_openvla_oft.py
+    WANDB_MODE=offline torchrun --standalone --nnodes 1 --nproc-per-node 8 DATA/finetune/run_openvla_oft.py
 
-Further arguments go to OFT's ``vla-scripts/finetune.py`` and win over the recipe, such as
-``--dataset_name libero_perturbed_spatial`` for one suite, or ``--wandb_entity NAME``.
+OFT always logs to Weights & Biases; offline it needs no account. With one, give ``--wandb_entity NAME --wandb_project
+NAME`` instead. Further arguments go to OFT's ``vla-scripts/finetune.py`` and win over the recipe, such as
+``--dataset_name libero_perturbed_spatial`` for one suite, or ``--max_steps 20000``.
 
 What OFT has no flag for is done here: the datasets and their mixture are registered, AdamW gets the recipe's weight
 decay (OFT leaves PyTorch's 0.01), a cosine with warm-up takes the place of OFT's step (whose own warm-up would undo
-any later decay), and the statistics of a checkpoint are also named by suite, which is where OFT's evaluation looks.
+any later decay), the statistics of a checkpoint are also named by suite, which is where OFT's evaluation looks, and
+the statistics that OFT computes first are not written among the dataset's files.
 """
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import math
 import runpy
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +65,65 @@ def name_statistics_by_suite(suites: Mapping[str, str]) -> None:
     module.save_dataset_statistics = save_with_suites
 
 
-def set_optimiser(weight_decay: float, steps: int, warmup_steps: int) -> None:
+def keep_statistics_elsewhere(dataset_sha256: str) -> None:
+    """Have OFT's loader write ``dataset_statistics_<hash>.json`` to its cache folder: it would change the dataset's.
+
+    OFT takes the file for another run's where sizes and counts are the same, so the manifest's hash goes into its name.
+    """
+    # The module that calls the function; it has imported it by name.
+    module: Any = importlib.import_module(f"{DATASETS}.dataset")
+    compute = module.get_dataset_statistics
+    folder = Path.home() / ".cache" / "orca"  # where OFT itself writes when it may not write to the dataset
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def get_dataset_statistics(dataset: Any, hash_dependencies: tuple[str, ...], save_dir: object = None) -> Any:
+        return compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
+
+    module.get_dataset_statistics = get_dataset_statistics
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The learning rate: a linear warm-up, then a cosine that ends at 0 with the last step.
+
+    Attributes:
+        steps: OFT's ``--max_steps``, counted from the first run on where training is resumed.
+        warmup_steps: how many of them rise to the full rate.
+        first: the step that this run begins with.
+    """
+
+    steps: int
+    warmup_steps: int
+    first: int = 0
+
+    def share(self, step: int) -> float:
+        """The share of the full rate at a step of this run, the first of which is 0."""
+        step += self.first
+        if step < self.warmup_steps:
+            return (step + 1) / self.warmup_steps
+        done = (step - self.warmup_steps) / max(self.steps - self.warmup_steps, 1)
+        return (1 + math.cos(math.pi * min(done, 1.0))) / 2
+
+
+def read_schedule(words: Sequence[str], steps: int, warmup_steps: int) -> Schedule:
+    """The recipe's schedule, by the steps, the warm-up and the resumed step among OFT's arguments.
+
+    Args:
+        words: arguments of OFT's script.
+        steps: the recipe's, for want of ``--max_steps``.
+        warmup_steps: the recipe's; without ``--lr_warmup_steps`` the same share of ``--max_steps``.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--max_steps", type=int, default=steps)
+    parser.add_argument("--lr_warmup_steps", type=int)
+    parser.add_argument("--resume", type=yaml.safe_load, default=False)  # as OFT reads its booleans
+    parser.add_argument("--resume_step", type=int, default=0)
+    given, _ = parser.parse_known_args(words)
+    warmup = given.max_steps * warmup_steps // steps if given.lr_warmup_steps is None else given.lr_warmup_steps
+    return Schedule(given.max_steps, warmup, given.resume_step if given.resume else 0)
+
+
+def set_optimiser(weight_decay: float, schedule: Schedule) -> None:
     """Have OFT's script find the recipe's optimiser and schedule where it looks for ``AdamW`` and ``MultiStepLR``."""
     import torch  # takes seconds, which a call in the wrong folder need not wait for
 
@@ -69,40 +131,33 @@ def set_optimiser(weight_decay: float, steps: int, warmup_steps: int) -> None:
         def __init__(self, params: Any, lr: float) -> None:
             super().__init__(params, lr=lr, weight_decay=weight_decay)
 
-    def share(step: int) -> float:
-        if step < warmup_steps:
-            return (step + 1) / warmup_steps
-        done = (step - warmup_steps) / max(steps - warmup_steps, 1)
-        return (1 + math.cos(math.pi * min(done, 1.0))) / 2
-
     class Cosine(torch.optim.lr_scheduler.LambdaLR):
         def __init__(self, optimizer: torch.optim.Optimizer, **_: object) -> None:
-            super().__init__(optimizer, share)
+            super().__init__(optimizer, schedule.share)
 
     optim: Any = torch.optim
     optim.AdamW, optim.lr_scheduler.MultiStepLR = AdamW, Cosine
 
 
-def arguments(manifest: Mapping[str, Any]) -> list[str]:
+def arguments(recipe: Mapping[str, Any]) -> list[str]:
     """The recipe as arguments of OFT's script."""
-    recipe = {name: field["value"] for name, field in manifest["recipe"].items()}
+    training = {name: field["value"] for name, field in recipe["training"].items()}
     flags = {
-        "vla_path": recipe["base_weights"],
+        "vla_path": training["base_weights"],
         "data_root_dir": HERE.parent / "rlds",
-        "dataset_name": manifest["name"],
-        "batch_size": recipe["batch_size_per_gpu"],
-        "learning_rate": recipe["learning_rate"],
-        "lr_warmup_steps": 0,  # part of the schedule above
-        "num_steps_before_decay": recipe["steps"],
-        "max_steps": recipe["steps"],
-        "use_l1_regression": recipe["action_head"] == "l1_regression",
+        "dataset_name": recipe["name"],
+        "batch_size": training["batch_size_per_gpu"],
+        "learning_rate": training["learning_rate"],
+        "num_steps_before_decay": training["steps"],
+        "max_steps": training["steps"],
+        "use_l1_regression": training["action_head"] == "l1_regression",
         "use_diffusion": False,
         "use_film": False,
-        "num_images_in_input": recipe["images"],
-        "use_proprio": recipe["proprioception"],
-        "image_aug": recipe["image_augmentation"],
-        "lora_rank": recipe["lora_rank"],
-        "shuffle_buffer_size": recipe["shuffle_buffer"],
+        "num_images_in_input": training["images"],
+        "use_proprio": training["proprioception"],
+        "image_aug": training["image_augmentation"],
+        "lora_rank": training["lora_rank"],
+        "shuffle_buffer_size": training["shuffle_buffer"],
     }
     return [word for name, value in flags.items() for word in (f"--{name}", str(value))]
 
@@ -110,13 +165,19 @@ def arguments(manifest: Mapping[str, Any]) -> list[str]:
 def main() -> None:
     if not Path(SCRIPT).is_file():
         sys.exit(f"error: no {SCRIPT} in {Path.cwd()}\n  try: call this in a checkout of OpenVLA-OFT")
-    manifest = yaml.safe_load((HERE / "finetune.yaml").read_text())
-    recipe = manifest["recipe"]
+    recipe = yaml.safe_load((HERE / "finetune.yaml").read_text())
+    dataset, training = recipe["dataset"], recipe["training"]
+    given = sys.argv[1:]
     # OFT takes its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" among the arguments.
-    sys.argv = [SCRIPT, *arguments(manifest), *sys.argv[1:]]
-    register(manifest["dataset"]["mixtures"]["value"])
-    name_statistics_by_suite(manifest["dataset"]["suites"]["value"])
-    set_optimiser(recipe["weight_decay"]["value"], recipe["steps"]["value"], recipe["warmup_steps"]["value"])
+    # Of two values the last counts; a warm-up of OFT's own would undo the cosine, so there is none.
+    sys.argv = [SCRIPT, *arguments(recipe), *given, "--lr_warmup_steps", "0"]
+    register(dataset["mixtures"]["value"])
+    name_statistics_by_suite(dataset["suites"]["value"])
+    keep_statistics_elsewhere(dataset["sha256"]["value"])
+    set_optimiser(
+        training["weight_decay"]["value"],
+        read_schedule(given, training["steps"]["value"], training["warmup_steps"]["value"]),
+    )
     runpy.run_path(SCRIPT, run_name="__main__")
 
 
