@@ -1,4 +1,4 @@
-"""The dataset card: what a run's folder holds, told to whoever finds it on the hub."""
+"""The dataset card: it explains what a run's folder holds to readers who find it on the hub."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Format = Literal["rlds", "lerobot"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
-"""What the card tells from, beside the manifest; in the run's folder."""
+"""What the card is made from, besides the manifest; in the run's folder."""
 
 REPOSITORY = "OWNER/NAME"
 """Stands in a card for the repository, which is not known before the upload."""
@@ -46,7 +46,7 @@ def write(data: Path, lerobot: str) -> None:
         lerobot: name of the LeRobot dataset.
 
     Raises:
-        PipelineError: when something it tells of is missing, or nothing was kept.
+        PipelineError: when something that it describes is missing, or nothing was kept.
     """
     missing = [name for name in (*REPORTS, "manifest.parquet", "finetune/finetune.yaml") if not (data / name).is_file()]
     if missing:
