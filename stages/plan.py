@@ -15,8 +15,8 @@ def run(config: Config) -> None:
     rows = plan.make(index.entries, config.plan, config.replay, benchmark.load())
     for axis, number in plan.shortage(rows, config.plan).items():
         print(
-            f"{axis}: {number} of {config.plan.episodes[axis]} wanted episodes cannot be planned, for want of "
-            "different draws; use more demonstrations or ask for fewer",
+            f"{axis}: {number} of {config.plan.episodes[axis]} wanted episodes cannot be planned, as no more "
+            "different draws are left; use more demonstrations or ask for fewer",
             file=sys.stderr,
         )
     plan.write(rows, config.data / "plan.parquet")

@@ -21,7 +21,7 @@ def run(config: Config) -> None:
             f"{first['what']}; findings in all: {', '.join(f'{check} {len(found)}' for check, found in off.items())}",
             where=f"{first['dataset']} {first['episode'] or ''}".strip(),
             expected=first["expected"],
-            remedy=f"read {file}, mend the cause, and run `dvc repro` again",
+            remedy=f"read {file}, correct the cause, and run `dvc repro` again",
         )
     print(f"{len(report)} checks found nothing off, see {file}")
 

@@ -47,7 +47,7 @@ _LIST = TypeAdapter(tuple[AnyPerturbation, ...])
 class Axes(Frozen):
     """The axes that a run draws from; an axis left out is not drawn.
 
-    They stand in the order in which their perturbations apply, deepest layer first. Objects are added where a
+    They are listed in the order in which their perturbations apply, deepest layer first. Objects are added where a
     demonstration's scene leaves room, then the target and the arm move, and are refused where they meet an object.
     """
 

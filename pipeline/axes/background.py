@@ -50,7 +50,7 @@ class Covering(Frozen):
     """A texture on one part of the scene.
 
     Attributes:
-        part: where; a part that the scene lacks is passed over.
+        part: where; a part that the scene does not have is left out.
         texture: name in the sources of :mod:`pipeline.catalogue.textures`.
         licence: as the texture's source states it.
         sha256: of the texture.

@@ -3,7 +3,7 @@
 An axis comes as a pair of small frozen models in one file:
 
 * ``XAxis`` is the axis as configured, its ranges, and draws: ``sample(rng, task, place) -> XPerturbation``.
-  Each demonstration counts its draws from a place of its own, for axes that deal from a list.
+  Each demonstration numbers its draws from a start of its own, for axes that take the entries of a list in turn.
 * ``XPerturbation`` is one drawn change with every parameter, and acts: ``apply(...)`` on what its layer
   touches (text: the instruction; pixels: a clean frame; render and physics: the MuJoCo model).
 """
@@ -150,10 +150,10 @@ class PhysicsPerturbation(Perturbation):
         Args:
             scene: what the perturbation changes.
             demo: the demonstration.
-            roll_out: tells where the demonstration's actions lead from a scene; costs a whole replay.
+            roll_out: gives the states that the demonstration's actions lead to from a scene; costs a whole replay.
 
         Raises:
-            RefusedError: when the change cannot be made here; its reason ends in the manifest.
+            RefusedError: when the change cannot be made here; its reason is written into the manifest.
         """
         raise NotImplementedError
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Component = Literal["distance", "spherical", "orientation"]
 
 ORBIT_CENTRE_M = np.array([0.0, 0.0, 0.8])
-"""World point that LIBERO-Plus turns and dollies the camera about, the same for every arena
+"""World point about which LIBERO-Plus turns the camera and scales its distance, the same for every arena
 (`Problem._setup_camera` of LIBERO-Plus)."""
 
 STEEPEST_DEG = 60.5
@@ -31,8 +31,8 @@ degree of azimuth spans the least of the sphere, so what is clear of the test ca
 class CameraPerturbation(RenderPerturbation):
     """A new pose for the agent view, relative to the scene's own.
 
-    The order is LIBERO-Plus's: elevate about the orbit centre, turn about the world's z axis, dolly along the ray
-    to the orbit centre, then yaw and pitch in place. Unlike there, nothing is rounded on the way.
+    The order is LIBERO-Plus's: elevate about the orbit centre, turn about the world's z axis, move along the ray
+    to the orbit centre, then yaw and pitch in place. Unlike LIBERO-Plus, no step is rounded.
 
     Attributes:
         azimuth_deg: counter-clockwise turn about the world's z axis.
@@ -42,10 +42,10 @@ class CameraPerturbation(RenderPerturbation):
         pitch_deg: turn in place about the world's y axis; positive looks further down.
 
     The paper keeps training cameras 5 degrees from test cameras on the sphere. Two cameras can also stand on one ray
-    from the orbit centre: the test set's dollies and turns in place all do. So the distance between two cameras is the
-    largest of three angles, and is zero only for the same picture: the one between their rays; the one between their
-    turns in place; and the logarithm of the ratio of their distances read as radians, because along the ray it moves
-    a camera by as much as the angle does across it (5 degrees are a ratio of 1.091).
+    from the orbit centre: the test set's changes of distance and turns in place all do. So the distance between two
+    cameras is the largest of three angles, and is zero only for the same picture: the one between their rays; the one
+    between their turns in place; and the logarithm of the ratio of their distances read as radians, because along the
+    ray it moves a camera by as much as the angle does across it (5 degrees are a ratio of 1.091).
     """
 
     axis: Literal["camera"] = "camera"
@@ -139,9 +139,9 @@ def _both_ways(low: float, high: float) -> Intervals:
 
 
 class DistanceRange(Frozen):
-    """The defaults come closer by up to a quarter, where the nearest objects still stand in the frame.
+    """The defaults come closer by up to a quarter, where the nearest objects are still in the frame.
 
-    Scales above 2.183 are clear of the test set too, but the orbit centre hangs so far above the floor arena that its
+    Scales above 2.183 are clear of the test set too, but the orbit centre is so far above the floor arena that its
     objects leave the frame.
     """
 
@@ -157,7 +157,7 @@ class DistanceRange(Frozen):
 class SphericalRange(Frozen):
     """The defaults pass below, between and above the test set's elevations, 0 and 15.
 
-    The lower the camera, the more a cabinet hides of what stands behind it, hence at most 10 degrees down.
+    The lower the camera, the more a cabinet hides of what is behind it, hence at most 10 degrees down.
     """
 
     azimuth_deg: ByLevel = (
@@ -203,8 +203,8 @@ class CameraAxis(Axis):
     """The ranges to draw from; the defaults keep clear of LIBERO-Plus's test cameras.
 
     The test set moves on azimuths of whole degrees in [-75, 75] at elevations 0 and 15, at distance scales
-    1.15 to 2.00, and turns in place by 2 to 10 degrees about both axes at once. What the defaults show was looked at
-    in all five arenas.
+    1.15 to 2.00, and turns in place by 2 to 10 degrees about both axes at once. The pictures of the
+    defaults were checked by eye in all five arenas.
     """
 
     distance: DistanceRange | None = DistanceRange()

@@ -1,11 +1,11 @@
 """Language: the instruction reworded; the demonstration and its frames stay as they are.
 
-How far two wordings are apart is their normalised edit distance: the fewest characters to insert, delete or replace
+The distance of two wordings is their normalised edit distance: the fewest characters to insert, delete or replace
 to turn one into the other, by the length of the longer, both without case and punctuation.
 
 The rewrites live in ``language_bank.yaml``, one list for each task and class. All are lower-case ASCII without a
 final full stop, as LIBERO's own instructions are, each keeps one reading among the objects of its scene, and each
-keeps the goal as far as ``language_goal.py`` can tell.
+keeps the goal as far as ``language_goal.py`` can check.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
 CLASSES: tuple[Component, ...] = get_args(Component)
 NAMED: tuple[Component, ...] = ("distraction", "paraphrase")
-"""The classes that call all things and places of the goal by their names; the others may tell them by what one knows
-of them, or by exclusion (``the only dairy product``), which holds for the task's own objects and no more."""
+"""The classes that call all things and places of the goal by their names; the others may describe them by what one
+knows of them, or by exclusion (``the only dairy product``), which holds for the task's own objects and no more."""
 
 Bank = dict[str, dict[str, dict[Component, tuple[str, ...]]]]
 """Suite to task name to class to rewrites."""
@@ -118,7 +118,7 @@ class LanguageAxis(Axis):
         return self.model_copy(update={"classes": classes})
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
-        """The rewrite at ``place`` of the task's deal, which starts again once the bank is exhausted.
+        """The rewrite at ``place`` of the task's list, which starts again once all were drawn.
 
         Independent draws would repeat, so neighbouring places are different wordings and ``rng`` is left alone.
 
@@ -198,7 +198,7 @@ def level_of(text: str, original: str) -> Level:
 
 
 def normalise(text: str) -> str:
-    """``text`` without case, punctuation and surplus white space: what two wordings are compared by."""
+    """``text`` without case, punctuation and repeated white space: what two wordings are compared by."""
     return " ".join(re.sub(r"[^a-z0-9]+", " ", text.lower().replace("'", "")).split())
 
 
@@ -238,7 +238,7 @@ def _test_wordings(test: TestSet, task: Task) -> tuple[NDArray[np.uint8], ...]:
 
 
 def lint(text: str, task: Task, component: Component) -> str | None:
-    """The reason why ``text`` cannot stand in for the task's instruction; None when it can.
+    """The reason why ``text`` cannot replace the task's instruction; None when it can.
 
     Raises:
         PipelineError: when the task's BDDL file cannot be read.

@@ -1,10 +1,10 @@
 """Whether a rewrite keeps the goal of its task: what is moved, where to, how it then stands, what is opened or lit.
 
 The goal is that of the BDDL file, the words for it are those of ``language_words.yaml``. No grammar is parsed: each
-thing and each place must be called by a word that nothing else in the scene shares, the relation is told by the words
+thing and each place must be called by a word that nothing else in the scene shares, the relation is given by the words
 right before a place, and where two things go to different places, the first goes to the first. What LIBERO's own
-wording does not tell by these words is not asked of a rewrite. So a changed goal is found, in plain words and in
-riddles; whether a riddle has one solution only is for its writer to see to.
+wording does not say by these words is not asked of a rewrite. So a changed goal is found, where things are named and
+where they are described; whether a description fits one thing only must be checked by its writer.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pipeline.libero.task_goal import Aim, TaskGoal, read_goal
 from pipeline.types import Task
 
 SIDES = ("front", "left", "right")
-"""Relations that may be told without a word for the place, as in ``to its right``."""
+"""Relations that may be given without a word for the place, as in ``to its right``."""
 
 UNTOLD = frozenset({"to", None})
 """What leaves the relation open: ``bring it to the basket``, ``the basket should have it``."""
 
 WAYS = frozenset({"on", "in", "off", "to", None})
-"""Relations that tell no place where they are followed by another: ``hold it over the basket and let it in``."""
+"""Relations that name no place where they are followed by another: ``hold it over the basket and let it in``."""
 
 DRAWERS = frozenset({"top", "middle", "bottom"})
 
@@ -54,7 +54,7 @@ class Mention(NamedTuple):
 
 
 class Reading:
-    """What an instruction tells, as far as the words go.
+    """What an instruction says, by its words alone.
 
     Attributes:
         plain: the text in lower case, without hyphens and apostrophes.
@@ -87,7 +87,7 @@ class Reading:
         return pattern(tuple(patterns)).search(self.plain) is not None
 
     def tells(self, kind: str, moved: frozenset[str]) -> bool:
-        """Whether a word tells this kind from all others in the scene, or both that are moved from the rest."""
+        """Whether a word fits this kind and no other in the scene, or both that are moved and no other."""
         together = moved if kind in moved and self.has(words().both) else frozenset()
         return any(kind in mention.kinds and {*mention.kinds} <= together | {kind} for mention in self.mentions)
 
@@ -129,7 +129,7 @@ class Reading:
 
 
 class Demand(NamedTuple):
-    """Something that a rewrite has to tell, and the fault where it does not."""
+    """Something that a rewrite has to say, and the fault where it does not."""
 
     fault: str
     met: Callable[[Reading], bool]
@@ -141,7 +141,7 @@ def changed_goal(text: str, task: Task, hints: bool) -> str | None:
     Args:
         text: the rewrite.
         task: whose goal.
-        hints: whether things may be told by what one knows of them, and a drawer by exclusion; else by name only.
+        hints: whether things may be described by what one knows of them, and a drawer by exclusion; else by name only.
 
     Raises:
         PipelineError: when the task's BDDL file cannot be read.
@@ -182,7 +182,7 @@ def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
 
 
 def _relation(aim: Aim, goal: TaskGoal, original: Reading) -> Callable[[Reading], bool]:
-    """The demand for an aim's relation, in LIBERO's wording too: what is on a bowl lies in it; a start is left."""
+    """The demand for an aim's relation, in LIBERO's wording too: what is on a bowl is in it; a start is left."""
     same_place = [one.relation for one in (*goal.aims, *goal.starts) if one.place == aim.place and one != aim]
     others = frozenset(relation for relation in same_place if relation)
     worded = {one.relation for one in original.mentions if one.relation and aim.place in one.kinds} - others

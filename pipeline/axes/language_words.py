@@ -20,7 +20,7 @@ Entries = Annotated[tuple[str, ...], BeforeValidator(lambda listed: re.split(r",
 
 
 class Thing(Frozen):
-    """What a kind of thing is called, and what else it can be told by."""
+    """What a kind of thing is called, and how else it can be described."""
 
     names: Entries
     hints: Entries

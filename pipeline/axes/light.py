@@ -40,9 +40,9 @@ class LightPerturbation(RenderPerturbation):
     Attributes:
         diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel.
         specular_scale: multiple of each lamp's specular colour.
-        orbit_deg: every lamp is carried about the world's z axis, counter-clockwise, with what it points at.
+        orbit_deg: every lamp is moved around the world's z axis, counter-clockwise, and turned with that.
         tilt_deg: every lamp is turned in place by so much,
-        tilt_azimuth_deg: towards this direction of the compass (0 is the world's x axis, 90 its y axis).
+        tilt_azimuth_deg: towards this horizontal direction (0 is the world's x axis, 90 its y axis).
         shadows: whether lamps cast shadows.
         fill_scale: share of the lamps' diffuse light that reaches into shadows.
     """
@@ -82,7 +82,7 @@ class LightPerturbation(RenderPerturbation):
             _limit(model.light_diffuse, model.light_directional, SHADOWED_DIFFUSE)
             _limit(model.light_specular, model.light_directional, SHADOWED_SPECULAR)
             model.light_diffuse *= 1 - self.fill_scale
-            # In MuJoCo a lamp's ambient light stops at shadows, the glow of what it falls on does not. A third of what
+            # In MuJoCo a lamp's ambient light stops at shadows, the emission of a surface does not. A third of what
             # is taken from the lamps: with more, walls outshine the table, with less, all darkens.
             model.mat_emission += self.fill_scale * SHADOWED_DIFFUSE / 3
 
@@ -97,7 +97,7 @@ class LightRange(Frozen):
     Attributes:
         brightness_scale: multiple of the diffuse light, or else
         saturation: the diffuse light is tinted so much, in any hue: 0 leaves white, 1 is a pure colour.
-        specular_scale: multiple of the specular light. The gentlest property by far: LIBERO's floors have no gloss, and
+        specular_scale: multiple of the specular light. The weakest property by far: LIBERO's floors have no gloss, and
             one-pass lighting cuts highlights off at the colour of the surface.
         orbit_deg: how far about the vertical lamps are carried, to either side.
         tilt_deg: how far lamps are turned in place, towards any side.

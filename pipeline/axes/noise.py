@@ -64,7 +64,7 @@ class NoisePerturbation(PixelPerturbation):
         """The distance to the nearest test severity of the same component, whatever its task: 0.5 is half way.
 
         The clearance keeps to the middle half between two severities. The parameters that do not set the strength
-        are not looked at, so an equal strength counts as equal.
+        are not compared, so an equal strength counts as equal.
         """
         name, clean = self.effect.strength
         tested, compared = _tested(test, self.component, name)
@@ -72,7 +72,7 @@ class NoisePerturbation(PixelPerturbation):
             return Nearest(math.inf, 0)
         steps = (clean, *tested)
         value = float(getattr(self.effect, name))
-        # Beyond the strongest severity the last step goes on.
+        # Beyond the strongest severity the last step is continued.
         upper = min(max(bisect.bisect_left(steps, value), 1), len(tested))
         severity = upper - (steps[upper] - value) / (steps[upper] - steps[upper - 1])
         return Nearest(abs(severity - min(max(round(severity), 1), len(tested))), compared)

@@ -28,10 +28,10 @@ DEEPER_M = 0.001
 """How much deeper than recorded a moved object may sit in what it touches, such as the wall of its drawer."""
 
 CREEP_M, CREEP_DEG = 0.002, 2.0
-"""How much farther than the recorded object a moved one may slide and tilt until it rests."""
+"""How much farther than the recorded object a moved one may slide and tilt until it stops."""
 
 NEXT_TO_M = 0.17
-"""Distance of centres up to which things stand next to each other; LIBERO has them 0.12 to 0.13 m apart."""
+"""Distance of centres up to which things stand next to each other; in LIBERO it is 0.12 to 0.13 m."""
 
 BETWEEN = 0.25
 """Share of the way between two things that still counts as at one of them, and as beside the line between them."""
@@ -206,7 +206,7 @@ def _relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> b
 
 
 class PoseAxis(Axis):
-    """Displacements in all directions alike, and turns either way.
+    """Displacements in all directions with equal chance, and turns to both sides.
 
     At level k the displacement is k - 1 to k times ``step_m``, uniform over the ring, and the turn k - 1 to k times
     ``step_deg``. Where there are several objects to choose from, one is drawn.

@@ -96,7 +96,7 @@ def benchmark_offsets_rad() -> Floats:
 
 
 class RobotAxis(Axis):
-    """Offsets in all directions alike.
+    """Offsets in all directions with equal chance.
 
     Attributes:
         norm_rad: the norm of the offset at each level; the defaults are the benchmark's.

@@ -1,4 +1,4 @@
-"""What the sources of a run's textures and objects hold, and to whom its episodes owe what they show."""
+"""What the sources of a run's textures and objects hold, and who made the ones that its episodes show."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The dataset card: what a run's folder holds, told to whoever finds it on the hub."""
+"""The dataset card: it explains what a run's folder holds to readers who find it on the hub."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from pipeline.publish.yields import LEVELS
 from pipeline.run import manifest
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
-"""What the card tells from, beside the manifest; in the run's folder."""
+"""What the card is made from, besides the manifest; in the run's folder."""
 
 REPOSITORY = "OWNER/NAME"
 """Stands in a card for the repository, which is not known before the upload."""
@@ -47,7 +47,7 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
         name: what all of them together are called.
 
     Raises:
-        PipelineError: when something it tells of is missing, or nothing was kept.
+        PipelineError: when something that it describes is missing, or nothing was kept.
     """
     missing = [name for name in (*REPORTS, "manifest.parquet", "finetune/finetune.yaml") if not (data / name).is_file()]
     if missing:

@@ -1,4 +1,4 @@
-"""Pictures and short videos as ``data:`` addresses, small enough to lie within a page."""
+"""Pictures and short videos as ``data:`` addresses, small enough to be part of a page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a run's draws lie, and where the benchmark's test parameters lie, axis by axis, as panels."""
+"""Panels that show, for each axis, the parameters that a run drew and those of the benchmark's test tasks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Draw(NamedTuple):
     Attributes:
         task: the episode's.
         made: what was drawn.
-        resolved: what it came to in the scene, None where nothing was recorded.
+        resolved: what it did in the scene, None where nothing was recorded.
     """
 
     task: Task

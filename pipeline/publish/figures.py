@@ -1,4 +1,4 @@
-"""Small plots as inline SVG: one panel each, as wide as a phone, in the ink of the page around them.
+"""Small plots as inline SVG: one panel each, as wide as a phone's screen, in the colour of the page's text.
 
 A page lays panels out as its width allows. Text stays text, and whatever is drawn in ``INK`` takes the page's own
 colour, so that one figure reads in light and in dark.
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 Values = NDArray[Any]
 Groups = Mapping[str, Values]
-"""What is drawn in one colour, by name; those of ``REFERENCES`` lie behind the others, in grey."""
+"""What is drawn in one colour, by name; those of ``REFERENCES`` are drawn behind the others, in grey."""
 
 REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
@@ -56,7 +56,7 @@ STYLE: Any = {
 }
 WIDTH_IN, HEIGHT_IN = 3.4, 2.3
 SMALLEST_SHARE = 1e-4
-"""Where a logarithmic scale of shares begins, in all figures alike."""
+"""Where a logarithmic scale of shares begins, the same in all figures."""
 
 DOTS_DPI = 220
 """Clouds of points are pictures within the SVG: a thousand circles would be a hundred times the bytes."""
@@ -123,7 +123,7 @@ def scatter(title: str, groups: Groups, x_label: str, y_label: str, equal: bool 
 
 
 def _dots(axes: Axes, x: Values, y: Values, group: str, behind: bool) -> None:
-    # Of many points the density is to be seen.
+    # Of many points the density should be visible.
     opacity = (0.4 if behind else 0.85) * min(1.0, max(0.1, 500 / max(1, len(x))))
     size_pt2 = 9 if behind else 15
     axes.scatter(x, y, s=size_pt2, color=colour(group), alpha=opacity, linewidths=0, rasterized=True)
@@ -138,7 +138,7 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
                 alone = len(groups) == 1
                 behind = name in REFERENCES and not alone
                 middle = height + (0.0 if alone else 0.2 if behind else -0.2)
-                # Equal values stand beside each other.
+                # Equal values are drawn beside each other.
                 ordered = np.sort(values)
                 spread = 0.16 * np.sin(2.4 * (np.arange(len(ordered)) - np.searchsorted(ordered, ordered)))
                 _dots(axes, ordered, middle + spread, name, behind)
@@ -149,7 +149,7 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
         drawn = np.concatenate([values for groups in rows.values() for values in groups.values()])
         axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((drawn == drawn.round()).all())))
         if len(drawn) and drawn.min() == drawn.max():
-            # A scale about one value would run in thousandths.
+            # A scale around one single value would show thousandths.
             axes.set_xlim(drawn[0] - 1, drawn[0] + 1)
 
     lines = max(1 + name.count("+") for name in rows)

@@ -1,4 +1,4 @@
-"""The report of a run: one HTML page with its counts, plots, pictures and videos, that needs nothing beside itself."""
+"""The report of a run: one HTML page with its counts, plots, pictures and videos, that needs no other file."""
 
 from __future__ import annotations
 

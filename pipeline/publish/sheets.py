@@ -23,12 +23,12 @@ UNSHOWN = {"sha256", "licence", "attribution", "category"}
 """Parameters that captions leave out."""
 
 LONGEST_CAPTION = 10
-"""Lines; what does not fit is cut off, the manifest has it in full."""
+"""Lines; what does not fit is left out; the manifest has the full text."""
 
 PAIR_SIDE_PX = 192
 HEADER = "in each pair: the clean twin on the left, the perturbed episode on the right"
 MOMENT = 0.35
-"""Share of the episode after which it is shown: the arm is in view and the objects still stand apart."""
+"""Share of the episode after which it is shown: the arm is in view and the objects have not been moved together yet."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ HASHED_BYTES = 16_000_000
 
 
 def listing(config: Config) -> dict[str, list[str | int]]:
-    """Path of each file that the configuration's paths lead to, and what tells whether it has changed."""
+    """Path of each file that the configuration's paths lead to, and what shows whether it has changed."""
     files = sorted({file for path in _paths(dict(config)) for file in _files(path)})
     return {str(file): _state(file) for file in files}
 
@@ -48,7 +48,7 @@ def _paths(value: Any) -> Iterator[Path]:
 
 def _files(path: Path) -> Iterator[Path]:
     if path.is_dir():
-        # Hidden files are notes of downloads.
+        # Hidden files are records that downloads leave.
         yield from (
             file
             for file in path.rglob("*")

@@ -1,7 +1,7 @@
 """The report that a plan keeps clear of the benchmark's test tasks.
 
 Every perturbation is read back from the plan as it was recorded and compared anew, whatever the planner thought. A row
-with several counts for each of its axes: the benchmark perturbs one at a time, but each part must keep clear by itself.
+with several counts for each of its axes: the benchmark perturbs one at a time, but each part must keep its clearance.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class AxisDistance:
         rows: planned episodes that the axis perturbs, reserves among them.
         test_tasks: the benchmark's tasks of this axis.
         comparisons: pairs of an episode and a test task that were compared.
-        smallest: the least distance of all; None when there was nothing to compare with, or nothing at all alike.
+        smallest: the least distance of all; None when there was nothing to compare with, or nothing similar.
         closest: the episode it belongs to.
         clearance: the least distance that is allowed.
         measure: what the distance is and its unit.

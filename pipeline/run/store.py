@@ -1,4 +1,4 @@
-"""A folder of HDF5 files, one for each trajectory, and the table that tells what is in them.
+"""A folder of HDF5 files, one for each trajectory, and the table that says what is in them.
 
 A file is whole or not there, and named after what it holds, so that a changed plan never picks up a file that was made
 for something else, and still finds every file that it shares with the plan before it.

@@ -27,7 +27,7 @@ class TrajectoryStore(Store):
     """Trajectories under one folder.
 
     The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (how the actions came about), ``steps``
-    (how many were executed) and ``resolved`` (JSON of what physics perturbations came to).
+    (how many were executed) and ``resolved`` (JSON of what physics perturbations did in the scene).
     """
 
     def __init__(self, root: Path):
