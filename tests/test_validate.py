@@ -205,6 +205,8 @@ def test_planted_faults_stop_the_run_and_nothing_else_is_found(
     index = {names[row["episode_id"]]: row["lerobot_episode_index"] for row in rows if row["kept"]}
     spoil_lerobot(data / "lerobot" / "tiny", index)
     spoil_manifest(data, rows, other)
+    killed = data / ".work" / "validate" / "of a killed run"
+    killed.mkdir(parents=True)
     with pytest.raises(AssertionError, match=r"(?s)findings in all: counts 1, .*try: read data/tiny/validation\.json"):
         run_stages(tmp_path, tiny_config(short_demos) | {"compute": {"cluster": "loop"}}, ["validate"])
     report = json.loads((data / "validation.json").read_text())
@@ -214,6 +216,7 @@ def test_planted_faults_stop_the_run_and_nothing_else_is_found(
         for finding in result["findings"]
     }
     assert found == EXPECTED
+    assert not (data / ".work").exists()
 
 
 def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory]) -> None:

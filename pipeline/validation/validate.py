@@ -81,7 +81,7 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
         job = EpisodesJob(config, data, opened, cache, frozenset(witnesses(rows)))
         # Episodes that lie together are read together.
         columns = [column.name for one in opened for column in one.columns]
-        ordered = sorted(kept.values(), key=lambda row: [row[column] for column in columns])
+        ordered = sorted(kept.values(), key=lambda row: [str(row[column]) for column in columns])
         slices = [ordered[start : start + SLICE] for start in range(0, len(ordered), SLICE)]
         for outcome in run(job, slices, "validate"):
             total.add(outcome)
