@@ -1,0 +1,27 @@
+"""The one build step that cannot be written in pyproject.toml: ``schemas/`` is installed inside of the library."""
+
+from pathlib import Path
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+SCHEMAS = [str(file) for file in sorted(Path("schemas").glob("*.json"))]
+
+
+class BuildWithSchemas(build_py):
+    """Copies the schemas to where ``pipeline.files.schema_file`` looks first."""
+
+    def run(self) -> None:
+        super().run()
+        if not self.editable_mode:
+            folder = Path(self.build_lib, "pipeline", "schemas")
+            self.mkpath(str(folder))
+            for file in SCHEMAS:
+                self.copy_file(file, str(folder))
+
+    def get_source_files(self) -> list[str]:
+        """What a source distribution has to hold."""
+        return [*super().get_source_files(), *SCHEMAS]
+
+
+setup(cmdclass={"build_py": BuildWithSchemas})
