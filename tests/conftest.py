@@ -99,7 +99,7 @@ def tiny_config(demos: Path) -> dict[str, object]:
 
 
 STAGES = (
-    *("plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest"),
+    *("inputs", "plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest"),
     *("validate", "recipe", "summary", "card", "report"),
 )
 
@@ -145,7 +145,7 @@ def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = 
 def finished(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The data folder of a finished ``dvc repro`` in a copy of the repository, on a configuration of its own."""
     clone = tmp_path_factory.mktemp("clone")
-    for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml", ".dvcignore"):
+    for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml", "requirements.lock", ".dvcignore"):
         source = REPOSITORY / name
         (shutil.copytree if source.is_dir() else shutil.copy)(source, clone / name)
     (clone / "configs").mkdir()
