@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import re
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,6 +17,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from conftest import REPOSITORY as REPOSITORY_FOLDER
 from conftest import served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from test_writers import SET, write_lerobot, write_rlds
@@ -414,9 +416,19 @@ def test_refuses(data: Path, spoil: Callable[[Path], None], complaint: str) -> N
         prepare(data, "lerobot")
 
 
-def test_refuses_what_training_left_in_rlds(data: Path) -> None:
-    (data / "rlds" / SET / "1.0.0" / "dataset_statistics_0123.json").write_text("{}")
-    with pytest.raises(PipelineError, match=r"not of the dataset.*dataset_statistics_0123") as caught:
+def test_passes_by_the_statistics_that_openvla_oft_leaves_in_rlds(data: Path) -> None:
+    files = prepare(data, "rlds").files
+    statistics = f"{SET}/1.0.0/dataset_statistics_{'0a' * 32}.json"
+    (data / "rlds" / statistics).write_text("{}")
+    assert prepare(data, "rlds").files == files
+    # Nor does DVC see a changed output.
+    command = ["dvc", "check-ignore", f"data/starter/rlds/{statistics}"]
+    assert subprocess.run(command, cwd=REPOSITORY_FOLDER, check=False, capture_output=True).returncode == 0
+
+
+def test_refuses_what_else_training_left_in_rlds(data: Path) -> None:
+    (data / "rlds" / SET / "1.0.0" / "loss.csv").write_text("1,2")
+    with pytest.raises(PipelineError, match=r"not of the dataset.*loss\.csv") as caught:
         prepare(data, "rlds")
     assert "move them away" in str(caught.value)
 

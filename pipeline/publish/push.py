@@ -8,6 +8,7 @@ leaves notes among the files, shows half a dataset meanwhile, and tries for ever
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ from pipeline.publish.card import REPORTS, REPOSITORY
 
 SCRIPTS = {".py", ".yaml", ".json"}
 """What of ``finetune/`` is uploaded; trying it leaves compiled Python there."""
+
+OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]{64}\.json")
+"""What OpenVLA-OFT's loader writes beside the shards when it trains without ``finetune/run_openvla_oft.py``."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +135,12 @@ def _content(path: str, file: Path, repository: str) -> Path | bytes:
 
 
 def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
-    """The wanted files under ``root``, when there is nothing else, and nothing that leads elsewhere."""
-    found = {file.relative_to(root).as_posix(): file for file in root.rglob("*") if file.is_symlink() or file.is_file()}
+    """The wanted files under ``root``, when there is nothing else but OFT's statistics, and nothing leads elsewhere."""
+    found = {
+        file.relative_to(root).as_posix(): file
+        for file in root.rglob("*")
+        if (file.is_symlink() or file.is_file()) and not OFT_STATISTICS.fullmatch(file.name)
+    }
     linked = sorted(path for path, file in found.items() if root.resolve() not in file.resolve().parents)
     foreign = sorted(found.keys() - wanted)
     if foreign or linked:
@@ -140,7 +148,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
             f"{len(foreign)} files that are not of the dataset, {len(linked)} that lie elsewhere, such as "
             f"{(foreign + linked)[0]}",
             where=root,
-            remedy="move them away (training leaves statistics and caches), or dvc repro to write the dataset anew",
+            remedy="move them away (training may leave files), or dvc repro to write the dataset anew",
         )
     if missing := sorted(wanted - found.keys()):
         raise PipelineError(f"lacks {len(missing)} files, such as {missing[0]}", where=root, remedy="dvc repro")
