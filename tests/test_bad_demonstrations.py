@@ -148,5 +148,5 @@ def test_a_bad_scene_leaves_no_trace_in_its_worker() -> None:
         reached.append(environment.state)
         with pytest.raises(UnusableSceneError):
             environment.restore(renamed("plate_1_main")(good).model_file, good.states[0])
-    assert np.array_equal(*reached)
+    assert np.array_equal(reached[0], reached[1])
     assert environment.place_fixtures(1) == Environment(STOVE).place_fixtures(1)
