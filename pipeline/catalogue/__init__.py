@@ -1,1 +1,1 @@
-"""What scenes are dressed with: textures and objects, from packages, downloads, procedures and folders of one's own."""
+"""Textures and objects for scenes: from installed packages, downloads, generators and the user's own folders."""

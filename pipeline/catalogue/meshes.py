@@ -1,4 +1,4 @@
-"""A Wavefront OBJ with its materials to a MuJoCo model of one object: what is seen, and a convex hull to touch."""
+"""A Wavefront OBJ with its materials to a MuJoCo model of one object: visual meshes, and a convex hull for contacts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _THINNEST_M = 1e-3
 _TEXTURE_PX = 512
 _SHEET_M = 5e-4
 _OPAQUE = 0.25
-"""Least opacity: glass that lets more through than this is all but invisible in a frame of 256 x 256."""
+"""Least opacity: glass that is more transparent can hardly be seen in a frame of 256 x 256."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def convert(
 ) -> None:
     """Write ``model.xml``, meshes and textures of an OBJ (y up) into the folder ``out``.
 
-    The model stands on the origin with z up. One convex hull is what it collides with: things that are only stood
-    somewhere and walked around need no more, and a hull is the same on every machine.
+    The model stands on the origin with z up. One convex hull is what it collides with: objects that the
+    robot only has to avoid need no more, and a hull is the same on every machine.
 
     Args:
         obj: the model; its materials and textures are found beside it.
@@ -111,7 +111,8 @@ def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: NDArray[n
     for mesh in meshes:
         vertices = (mesh.vertices @ turn.T - foot) * scale @ stand.T
         faces, material = np.asarray(mesh.faces), getattr(mesh.visual, "material", None)
-        uv = None if (found := getattr(mesh.visual, "uv", None)) is None else np.asarray(found)
+        coordinates = getattr(mesh.visual, "uv", None)
+        uv = None if coordinates is None else np.asarray(coordinates)
         image = getattr(material, "image", None) if uv is not None else None
         if share < 1.0:
             vertices, faces, uv = _simplified(vertices, faces, uv if image is not None else None, share)
@@ -127,10 +128,10 @@ def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: NDArray[n
 def _simplified(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None, share: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
-    """Fewer faces; a small part keeps its own, and so does a textured one, as collapsing edges would smear it."""
+    """Fewer faces; a small part and a textured one keep theirs, as collapsing edges would distort the texture."""
     if uv is not None or len(faces) < _SMALL_PART:
         return vertices, faces, uv
-    # Faces that share places but not vertices (for normals of their own) would drift apart.
+    # Faces that share places but not vertices (for normals of their own) would come apart.
     merged = trimesh.Trimesh(vertices, faces, process=False)
     merged.merge_vertices(merge_norm=True, merge_tex=True)
     fewer, faces_left = fast_simplification.simplify(

@@ -127,8 +127,10 @@ class ObjectModel:
         except (OSError, ET.ParseError) as error:
             raise PipelineError(f"not a readable model ({error})", where=self.mjcf) from error
         # What would change the meaning of the geoms when they are moved to another model.
-        redirected = any({"meshdir", "texturedir", "assetdir"} & set(found.attrib) for found in root.iter("compiler"))
-        turned = any(found.get("euler", "0 0 0") != "0 0 0" for found in root.iter())
+        redirected = any(
+            {"meshdir", "texturedir", "assetdir"} & set(compiler.attrib) for compiler in root.iter("compiler")
+        )
+        turned = any(element.get("euler", "0 0 0") != "0 0 0" for element in root.iter())
         if redirected or turned or any(root.find(tag) is not None for tag in ("default", "include", "deformable")):
             raise PipelineError(
                 "the model uses defaults, includes, asset folders or euler angles",
@@ -142,7 +144,7 @@ class ObjectModel:
     def _assets(self) -> tuple[ET.Element, ...]:
         """The meshes, materials and textures that its geoms use, with absolute paths."""
         used = {geom.get(kind) for geom in self._root.iter("geom") for kind in ("mesh", "material")}
-        used |= {found.get("texture") for found in self._root.iter("material") if found.get("name") in used}
+        used |= {material.get("texture") for material in self._root.iter("material") if material.get("name") in used}
         assets = []
         for asset in self._root.findall("asset/*"):
             if asset.get("name") in used:
@@ -153,16 +155,16 @@ class ObjectModel:
         return tuple(assets)
 
     def _geoms(self, prefix: str, shift_m: Sequence[float], density: float) -> Iterator[ET.Element]:
-        """Its geoms as those of one body that stands upright, moved by ``shift_m``; what is only seen has no mass."""
-        found = list(_placed(self._root.findall("worldbody/body"), np.array(shift_m, float), _UPRIGHT[self.up]))
-        drawn = any(_is_visual(geom) for geom, _, _ in found)
-        for geom, pos, quat in found:
+        """Its geoms as those of one body that stands upright, moved by ``shift_m``; visual geoms have no mass."""
+        placed = list(_placed(self._root.findall("worldbody/body"), np.array(shift_m, float), _UPRIGHT[self.up]))
+        has_visuals = any(_is_visual(geom) for geom, _, _ in placed)
+        for geom, pos, quat in placed:
             shape = {key: value for key, value in geom.attrib.items() if key in ("type", "mesh", "size")}
             shape |= {"pos": _numbers(pos), "quat": _numbers(quat)}
             if not _is_visual(geom):
                 touch = {**shape, **_CONTACT, "density": f"{density:.4f}", "group": "0", "rgba": "0 0 0 0"}
                 yield _renamed(ET.Element("geom", touch), prefix)
-            if _is_visual(geom) or not drawn:
+            if _is_visual(geom) or not has_visuals:
                 look = {key: value for key, value in geom.attrib.items() if key in ("material", "rgba")}
                 seen = {**shape, **look, "contype": "0", "conaffinity": "0", "mass": "0", "group": "1"}
                 yield _renamed(ET.Element("geom", seen), prefix)

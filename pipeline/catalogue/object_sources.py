@@ -1,8 +1,8 @@
 """What the sources of object models offer.
 
 ``libero`` and ``robosuite`` are installed with the pipeline. ``sweethome3d`` (Debian's package of furniture models, CC0
-and CC-BY) and a :class:`Folder` of the user's are converted into ``FOLDER`` when they are first asked for. What is
-there stays as it is until its origin or the conversion changes, so a conversion that was cut short goes on.
+and CC-BY) and a :class:`Folder` of the user's are converted into ``FOLDER`` when they are first needed. A converted
+model is kept until its origin or the conversion changes, so a conversion that was stopped goes on where it was.
 """
 
 from __future__ import annotations
@@ -119,28 +119,28 @@ def _sweethome3d() -> Iterator[ObjectModel]:
         _make(names[piece.member], about, write)
 
     if missing():
-        with _alone():
+        with _locked():
             deb = sweethome3d.fetch(FOLDER)
             todo = missing()
             pieces = [piece for piece in sweethome3d.pieces(deb) if piece.member in todo]
             for piece in track(pieces, "converting sweethome3d", console=Console(stderr=True)):
                 make(piece)
-            if lost := missing():
-                raise PipelineError(f"the package lacks {', '.join(sorted(lost))}", where=deb, remedy="report it")
+            if absent := missing():
+                raise PipelineError(f"the package lacks {', '.join(sorted(absent))}", where=deb, remedy="report it")
     for name in names.values():
         yield converted(name)
 
 
 def _own(source: Folder) -> Iterator[ObjectModel]:
-    found = sorted(path for path in source.folder.glob("*/*") if path.suffix in (".obj", ".xml"))
-    if not found:
+    paths = sorted(path for path in source.folder.glob("*/*") if path.suffix in (".obj", ".xml"))
+    if not paths:
         raise PipelineError(
             "there are no models here",
             where=source.folder,
             expected="<category>/<name>.obj or <category>/<name>.xml",
             remedy="correct the folder in plan.axes.layout.sources",
         )
-    for path in found:
+    for path in paths:
         category = path.parent.name
         if not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)*", category):
             raise PipelineError(
@@ -153,7 +153,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         beside = [file for file in sorted(path.parent.rglob("*")) if file.is_file()]
         content = [(file.relative_to(path.parent).as_posix(), sha256(file.read_bytes()).hexdigest()) for file in beside]
         made_from = digest("object", RECIPE, path.name, content)
-        # The name tells what it was made from, so that an earlier plan still finds its own.
+        # The name holds a hash of what it was made from, so that an earlier plan still finds its own objects.
         name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
         about = {
             "made_from": made_from,
@@ -162,7 +162,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
             "attribution": f"{category}/{path.name}",
         }
         if _about(name) != about:
-            with _alone():
+            with _locked():
                 _make(name, about, lambda folder, path=path: _convert_own(path, folder))  # type: ignore[misc]
         yield converted(name)
 
@@ -202,7 +202,7 @@ def _copy(mjcf: Path, out: Path) -> None:
 
 
 def _make(name: str, about: dict[str, str], write: Callable[[Path], None]) -> None:
-    """Have ``write`` fill the folder of a converted model, which is whole or not there."""
+    """Let ``write`` fill the folder of a converted model, which is complete or absent."""
     with replaced(FOLDER / name) as folder:
         folder.mkdir()
         write(folder)
@@ -218,8 +218,8 @@ def _about(name: str) -> dict[str, str] | None:
 
 
 @contextmanager
-def _alone() -> Iterator[None]:
-    """Let one process convert at a time, so that another finds its work done."""
+def _locked() -> Iterator[None]:
+    """Let one process convert at a time; the next one finds the models converted."""
     FOLDER.mkdir(parents=True, exist_ok=True)
     with (FOLDER / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

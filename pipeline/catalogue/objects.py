@@ -1,4 +1,4 @@
-"""Small objects that can be added to a scene: of none of the test set's categories, and told apart by their nouns."""
+"""Small objects that can be added to a scene: of no category of the test set's, with nouns that cannot be confused."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TEST_CATEGORIES = frozenset(
 
 
 ALIKE = ({"bowl", "ramekin", "ashtray"}, {"mug", "glass", "measure", "creamer"}, {"pot", "teapot", "kettle"})
-"""Nouns of things that one may be taken for the other, from looking at the models."""
+"""Groups of nouns whose objects look alike, judged by looking at the models."""
 
 
 @cache
@@ -34,15 +34,15 @@ def models(sources: tuple[Source, ...]) -> dict[str, ObjectModel]:
     Raises:
         PipelineError: when a source cannot be had, or holds what must not be added.
     """
-    found = [model for source in sources for model in offered(source)]
-    for model in found:
+    members = [model for source in sources for model in offered(source)]
+    for model in members:
         if model.category in TEST_CATEGORIES:
             raise PipelineError(
                 f"{model.name} is of the category {model.category}, which the test set adds to its scenes",
                 where=model.mjcf,
                 remedy="leave it out",
             )
-    return {model.name: model for model in sorted(found, key=lambda model: model.name)}
+    return {model.name: model for model in sorted(members, key=lambda model: model.name)}
 
 
 def find(name: str, sha256: str) -> ObjectModel:

@@ -1,4 +1,4 @@
-"""Surfaces made from numbers: seven families of seamless colour maps, as many of each as one asks for.
+"""Procedural surfaces: seven families of seamless colour maps, with any number of textures in each.
 
 All patterns are periodic, so that they tile without a seam. A texture is determined by its family and index and
 :data:`RECIPE` alone, and nothing but NumPy makes it, in about 0.1 s.

@@ -83,10 +83,10 @@ def fetch(folder: Path) -> Path:
                     remedy=f"`sudo apt-get update`, and run it again; or put {DEB} of Debian 12 there; or leave "
                     "sweethome3d out of plan.axes.layout.sources: libero, robosuite and a folder work without it",
                 ) from error
-    found = hashlib.sha256(deb.read_bytes()).hexdigest()
-    if found != SHA256:
+    sha256 = hashlib.sha256(deb.read_bytes()).hexdigest()
+    if sha256 != SHA256:
         raise PipelineError(
-            f"not the package that the catalogue was made for: its SHA-256 is {found}",
+            f"not the package that the catalogue was made for: its SHA-256 is {sha256}",
             where=deb,
             expected=SHA256,
             remedy="delete it and run it again",
@@ -129,8 +129,8 @@ def _libraries(deb: Path) -> Iterator[tuple[str, zipfile.ZipFile]]:
 
 def _properties(text: str) -> dict[str, str]:
     """A Java properties file."""
-    found = re.findall(r"^\s*([^#!=:\s][^=:\s]*)\s*[=:]\s*(.*?)\s*$", re.sub(r"\\\r?\n\s*", "", text), re.MULTILINE)
-    return {key: re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value) for key, value in found}
+    lines = re.findall(r"^\s*([^#!=:\s][^=:\s]*)\s*[=:]\s*(.*?)\s*$", re.sub(r"\\\r?\n\s*", "", text), re.MULTILINE)
+    return {key: re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value) for key, value in lines}
 
 
 def _entries(listed: dict[str, str]) -> Iterator[dict[str, str]]:

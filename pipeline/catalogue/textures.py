@@ -56,8 +56,8 @@ def normalise(name: str) -> str:
 @cache
 def test_images() -> frozenset[str]:
     """SHA-256 of LIBERO's images that test tasks show."""
-    shown = (file for file in libero_images() if file.stem in IN_TEST_SET)
-    return frozenset(hashlib.sha256(file.read_bytes()).hexdigest() for file in shown)
+    tested = (file for file in libero_images() if file.stem in IN_TEST_SET)
+    return frozenset(hashlib.sha256(file.read_bytes()).hexdigest() for file in tested)
 
 
 test_images.__test__ = False  # type: ignore[attr-defined]  # not a test case, whatever its name starts with
@@ -83,14 +83,14 @@ def catalogue(sources: tuple[Source, ...]) -> dict[str, Texture]:
     Raises:
         PipelineError: when a source cannot be had, or a user's folder holds what must not be drawn.
     """
-    found: dict[str, Texture] = {}
+    by_name: dict[str, Texture] = {}
     seen: set[str] = set()
     for source in sources:
         for texture in offered(source):
             if texture.sha256 not in seen and _may_be_drawn(texture, source):
                 seen.add(texture.sha256)
-                found[texture.name] = texture
-    return found
+                by_name[texture.name] = texture
+    return by_name
 
 
 def find(name: str, sha256: str) -> Texture:
@@ -130,7 +130,7 @@ def _may_be_drawn(texture: Texture, source: Source) -> bool:
                 where=texture.name.removeprefix("folder:"),
                 remedy="move it out of the folder",
             )
-        texture.load()  # a file that is no image should be found now, not by a renderer in an hour
+        texture.load()  # a file that is not an image is reported now, not when it is rendered
         return True
     if texture.source == "libero":
         return texture.name.removeprefix("libero:") in _LIBERO_FREE

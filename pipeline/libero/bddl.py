@@ -1,4 +1,4 @@
-"""What a BDDL file says of a task: its instruction, what is in its scene, where things start and what is wanted."""
+"""What a BDDL file says of a task: its instruction, what is in its scene, where things start, and its goal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from bddl.parsing import scan_tokens
 from pipeline.errors import PipelineError
 
 Fact = tuple[str, ...]
-"""A predicate and what it is said of, such as ``("on", "plate_1", "main_table_plate_region")``."""
+"""A predicate and its arguments, such as ``("on", "plate_1", "main_table_plate_region")``."""
 
 
 @dataclass(frozen=True)
@@ -105,13 +105,13 @@ def parse(text: str, where: object) -> Bddl:
 def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:
     """Name and centre of each of a list of ``[name, [":target", thing], [":ranges", [[x0, y0, x1, y1], ...]], ...]``;
     of several ranges the first counts."""
-    found = []
+    centres = []
     for name, *fields in listed:
-        said = {field: content for field, *content in fields}
-        if ":ranges" in said:
-            x0, y0, x1, y1 = map(float, said[":ranges"][0][0])
-            found.append((f"{said[':target'][0]}_{name}", ((x0 + x1) / 2, (y0 + y1) / 2)))
-    return found
+        sections = {field: content for field, *content in fields}
+        if ":ranges" in sections:
+            x0, y0, x1, y1 = map(float, sections[":ranges"][0][0])
+            centres.append((f"{sections[':target'][0]}_{name}", ((x0 + x1) / 2, (y0 + y1) / 2)))
+    return centres
 
 
 def _declared(listed: list[str]) -> dict[str, str]:

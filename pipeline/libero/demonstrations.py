@@ -138,7 +138,9 @@ class HDF5Source:
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         wanted = list(wanted)
         entries: list[DemoEntry] = []
-        problems = [stray for suite in dict.fromkeys(task.suite for task in wanted) for stray in self._strays(suite)]
+        problems = [
+            stray for suite in dict.fromkeys(task.suite for task in wanted) for stray in self._files_of_no_task(suite)
+        ]
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
             name, usable = f"{task.suite}/{task.name}", 0
@@ -168,8 +170,8 @@ class HDF5Source:
     def _path(self, task: Task) -> Path:
         return self.root / task.suite / f"{task.name}_demo.hdf5"
 
-    def _strays(self, suite: str) -> Iterator[Problem]:
-        """The files that go with no task of LIBERO's list."""
+    def _files_of_no_task(self, suite: str) -> Iterator[Problem]:
+        """The files that are named after no task of LIBERO's list."""
         folder = self.root / suite
         if not folder.is_dir():
             raise PipelineError(
@@ -190,7 +192,7 @@ class HDF5Source:
         with hdf5.opened(path) as file:
             data = hdf5.member(file, "data", h5py.Group, str(path))
             # Of the places that name the task, only this one was corrected for publication; the tasks' earlier names
-            # stay in env_args. A name that no task has is taken for one of those.
+            # stay in env_args. A name that no task has counts as one of those.
             recorded = PurePosixPath(hdf5.text(data, "bddl_file_name", f"{path} data")).stem
             if recorded != task.name and recorded in _task_names():
                 raise PipelineError(
@@ -213,7 +215,7 @@ class HDF5Source:
                 f"actions {actions.shape}, states {states.shape} and the attribute init_state do not agree",
                 where=where,
                 expected="one state for each action, the first of them equal to init_state",
-                remedy=hdf5.AGAIN,
+                remedy=hdf5.DOWNLOAD_AGAIN,
             )
         # Named within the set, not on this machine: provenance must not change from machine to machine.
         source = f"{task.suite}/{path.name} {key}"
@@ -246,7 +248,7 @@ def _demo(
         fault = f"states reach {np.abs(states).max():.6g}"
     if fault:
         expected = f"actions (T, 7) in [-1, 1] and states (T, S), all finite and none beyond {LARGEST_STATE:.0e}"
-        raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.AGAIN)
+        raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.DOWNLOAD_AGAIN)
     # Hash the model as recorded: relocated, it would differ from machine to machine.
     content = hashlib.sha256()
     for array in (actions, states):

@@ -1,4 +1,4 @@
-"""LIBERO's HDF5 layout: reading its parts without trusting them, and writing it."""
+"""LIBERO's HDF5 layout: reading it with every part checked, and writing it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pipeline.files import replaced
 from pipeline.libero.assets import package_folder
 from pipeline.types import Floats, Task
 
-AGAIN = "delete the file and download it again; the starter set needs no download"
+DOWNLOAD_AGAIN = "delete the file and download it again; the starter set needs no download"
 
 EXPANDED_FROM = "expanded_from"
 """Attribute of a demonstration that was made from another: that one's id."""
@@ -31,12 +31,12 @@ _Node = TypeVar("_Node", h5py.Group, h5py.Dataset)
 
 @contextmanager
 def _undamaged(where: str) -> Iterator[None]:
-    """Turn all that h5py raises on truncated or overwritten bytes into one error."""
+    """Raise one error for all that h5py raises on truncated or overwritten bytes."""
     try:
         yield
     except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
         raise PipelineError(
-            f"not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=AGAIN
+            f"not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=DOWNLOAD_AGAIN
         ) from error
 
 
@@ -60,19 +60,19 @@ def names(group: h5py.Group, where: str) -> list[str]:
     """A group's member names in natural order, ``demo_2`` before ``demo_10``."""
     with _undamaged(where):
         # h5py gives a name that is not UTF-8 as bytes.
-        text = [name if isinstance(name, str) else name.decode(errors="backslashreplace") for name in group]
-        return sorted(text, key=lambda name: [part.zfill(20) for part in re.split(r"(\d+)", name)])
+        decoded = [name if isinstance(name, str) else name.decode(errors="backslashreplace") for name in group]
+        return sorted(decoded, key=lambda name: [part.zfill(20) for part in re.split(r"(\d+)", name)])
 
 
 def member(group: h5py.Group, name: str, kind: type[_Node], where: str) -> _Node:
     """A group's member, which must be of that kind and in the same file: a link could lead to any file."""
     with _undamaged(where):
         link = group.get(name, getlink=True)
-        found = group[name] if isinstance(link, h5py.HardLink) else link
-    if not isinstance(found, kind):
-        what = "missing" if found is None else f"a {type(found).__name__}"
-        raise PipelineError(f"{name!r} is {what}", where=where, expected=f"a {kind.__name__}", remedy=AGAIN)
-    return found
+        node = group[name] if isinstance(link, h5py.HardLink) else link
+    if not isinstance(node, kind):
+        what = "missing" if node is None else f"a {type(node).__name__}"
+        raise PipelineError(f"{name!r} is {what}", where=where, expected=f"a {kind.__name__}", remedy=DOWNLOAD_AGAIN)
+    return node
 
 
 def array(group: h5py.Group, name: str, where: str) -> Floats:
@@ -80,13 +80,13 @@ def array(group: h5py.Group, name: str, where: str) -> Floats:
     dataset = member(group, name, h5py.Dataset, where)
     with _undamaged(where):
         if dataset.external or dataset.is_virtual:
-            raise PipelineError(f"{name!r} takes its numbers from another file", where=where, remedy=AGAIN)
+            raise PipelineError(f"{name!r} takes its numbers from another file", where=where, remedy=DOWNLOAD_AGAIN)
         if dataset.dtype.kind != "f" or dataset.ndim != 2 or not 0 < dataset.size <= _MAX_NUMBERS:
             raise PipelineError(
                 f"{name!r} holds {dataset.dtype} of shape {dataset.shape}",
                 where=where,
                 expected="floating-point numbers of shape (T, N)",
-                remedy=AGAIN,
+                remedy=DOWNLOAD_AGAIN,
             )
         return np.asarray(dataset[()], np.float64)
 
@@ -112,7 +112,7 @@ def text(group: h5py.Group, name: str, where: str) -> str:
         )
     # h5py reads bytes that are not UTF-8 as lone surrogates, which nothing can encode again.
     if not value.isascii() and any("\ud800" <= character <= "\udfff" for character in value):
-        raise PipelineError(f"attribute {name!r} is not UTF-8", where=where, remedy=AGAIN)
+        raise PipelineError(f"attribute {name!r} is not UTF-8", where=where, remedy=DOWNLOAD_AGAIN)
     return value
 
 
@@ -138,7 +138,7 @@ class Recording:
 
 
 def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
-    """Write a task's demonstrations the way LIBERO publishes them, so that whatever reads its files reads this one.
+    """Write a task's demonstrations the way LIBERO publishes them, so that what can read its files can read this one.
 
     The same recordings make the same bytes.
     """
@@ -213,7 +213,7 @@ def _write_demo(group: h5py.Group, recording: Recording) -> None:
 
 
 def _in_bddl(bddl: str, keyword: str) -> str:
-    found = re.search(rf"\({keyword}\s+([^()]+)\)", bddl)
-    if found is None:
+    match = re.search(rf"\({keyword}\s+([^()]+)\)", bddl)
+    if match is None:
         raise PipelineError(f"the BDDL file has no ({keyword} ...)", remedy="reinstall LIBERO")
-    return found[1].strip()
+    return match[1].strip()

@@ -1,4 +1,4 @@
-"""What a task asks for, as its BDDL file tells it: what goes where, and what is opened, closed, turned on or off."""
+"""What a task asks for, as its BDDL file defines it: what goes where, and what is opened, closed, turned on or off."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import NamedTuple
 from pipeline.libero.bddl import Bddl, read
 
 PARTS = ("top", "middle", "bottom", "left", "right", "front", "back", "center")
-"""Words in the names of regions that tell which drawer, compartment, side or spot."""
+"""Words in the names of regions that say which drawer, compartment, side or spot."""
 
 
 class Aim(NamedTuple):
@@ -20,9 +20,9 @@ class Aim(NamedTuple):
 
     Attributes:
         relation: ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the place; None where the
-            part says it all.
+            part is enough.
         thing: its kind.
-        place: kind of what it is put on, in, next to; None where the part says it all.
+        place: kind of what it is put on, in, next to; None where the part is enough.
         part: which of ``PARTS`` of the place, or which of several places of that kind.
     """
 
@@ -47,7 +47,7 @@ class TaskGoal:
     Attributes:
         scene: kinds of all that is there, in order of the file.
         aims: what is moved where.
-        starts: where something that is moved is at first, if that tells it from others of its kind.
+        starts: where something that is moved is at first, if that distinguishes it from others of its kind.
         changes: what changes its state.
         pairs: kinds of which two are moved.
     """
@@ -72,8 +72,8 @@ def read_goal(bddl_file: Path) -> TaskGoal:
     moves = [fact for fact in facts if len(fact) == 3]
     moved = dict.fromkeys(name for _, name, _ in moves)
     counts = Counter(scene.kinds.get(name, name) for name in moved)
-    told_apart = [name for name in moved if counts[scene.kinds.get(name, name)] < scene.count(name)]
-    starts = [fact for fact in bddl.start if len(fact) == 3 and fact[1] in told_apart]
+    distinguished = [name for name in moved if counts[scene.kinds.get(name, name)] < scene.count(name)]
+    starts = [fact for fact in bddl.start if len(fact) == 3 and fact[1] in distinguished]
     return TaskGoal(
         scene=tuple(dict.fromkeys(scene.kinds.values())),
         aims=tuple(dict.fromkeys(aim for fact in moves for aim in scene.aims(*fact))),
@@ -110,9 +110,10 @@ class _Scene:
             return
         words = self._region(place)[1]
         beside = [other for other in self._named(words) if other not in (kind, host)]
-        near = next((told for word, told in (("between", "between"), ("next", "next to")) if word in words), part)
-        if beside and near:
-            yield from (Aim(near, kind, other) for other in beside)
+        phrases = (("between", "between"), ("next", "next to"))
+        relation_beside = next((phrase for word, phrase in phrases if word in words), part)
+        if beside and relation_beside:
+            yield from (Aim(relation_beside, kind, other) for other in beside)
         elif part:
             yield Aim(None, kind, None, part)
 

@@ -1,4 +1,4 @@
-"""LIBERO's own environment for one task, without rendering: the physics, the controller and the judge's predicates."""
+"""LIBERO's own environment for one task, without rendering: the physics, the controller and the goal's predicates."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _turn_off_rendering() -> None:
 
 
 def _without_textures(model_xml: str) -> str:
-    """The scene with plain colours for images: nothing here is looked at, and they are half of its compilation."""
+    """The scene with plain colours for images: nothing is rendered here, and images are half of the compilation."""
     scene = ET.fromstring(model_xml)
     for texture in scene.iterfind("asset/texture[@name][@file]"):
         del texture.attrib["file"]
@@ -127,7 +127,7 @@ class Environment:
         return self._placed[seed]
 
     def restore(self, model_xml: str, state: Floats) -> None:
-        """Put the environment into a recorded scene and state, as if nothing had ever happened in this process.
+        """Put the environment into a recorded scene and state; nothing from before has an effect on what follows.
 
         A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms.
 
@@ -152,7 +152,7 @@ class Environment:
             self._check_names()
             self._scene, self._site_rgba = model_xml, env.sim.model.site_rgba.copy()
         else:
-            # What of the model LIBERO changes while it steps: a burner's site is lit.
+            # The part of the model that LIBERO changes while it steps: the site that shows a lit burner.
             env.sim.model.site_rgba[:] = self._site_rgba
             env.deterministic_reset = True
             env.reset()

@@ -1,4 +1,4 @@
-"""What the hand did in a rollout, what it touched, and where the things were: read from the rollout's stored states."""
+"""What the hand did in a rollout, what it touched, and where the objects were, read from the stored states."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Reference:
-    """A rollout as somebody sees it who wants to do the same again.
+    """What has to be known of a rollout to repeat it.
 
     K actions lie between K+1 states. An object is *carried* while it touches the robot and nothing else, and *met*
     while the hand touches it without carrying it, or while something in the hand newly touches it.
@@ -70,7 +70,7 @@ class Reference:
         held, carried, met = ({name: np.zeros(steps, bool) for name, _ in free.values()} for _ in range(3))
         poses = {name: np.empty((steps, 7)) for name, _ in free.values()}
         compiled.restore(states[0])
-        rested = _partners(compiled)
+        touched_at_start = _partners(compiled)
         for step, state in enumerate(states):
             compiled.restore(state)
             positions[step], matrices[step] = data.site_xpos[grip], data.site_xmat[grip].reshape(3, 3)
@@ -86,7 +86,7 @@ class Reference:
                 held[name][step] = True
                 (carried if alone else met)[name][step] = True
                 # What an object stood on from the start is not met when the hand takes the object.
-                for other in (partners[body] & free.keys()) - rested.get(body, set()):
+                for other in (partners[body] & free.keys()) - touched_at_start.get(body, set()):
                     met[free[other][0]][step] = True
         return cls(positions, Rotation.from_matrix(matrices), actions, busy, held, carried, met, poses)
 

@@ -1,4 +1,4 @@
-"""LIBERO's control step without what only costs time: the same states, bit for bit."""
+"""LIBERO's control step without the parts that change no state: the same states, bit for bit."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class ControlStep:
     A substep of robosuite's runs MuJoCo's whole forward dynamics three times on one state: before the controller,
     inside the controller's update, and inside ``mj_step``. What can differ between them is the solver, which starts
     from its last result, and, once torques are set, what follows from them. So the second is the constraint solver
-    alone and the third is ``mj_step2``. None of the solves can be left out: each moves the start of the next by less
-    than a hair, and contacts make decimetres of it before a demonstration ends.
+    alone and the third is ``mj_step2``. None of the solves can be left out: each changes the start of the next by very
+    little, and contacts amplify that to decimetres before a demonstration ends.
 
     Of ``mj_step``, only its check for positions and velocities beyond 1e10 is missing; that of accelerations, which
     comes first when a scene explodes, is part of ``mj_step2``. LIBERO's scenes are integrated by Euler's method.
@@ -58,7 +58,7 @@ class ControlStep:
         model, data, controller = self._model, self._data, self._controller
         for substep in range(self._substeps):
             mujoco.mj_forward(model, data)
-            # Not so in the first substep after a restore, which has told the controller already.
+            # In the first substep after a restore the controller is up to date already.
             if controller.new_update:
                 mujoco.mj_fwdConstraint(model, data)
                 self._update()
@@ -72,8 +72,8 @@ class ControlStep:
     def _update(self) -> None:
         """Give the controller what its own ``update`` would read, computed once and from addresses already known.
 
-        Jacobians and mass matrix are stored by columns, as robosuite's indexing leaves them: the layout chooses the
-        BLAS routine, and that the last bits.
+        Jacobians and mass matrix are stored by columns, as robosuite's indexing leaves them: the layout selects the
+        BLAS routine, and the routine determines the last bits.
         """
         model, data, arm = self._model, self._data, self._controller
         mujoco.mj_jacSite(model, data, self._positional, self._rotational, self._site)

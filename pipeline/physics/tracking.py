@@ -1,4 +1,4 @@
-"""Tracked replay: doing again what succeeded once, from another start or with objects moved, by feedback.
+"""Tracked replay: repeating by feedback what succeeded once, from another start or with objects moved.
 
 A ``Route`` is a reference rollout bent so that it begins where the hand is and meets every moved object where it now
 stands. ``follow`` yields the actions that keep the hand on it: what the demonstrator did, plus the bend's own motion,
@@ -37,10 +37,10 @@ PATIENCE = 80.0
 """Control steps (4 s) that the route waits in all; where the hand is held up for longer, it goes on without waiting."""
 
 REGRASP = 0.1
-"""Share, in each control step, by which the route closes in on what a grasp that fell out otherwise asks for."""
+"""Share of the difference in grasp that is added to the route's correction in each control step."""
 
 LOST_M = 0.05
-"""An object that lies otherwise in the hand by more than this was not grasped, or was dropped."""
+"""An object whose place in the hand differs by more than this was not grasped, or was dropped."""
 
 BEND_SPEED = 0.6
 """Largest share of the hand's speed that returning to the demonstrated route may take by itself."""
@@ -78,7 +78,7 @@ class Route:
 
         An object's displacement (about the vertical and along it and across it) is followed from before the hand
         meets it until it is carried off; then the route returns to the reference on the way to the goal. What objects
-        are put on or in is followed from before until the hand is through with it.
+        are put on or in is followed from before the hand meets it until its last contact.
 
         Args:
             reference: a rollout that reached the goal.
@@ -99,8 +99,8 @@ class Route:
                 raise RefusedError("object_not_upright")
             upright = np.array([0.0, 0.0, turn[2]])
             weights = _followed(reference, name)[:, None]
-            there = then[:3] + shift + Rotation.from_rotvec(upright).apply(positions - then[:3])
-            positions = positions + weights * (there - positions)
+            displaced = then[:3] + shift + Rotation.from_rotvec(upright).apply(positions - then[:3])
+            positions = positions + weights * (displaced - positions)
             rotations = Rotation.from_rotvec(weights * upright) * rotations
         shift, turn = hand[0] - positions[0], (hand[1] * rotations[0].inv()).as_rotvec()
         weights = _returning(reference, np.concatenate([shift, turn]))[:, None]
@@ -123,7 +123,7 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
 
     The index along the route advances by one a step, so that grasp and release keep their timing, and more slowly while
     the hand is far from where it should be. While something is carried, it is brought where it was in the reference
-    rather than the hand, as it may have been grasped a little otherwise.
+    rather than the hand, because it may have been grasped differently.
 
     Args:
         route: where to go.
@@ -138,13 +138,13 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
     grasp: Floats = np.zeros(3)
     while index < len(route):
         (position, rotation), (wanted_position, wanted_rotation) = hand(), route.at(index)
-        grasp = grasp + REGRASP * (_otherwise_grasped(reference, int(index), (position, rotation), pose, grasp) - grasp)
+        grasp = grasp + REGRASP * (_grasp_offset(reference, int(index), (position, rotation), pose, grasp) - grasp)
         wanted_position = wanted_position + wanted_rotation.apply(grasp)
         error = np.concatenate([wanted_position - position, (wanted_rotation * rotation.inv()).as_rotvec()])
         off = max(np.linalg.norm(error[:3]) / TOLERANCE_M, np.linalg.norm(error[3:]) / TOLERANCE_RAD)
         rate = float(np.clip(2 - 2 * off, 0.0, 1.0)) if patience > 0 else 1.0
         patience -= 1 - rate
-        # Rounding must not leave a last sliver of the route to a step of its own.
+        # Rounding must not leave a very short rest of the route, which would cost one more step.
         upcoming = min(round(index + rate, 6), float(len(route)))
         demonstrated = reference.actions[int(index)]
         moved = [np.interp(upcoming, steps, column) - np.interp(index, steps, column) for column in bend.T]
@@ -154,12 +154,10 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
         index = upcoming
 
 
-def _otherwise_grasped(
-    reference: Reference, step: int, hand: Hand, pose: Callable[[str], Floats], before: Floats
-) -> Floats:
-    """(3,) m, how far what is carried lies from where it lay in the reference's hand, in the hand's frame.
+def _grasp_offset(reference: Reference, step: int, hand: Hand, pose: Callable[[str], Floats], before: Floats) -> Floats:
+    """(3,) m from where a carried object is in the hand to where it was in the reference's, in the hand's frame.
 
-    Zero when nothing is carried; as ``before`` while it is being put down, when contacts shift it in the hand.
+    Zero when nothing is carried; ``before`` while it is put down, because contacts then shift it in the hand.
     """
     held = [name for name, mask in reference.held.items() if mask[step]]
     carried = [name for name in held if reference.carried[name][step]]

@@ -1,4 +1,4 @@
-"""A scene compiled and put into its state, for perturbations that must see what stands where."""
+"""A scene compiled and put into its state, for perturbations that depend on where things stand."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CompiledScene:
         return np.concatenate([[self.data.time], self.data.qpos, self.data.qvel])
 
     def restore(self, state: Floats) -> None:
-        """Put a flattened state (S,) into the data, forgetting what was there, and find its contacts."""
+        """Reset the data, put a flattened state (S,) into it and compute its contacts."""
         mujoco.mj_resetData(self.model, self.data)
         nq = self.model.nq
         self.data.time, self.data.qpos[:], self.data.qvel[:] = state[0], state[1 : 1 + nq], state[1 + nq :]

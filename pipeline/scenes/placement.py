@@ -19,14 +19,14 @@ from pipeline.types import Demo, Floats, RollOut, Scene
 SCENES, DRAWS = 12, 80
 """How often a whole scene is begun, and how often one object's place is drawn in it, before giving up."""
 DRAW_CLEARANCE_M, CLEARANCE_M = 0.02, 0.015
-"""What the demonstration's path keeps away from an object: where it is drawn, and where it has come to rest."""
+"""Least distance of the demonstration's path from an object: where it is drawn, and where it has come to rest."""
 REACH_M = (0.15, 0.95)
 """How far in front of the robot's base objects are put, and to its sides as far as the agent view shows."""
 SIDE_M = 0.45
 FRAME = 0.8
 """Share of the agent view's half width that an object's middle stays within."""
 HIDDEN = 0.05
-"""Most of what is seen of a task's objects that may be hidden."""
+"""Largest share of the visible part of a task's objects that added objects may cover."""
 _SETTLE_S, _REST_S = 1.0, 0.25
 _STILL_M, _TILT_DEG, _SLID_M = 2e-4, 15.0, 0.03
 _DISTURBED_M = 1e-3
@@ -41,26 +41,26 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
 
     Args:
         seed: keys the places that are tried.
-        roll_out: tells where the demonstration's actions lead when nothing is added.
+        roll_out: gives the states that the demonstration's actions lead through when nothing is added.
 
     Raises:
         RefusedError: when no place was found; the reason is the one that most places were refused for.
     """
     names = [f"layout{number}" for number in range(len(objects))]
     model_xml = _with(scene.model_xml, objects, names)
-    room = _Room(
+    placement = _Placement(
         model_xml, scene.state, roll_out(scene, demo), objects, names, bddl.read(demo.task.bddl_file).of_interest
     )
     rejected: Counter[str] = Counter()
     for attempt in range(SCENES):
-        poses = room.drawn(seeding.rng(seed, "layout", attempt), rejected)
+        poses = placement.draw(seeding.rng(seed, "layout", attempt), rejected)
         if poses is None:
             continue
-        settled, fault = room.settled(poses)
+        settled, fault = placement.settle(poses)
         if fault:
             rejected[fault] += 1
             continue
-        nq = room.old_nq
+        nq = placement.old_nq
         state = np.concatenate(
             [scene.state[: 1 + nq], settled.ravel(), scene.state[1 + nq :], np.zeros(6 * len(names))]
         )
@@ -82,7 +82,7 @@ def _with(model_xml: str, objects: Sequence[ObjectModel], names: Sequence[str]) 
     return model_xml
 
 
-class _Room:
+class _Placement:
     """A scene with objects in it whose places are still open.
 
     Args:
@@ -122,15 +122,15 @@ class _Room:
         self._eye_axes = self._data.cam("agentview").xmat.reshape(3, 3).copy()
         self._eye_slope = np.tan(np.deg2rad(self._model.camera("agentview").fovy[0]) / 2)
 
-    def drawn(self, rng: np.random.Generator, rejected: Counter[str]) -> Floats | None:
+    def draw(self, rng: np.random.Generator, rejected: Counter[str]) -> Floats | None:
         """(N, 7) a place for each object, the broadest first; None when one finds none."""
         poses = self._parked.copy()
         for number in sorted(range(len(poses)), key=lambda number: -self._objects[number].shape.footprint_m2):
             model = self._objects[number]
             for _ in range(DRAWS):
-                at = self._base_m[:2] + np.array([rng.uniform(*REACH_M), rng.uniform(-SIDE_M, SIDE_M)])
+                at_m = self._base_m[:2] + np.array([rng.uniform(*REACH_M), rng.uniform(-SIDE_M, SIDE_M)])
                 yaw = rng.uniform(-np.pi, np.pi)
-                fault = self._fault_at(poses, number, model, at, yaw)
+                fault = self._fault_at(poses, number, model, at_m, yaw)
                 if fault is None:
                     break
                 rejected[fault] += 1
@@ -159,11 +159,11 @@ class _Room:
         poses[number] = self._parked[number]
         return fault
 
-    def settled(self, poses: Floats) -> tuple[Floats, str | None]:
+    def settle(self, poses: Floats) -> tuple[Floats, str | None]:
         """(N, 7) where the objects come to rest while the robot is held, and what is wrong with that."""
         at_rest, moved = self._simulated(poses, held=False)
         _, moved_without = self._simulated(self._parked, held=True)
-        # Some demonstrations begin while an object is still falling over: only the difference is the objects' doing.
+        # Some demonstrations begin while an object is still falling over: only the difference is caused by the objects.
         if np.linalg.norm(moved - moved_without, axis=1).max() > _DISTURBED_M:
             return poses, "moved_another_object"
         rest, before = at_rest
@@ -197,15 +197,15 @@ class _Room:
             positions, velocities = width.get(model.jnt_type[joint], (1, 1))
             qpos += range(model.jnt_qposadr[joint], model.jnt_qposadr[joint] + positions)
             qvel += range(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + velocities)
-        start, seen = data.qpos[qpos].copy(), []
+        start, poses_at = data.qpos[qpos].copy(), []
         for seconds in (_SETTLE_S, _REST_S):
             for _ in range(round(seconds / model.opt.timestep)):
                 mujoco.mj_step(model, data)
                 data.qpos[qpos], data.qvel[qvel] = start, 0.0
-            seen.append(data.qpos[self.old_nq :].reshape(-1, 7).copy())
+            poses_at.append(data.qpos[self.old_nq :].reshape(-1, 7).copy())
         mujoco.mj_kinematics(model, data)
         others = data.xpos[: model.nbody - len(poses)].copy()
-        return (seen[1], seen[0]), others
+        return (poses_at[1], poses_at[0]), others
 
     def _put(self, state: Floats, poses: Floats) -> None:
         mujoco.mj_resetData(self._model, self._data)
@@ -229,11 +229,11 @@ class _Room:
             mujoco.mj_multiRay(
                 self._model, self._data, self._eye_m, rays.ravel(), drawn, 1, -1, hit, distance, len(rays), 1e3
             )
-            shown = self._targets[self._model.geom_bodyid[hit]] & (hit >= 0)
+            visible = self._targets[self._model.geom_bodyid[hit]] & (hit >= 0)
             # A distance of 1 is the point itself.
             covered = self._added[hit] & (hit >= 0) & (distance < 1.0)
             if covered.any():
-                worst = max(worst, float(covered.sum() / (covered.sum() + shown.sum())))
+                worst = max(worst, float(covered.sum() / (covered.sum() + visible.sum())))
         return worst
 
     def _target_points(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""What a demonstration passes on its way, and what added objects may stand on."""
+"""The space that a demonstration moves through, and the surfaces that added objects may stand on."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _RAY_GROUP = 5
 
 
 class SweptPath:
-    """A copy of a model in which the only contacts are those that must not be: an object with anything but a surface.
+    """A copy of a model whose only contacts are those not allowed: of an added object with anything but a surface.
 
     Args:
         model: the scene with the objects; their joints are its last.
@@ -31,23 +31,23 @@ class SweptPath:
     def __init__(self, model: mujoco.MjModel, added: NDArray[np.bool_], path: Floats):
         self._model, self._added, self._path = copy.copy(model), added, path
         model = self._model
-        there = [
+        surfaces = [
             number for name in SURFACES if (number := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)) >= 0
         ]
-        if not there:
+        if not surfaces:
             raise PipelineError(
                 "the scene has no working surface to put objects on", expected=f"a body named {' or '.join(SURFACES)}"
             )
         roots = model.body_rootid[model.geom_bodyid]
         touches = (model.geom_contype | model.geom_conaffinity) != 0
-        stands_on = touches & np.isin(roots, [*there, 0])
+        stands_on = touches & np.isin(roots, [*surfaces, 0])
         model.geom_contype[:] = np.where(added, 2, 1) * (touches & ~stands_on)
         model.geom_conaffinity[:] = np.where(added, 3, 0) * touches
         for body in range(model.nbody):
             own = model.geom_bodyid == body
             model.body_contype[body] = np.bitwise_or.reduce(model.geom_contype[own], initial=0)
             model.body_conaffinity[body] = np.bitwise_or.reduce(model.geom_conaffinity[own], initial=0)
-        model.geom_group[:] = np.where(touches & (roots == there[0]), _RAY_GROUP, 0)
+        model.geom_group[:] = np.where(touches & (roots == surfaces[0]), _RAY_GROUP, 0)
         self._data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, self._data)
 

