@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import PipelineError
 
@@ -89,7 +90,8 @@ def prepare() -> GlChoice:
     """
     choice = choose()
     # mujoco.Renderer looks its context class up here; MuJoCo itself fills it in by MUJOCO_GL, but only when imported.
-    vars(import_module("mujoco.gl_context"))["GLContext"] = import_module(f"mujoco.{choice.backend}").GLContext
+    context: Any = import_module("mujoco.gl_context")
+    context.GLContext = import_module(f"mujoco.{choice.backend}").GLContext
     return choice
 
 

@@ -116,7 +116,7 @@ def test_two_runs_on_one_cluster_are_what_they_are_without_it(
     # The second run has its plan, its frames and its datasets where the first had them.
     made = [run(there, configuration("demos", address, seed), monkeypatch) for seed in (7, 8)]
     alone = run(here, configuration("demos", "loop", 8), monkeypatch)
-    assert made[0].keys() != made[1].keys()
+    assert made[0] != made[1]
     assert made[1] == alone
     assert sorted(path.name for path in (tmp_path / "elsewhere").iterdir()) == []
 
