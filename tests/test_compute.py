@@ -27,6 +27,7 @@ def refuse(number: int) -> int:
     return number
 
 
+@pytest.mark.slow
 def test_local_processes_and_a_scheduler_by_address() -> None:
     numbers = list(range(20))
     with runner(ComputeConfig(cluster="local", workers=2)) as run:
@@ -57,6 +58,7 @@ def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch) -> None:
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["plan", "export_rlds", "export_lerobot", "manifest"])
 def test_only_replay_and_render_load_the_simulator(stage: str) -> None:
     script = (

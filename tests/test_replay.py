@@ -113,6 +113,7 @@ def test_replay_starts_from_the_recorded_state_and_reaches_the_recorded_goal(
     assert np.allclose(control_step_s, 1 / 20)
 
 
+@pytest.mark.slow
 def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> None:
     environment = Environment(STOVE)
     np.random.seed(5)
