@@ -1,12 +1,15 @@
 # Short names for setup.sh, which works where make is not installed.
 
-.PHONY: setup run test doctor lock
+.PHONY: setup run quick test doctor lock
 
 setup:
 	bash setup.sh
 
 run:
 	bash setup.sh run
+
+quick:
+	bash setup.sh quick
 
 test:
 	bash setup.sh test

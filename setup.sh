@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# Installs what the pipeline needs on Debian 12 and is quick when it is there: bash setup.sh [run|test]
+# Installs what the pipeline needs on Debian 12 and is quick when it is there: bash setup.sh [run|quick|test]
 #   run    then makes the datasets of the configuration that params.yaml names
-#   test   then checks style, types and behaviour
+#   quick  then checks style and types and runs the tests that take little time
+#   test   then checks style and types and runs all tests, one of them in a browser
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
@@ -38,6 +39,8 @@ missing_packages() {
     has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which links libpython too
     "$PYTHON" -c 'import ctypes; ctypes.CDLL("libpython3.11.so.1.0")' 2>/dev/null || echo libpython3.11
     command -v git >/dev/null || echo git
+    # The tests' browser; `quick` leaves out the test that needs it.
+    [[ $VERB != test ]] || command -v chromium-headless-shell >/dev/null || echo chromium-headless-shell
     [[ -x .venv/bin/pip ]] || "$PYTHON" -c 'import ensurepip' 2>/dev/null || echo python3.11-venv
 }
 
@@ -66,7 +69,7 @@ install_venv() {
     .venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable .
 }
 
-[[ $VERB =~ ^(run|test|)$ ]] || fail "unknown verb '$VERB', expected run, test or none"
+[[ $VERB =~ ^(run|quick|test|)$ ]] || fail "unknown verb '$VERB', expected run, quick, test or none"
 PYTHON=$(find_python)
 packages=$(missing_packages)
 if [[ -n $packages ]]; then
@@ -88,10 +91,10 @@ run)
     python -m pipeline doctor
     dvc repro
     ;;
-test)
+quick | test)
     ruff check
     ruff format --check
     mypy
-    pytest
+    if [[ $VERB == quick ]]; then pytest -m "not slow"; else pytest; fi
     ;;
 esac

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import os
 import shutil
 import subprocess
@@ -20,7 +22,7 @@ from pipeline.config import ReplayConfig
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.physics.environment import Environment
+from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import fetch_testset
@@ -34,6 +36,26 @@ BOWL = find_task("libero_goal", "put_the_bowl_on_the_plate")
 MILK = find_task("libero_object", "pick_up_the_milk_and_place_it_in_the_basket")
 SHORT = {STOVE: 14, BOWL: 16, MILK: 18}
 """How many of the last actions are kept; the goal is reached within them."""
+
+
+SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage", "expanded", "everything"}
+"""Whoever asks for one of these, or for what is made from it, is no quick test: see ``-m "not slow"``."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if isinstance(item, pytest.Function) and SLOW_FIXTURES.intersection(item.fixturenames):
+            item.add_marker(pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def memory() -> Iterator[None]:
+    """After a module, give back what it held: an environment or an open scene takes half a gigabyte."""
+    yield
+    shared.cache_clear()
+    gc.collect()
+    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc keeps what was freed
+        trim(0)
 
 
 def starter_demo(task: Task) -> Demo:

@@ -34,6 +34,7 @@ def texture_bytes(shown: Renderer) -> list[bytes]:
     return [model.tex_data[at : at + size].tobytes() for at, size in zip(model.tex_adr, sizes, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arena", TASKS)
 def test_only_the_named_surfaces_change_and_all_comes_back(arena: str) -> None:
     shown = renderer(arena)
@@ -55,6 +56,7 @@ def test_only_the_named_surfaces_change_and_all_comes_back(arena: str) -> None:
         shown.close()
 
 
+@pytest.mark.slow
 def test_levels_move_the_average_colour_away() -> None:
     shown = renderer("floor")
     try:
@@ -116,6 +118,7 @@ def test_nearest_knows_test_images_by_name_and_by_content() -> None:
     assert one.model_copy(update={"coverings": (copy,)}).nearest(shows(), MILK).distance < one.clearance
 
 
+@pytest.mark.slow
 def test_draws_are_clear_of_the_benchmark() -> None:
     test = benchmark.load(REPOSITORY / benchmark.FOLDER)
     shown = {other.parameters[part] for other in test.of("background") for part in ("surface", "wall")

@@ -28,6 +28,7 @@ def refuse(number: int) -> int:
     return number
 
 
+@pytest.mark.slow
 def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
     numbers = list(range(20))
     with runner(ComputeConfig(cluster="local", workers=2), tmp_path) as run:
@@ -59,6 +60,7 @@ def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
         pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["plan", "export_rlds", "export_lerobot", "manifest"])
 def test_only_replay_and_render_load_the_simulator(stage: str) -> None:
     script = (

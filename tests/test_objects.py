@@ -102,6 +102,7 @@ def test_the_catalogue_has_two_hundred_models_and_no_category_of_the_test_set() 
     assert not TEST_CATEGORIES & {category for source in catalogue().values() for category in source}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(INSTALLED))
 def test_an_object_stands_where_it_is_put(name: str) -> None:
     model = compiled(INSTALLED[name])

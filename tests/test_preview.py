@@ -214,6 +214,7 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
         assert np.abs(compressed.astype(int) - frame).mean() < 2
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sheet"
     monkeypatch.chdir(REPOSITORY)
@@ -225,6 +226,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
         assert sheet.width == 4 * (preview.SIDE_PX[1] + sheets.GAP_PX) + sheets.GAP_PX
 
 
+@pytest.mark.slow
 def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "VARIANTS", 2)
     tasks = tuple(f"{task.suite}/{task.name}" for task in (STOVE, MILK))

@@ -141,6 +141,7 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
     assert np.array_equal(json.loads(trajectory.resolved)["path"], trajectory.states)
 
 
+@pytest.mark.slow
 def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> None:
     environment = Environment(STOVE)
     np.random.seed(5)

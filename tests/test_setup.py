@@ -22,11 +22,12 @@ LIBRARIES = (
     "libMagickWand-6.Q16.so.6",
     "libavcodec.so.59",
 )
+BROWSER = "chromium-headless-shell"
 # As the real one does, `-m venv` makes pip, and pip uv; what they are called with is kept.
 PYTHON = """
 if [[ $* == "-m venv .venv" ]]; then
     mkdir -p .venv/bin
-    for tool in python pip uv; do
+    for tool in python pip uv ruff mypy pytest; do
         printf '#!/bin/bash\necho %s "$@" >>calls\n' "$tool" >.venv/bin/$tool
         chmod +x .venv/bin/$tool
     done
@@ -46,6 +47,11 @@ class Tree:
         (root / "pyproject.toml").touch()
         self.stub("python3.11", PYTHON.replace("{executable}", sys.executable))
         self.libraries(*LIBRARIES)
+        # The machine's commands, without the browser that is there when these tests run.
+        (root / "commands").mkdir()
+        for command in Path("/usr/bin").iterdir():
+            if command.name != BROWSER:
+                (root / "commands" / command.name).symlink_to(command)
 
     def stub(self, name: str, script: str) -> None:
         file = self.root / "bin" / name
@@ -59,7 +65,7 @@ class Tree:
     def setup(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             ["bash", self.root / "setup.sh", *arguments],
-            env={"PATH": f"{self.root / 'bin'}:/usr/bin:/bin", "HOME": str(self.root)},
+            env={"PATH": f"{self.root / 'bin'}:{self.root / 'commands'}", "HOME": str(self.root)},
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -116,7 +122,7 @@ def test_without_root_it_names_what_is_missing_and_stops(tree: Tree) -> None:
     tree.stub("sudo", "exit 1")
     done = tree.setup("test")
     assert done.returncode != 0
-    packages = "libegl-mesa0 libosmesa6 libmagickwand-6.q16-6 ffmpeg"
+    packages = f"libegl-mesa0 libosmesa6 libmagickwand-6.q16-6 ffmpeg {BROWSER}"
     assert f"takes root: {packages}\n" in done.stderr
     assert f"sudo apt-get install -y --no-install-recommends {packages}\n" in done.stderr
     assert not (tree.root / ".venv").exists()
@@ -129,6 +135,17 @@ def test_with_root_it_installs_what_is_missing(tree: Tree) -> None:
     done = tree.setup()
     assert done.returncode == 0, done.stderr
     assert "apt-get install -y --no-install-recommends ffmpeg -qq" in tree.calls()
+
+
+@pytest.mark.parametrize(("verb", "selection"), [("quick", "-m not slow"), ("test", "")])
+def test_checks_style_and_types_before_behaviour(tree: Tree, verb: str, selection: str) -> None:
+    if verb == "test":
+        tree.stub(BROWSER, "")
+    done = tree.setup(verb)
+    assert done.returncode == 0, done.stderr
+    *_, check, form, types, behaviour = tree.calls()
+    assert (check, form, types) == ("ruff check", "ruff format --check", "mypy")
+    assert behaviour == f"pytest {selection}".rstrip()
 
 
 def test_no_python_of_the_right_version(tree: Tree) -> None:

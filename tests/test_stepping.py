@@ -41,6 +41,7 @@ def test_whole_demonstrations_are_liberos_bit_for_bit(task: Task, whole: dict[Ta
     assert (len(np.unique(alphas, axis=0)) > 1) == (task == STOVE), "the stove's burner is lit on the way"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [DRAWER, MICROWAVE], ids=["drawer", "microwave"])
 def test_actions_beyond_their_limits_are_liberos_bit_for_bit(task: Task) -> None:
     environment, demo = Environment(task), starter_demo(task)

@@ -248,6 +248,7 @@ def test_rlds_holds_the_episodes(written: Written) -> None:
     assert "tensorflow" not in sys.modules
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("uv") is None, reason="uv makes the environment with TensorFlow")
 def test_rlds_reads_with_tensorflow(written: Written, tmp_path: Path) -> None:
     requirements = ["--with", "tensorflow-cpu==2.21.0", "--with", "tensorflow-datasets==4.9.10"]
@@ -301,6 +302,7 @@ def test_lerobot_holds_the_episodes(written: Written) -> None:
     assert info["splits"] == {"train": f"0:{len(IDS)}"}
 
 
+@pytest.mark.slow
 def test_lerobot_images_are_the_stored_frames(written: Written) -> None:
     assert_lerobot_episodes(written.images.root, exact=True)
     assert lerobot_index(written.images) == lerobot_index(written.lerobot)
@@ -314,6 +316,7 @@ def test_lerobot_images_are_the_stored_frames(written: Written) -> None:
     assert found == [frame for episode_id in IDS for frame in episode(episode_id).frames["wrist_image"]]
 
 
+@pytest.mark.slow
 def test_lerobot_images_read_when_they_spread_over_many_files(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
@@ -350,6 +353,7 @@ def assert_statistics(found: Mapping[str, Any], values: NDArray[Any], axes: int 
     np.testing.assert_array_equal(np.ravel(found["count"]), [len(values)])
 
 
+@pytest.mark.slow
 def test_lerobot_statistics_are_exact(written: Written) -> None:
     stats = LeRobotDataset(REPO, root=written.lerobot.root, video_backend="pyav").meta.stats
     sources = [episode(episode_id) for episode_id in IDS]
@@ -367,6 +371,7 @@ def test_lerobot_statistics_are_exact(written: Written) -> None:
             assert_statistics(of_episode, shown, (0, 1, 2))
 
 
+@pytest.mark.slow
 def test_lerobot_reads_when_videos_spread_over_many_files(written: Written, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lerobot_write, "PART_VIDEO_MB", 0.05)
@@ -393,6 +398,7 @@ def test_formats_carry_the_same_numbers(written: Written) -> None:
             np.testing.assert_array_equal(np.array([table[key][row] for row in rows], np.float32), steps[name])
 
 
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_the_workers(written: Written, tmp_path: Path) -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as executor:
         run = partial(spread, executor)

@@ -1,0 +1,68 @@
+"""An axis of your own, tried on a scene of a run: python examples/add_axis.py data/starter
+
+Both classes in a file of ``pipeline/axes``, and their names in its ``__init__.py``, make it an axis that
+configurations can name. CONTRIBUTING.md has the steps.
+"""
+
+import math
+import sys
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import mujoco
+import numpy as np
+
+from pipeline import seeding
+from pipeline.axes.base import Axis, Nearest, RenderPerturbation
+from pipeline.libero.tasks import find_task
+from pipeline.rendering.renderer import Renderer
+from pipeline.run import manifest
+from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Task
+
+
+class LensPerturbation(RenderPerturbation):
+    """Another field of view of the agent camera."""
+
+    axis: Literal["lens"] = "lens"
+    component: Literal["zoom"] = "zoom"
+    fovy_scale: float  # multiple of the scene's vertical field of view
+
+    views: ClassVar[frozenset[str]] = frozenset({"image"})
+    fields: ClassVar[tuple[str, ...]] = ("cam_fovy",)
+    clearance: ClassVar[float] = 0.0
+    measure: ClassVar[str] = "nothing to compare with: no test task changes the field of view"
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        model.cam_fovy[model.camera("agentview").id] *= self.fovy_scale
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        return Nearest(math.inf, 0)
+
+
+class LensAxis(Axis):
+    """Narrows the view by up to 6 % at level 1 and up to 30 % at level 5."""
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LensPerturbation:
+        level = self.draw_level(rng)
+        return LensPerturbation(level=level, fovy_scale=round(1 - 0.06 * (level - rng.random()), 4))
+
+
+def main(run: Path) -> None:
+    row = next(row for row in manifest.read(run / "manifest.parquet") if row["kept"])
+    task = find_task(row["suite"], row["task"])
+    trajectory = TrajectoryStore(run / "trajectories").load(row["trajectory_id"])
+    renderer = Renderer(trajectory.model_xml)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    before = renderer.frame("agentview").astype(int)
+    for variant in range(3):
+        lens = LensAxis().sample(seeding.rng(7, "lens", row["demo_id"], variant), task, variant)
+        with renderer.perturbed([lens]):
+            after = renderer.frame("agentview")
+        print(f"{lens.model_dump_json()}: frames differ by {np.abs(after - before).mean():.1f} grey levels")
+    renderer.close()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,34 @@
+"""Load the LeRobot set of a run as a PyTorch dataset: python examples/load_lerobot.py data/starter
+
+A policy that predicts several actions at once asks for them by ``delta_timestamps``, in seconds from the frame.
+"""
+
+import sys
+from pathlib import Path
+
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch.utils.data import DataLoader
+
+FPS_HZ = 20
+CHUNK = 10
+"""How many actions each sample has."""
+
+
+def main(run: Path) -> None:
+    (root,) = (run / "lerobot").iterdir()
+    dataset = LeRobotDataset(
+        root.name,  # only a name: the hub is not asked for what lies in `root`
+        root=root,
+        video_backend="pyav",
+        delta_timestamps={"action": [step / FPS_HZ for step in range(CHUNK)]},
+    )
+    print(f"{root.name}: {dataset.num_episodes} episodes, {dataset.num_frames} frames at {dataset.fps} Hz")
+    batch = next(iter(DataLoader(dataset, batch_size=4, shuffle=True)))
+    for name in ("observation.images.image", "observation.images.image2", "observation.state", "action"):
+        print(f"  {name}: {tuple(batch[name].shape)}")  # images are (N, 3, 256, 256), from 0 to 1
+    for instruction in batch["task"]:
+        print(f"  instruction: {instruction}")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,32 @@
+"""Read the manifest of a run with pandas: python examples/read_manifest.py data/starter
+
+The manifest has a row for every planned episode, kept or dropped. ``episode_id`` joins it with both datasets.
+``schemas/manifest.json`` says what each column means.
+"""
+
+import json
+import sys
+from pathlib import Path
+
+import pandas as pd
+
+
+def main(run: Path) -> None:
+    manifest = pd.read_parquet(run / "manifest.parquet")
+    print(f"{len(manifest)} planned, {manifest.kept.sum()} kept")
+    print(manifest.groupby(["axis", "reason"]).size().unstack(fill_value=0).to_string())
+
+    kept = manifest[manifest.kept].astype({"lerobot_episode_index": int, "rlds_index": int})
+    # Every parameter of what was changed, as JSON; an episode of several axes has several.
+    drawn = kept.perturbations.map(json.loads)
+    print(f"parameters of one episode: {drawn[drawn.str.len() > 0].iloc[0]}")
+
+    # Pairs for a comparison: a perturbed episode and the clean one of the same demonstration.
+    pairs = kept[kept.role == "perturbed"].merge(kept, left_on="twin_id", right_on="episode_id", suffixes=("", "_twin"))
+    index = "lerobot_episode_index"
+    print(f"{len(pairs)} pairs")
+    print(pairs[["axis", "component", "level", index, f"{index}_twin"]].to_string(index=False))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,57 @@
+"""The examples run on a finished run as they stand, and print what its manifest says."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+
+from pipeline.run import manifest
+
+pytestmark = pytest.mark.slow
+
+
+def printed(example: str, run: Path) -> str:
+    done = subprocess.run(
+        [sys.executable, REPOSITORY / "examples" / f"{example}.py", run], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def kept(run: Path) -> list[dict[str, object]]:
+    return [row for row in manifest.read(run / "manifest.parquet") if row["kept"]]
+
+
+def test_load_rlds(finished: Path) -> None:
+    output = printed("load_rlds", finished)
+    for suite, count in Counter(str(row["suite"]).removeprefix("libero_") for row in kept(finished)).items():
+        assert f"libero_tiny_{suite}: {count} episodes" in output
+    assert "image: (256, 256, 3) uint8" in output
+
+
+def test_load_lerobot(finished: Path) -> None:
+    output = printed("load_lerobot", finished)
+    frames = sum(int(str(row["steps"])) for row in kept(finished))
+    assert f"tiny: {len(kept(finished))} episodes, {frames} frames at 20 Hz" in output
+    assert "action: (4, 10, 7)" in output
+
+
+def test_read_manifest(finished: Path) -> None:
+    output = printed("read_manifest", finished)
+    assert f" planned, {len(kept(finished))} kept" in output
+    assert f"{sum(row['role'] == 'perturbed' for row in kept(finished))} pairs" in output
+
+
+def test_add_axis(finished: Path) -> None:
+    lines = printed("add_axis", finished).splitlines()
+    assert len(lines) == 3
+    for line in lines:
+        drawn, difference = line.rsplit(": frames differ by ", 1)
+        assert json.loads(drawn)["axis"] == "lens"
+        assert float(difference.split()[0]) > 0
