@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 import tensorflow_datasets as tfds
-from pipeline.validation.shards import records
+
+from pipeline.formats.tfrecord import records
 
 
 def main(run: Path) -> None:
