@@ -30,6 +30,11 @@ from pipeline.types import Demo, Task, Trajectory
 
 REPOSITORY = Path(__file__).parent.parent
 
+LIBC = ctypes.CDLL("libc.so.6")
+M_MMAP_THRESHOLD = -3
+# glibc gives blocks of this size back when they are freed; without a fixed size it soon keeps those of a whole scene.
+LIBC.mallopt(M_MMAP_THRESHOLD, 2**20)
+
 STOVE = find_task("libero_goal", "turn_on_the_stove")
 PLATE = find_task("libero_goal", "push_the_plate_to_the_front_of_the_stove")
 BOWL = find_task("libero_goal", "put_the_bowl_on_the_plate")
@@ -54,8 +59,7 @@ def memory() -> Iterator[None]:
     yield
     shared.cache_clear()
     gc.collect()
-    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc keeps what was freed
-        trim(0)
+    LIBC.malloc_trim(0)
 
 
 def starter_demo(task: Task) -> Demo:

@@ -143,9 +143,9 @@ def test_levels_and_components_can_be_chosen() -> None:
 
 
 def test_default_draws_are_clear_of_every_test_camera(test_set: TestSet) -> None:
-    start = time.perf_counter()
+    start = time.process_time()
     found = [p.nearest(test_set, MILK) for p in draws(CameraAxis())]
-    elapsed_ms = 1e3 * (time.perf_counter() - start) / len(found)
+    elapsed_ms = 1e3 * (time.process_time() - start) / len(found)
     assert {near.compared for near in found} == {len(test_set.tasks)}
     assert np.mean([near.distance >= CameraPerturbation.clearance for near in found]) > 0.99
     assert elapsed_ms < 1, "a plan asks this tens of thousands of times"
