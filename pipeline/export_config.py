@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 Count = Annotated[int, Field(ge=1)]
+Share = Annotated[float, Field(ge=0.0, le=0.5)]
 
 
 class _Frozen(BaseModel):
@@ -14,8 +15,17 @@ class _Frozen(BaseModel):
 
 
 class RldsConfig(_Frozen):
+    """How the RLDS sets are written.
+
+    Attributes:
+        name: what the sets' names begin with.
+        shards: TFRecord files, over all sets.
+        validation: share of each task's demonstrations whose episodes go into the split ``val`` instead of ``train``.
+    """
+
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     shards: Count
+    validation: Share = 0.0
 
 
 class LeRobotConfig(_Frozen):
@@ -25,11 +35,13 @@ class LeRobotConfig(_Frozen):
         name: of the dataset.
         parts: pieces written in parallel, then merged.
         frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
+        validation: share of each task's demonstrations whose episodes come last, as the split ``val``.
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     parts: Count
     frames: Literal["video", "images"] = "video"
+    validation: Share = 0.0
 
 
 class ExportConfig(_Frozen):

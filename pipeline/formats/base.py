@@ -10,8 +10,9 @@ import json
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
+from math import ceil
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from pipeline.errors import PipelineError
+from pipeline.seeding import digest
 from pipeline.types import Episode, Frame
 
 Load = Callable[[str], Episode]
@@ -40,12 +42,50 @@ class Episodes:
         load: reads one episode.
         suites: episode id to LIBERO suite.
         content: episode id to a token that changes with anything ``load`` would return.
+        demos: episode id to its demonstration, ``<suite>/<task>/<key>``.
     """
 
     ids: Sequence[str]
     load: Load
     suites: Mapping[str, str]
     content: Mapping[str, str]
+    demos: Mapping[str, str] = field(default_factory=dict)
+
+    def by_split(self, validation: float) -> dict[str, list[str]]:
+        """``train``, and ``val`` where a share is held out, to their episodes in the order of ``ids``.
+
+        A demonstration is held out with all of its episodes, so that no perturbed episode has its clean twin, or the
+        same actions, on the other side. Of each task at least one demonstration stays to train on.
+
+        Args:
+            validation: share of each task's demonstrations, by number, rounded; drawn by a hash of its name.
+
+        Raises:
+            PipelineError: when the demonstrations are too few to hold any out.
+        """
+        if not validation:
+            return {"train": list(self.ids)}
+        by_task: dict[str, set[str]] = {}
+        for episode_id in self.ids:
+            demo = self.demos[episode_id]
+            by_task.setdefault(demo.rpartition("/")[0], set()).add(demo)
+        held_out = {
+            demo
+            for demos in by_task.values()
+            for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: round(validation * len(demos))]
+            if len(demos) > 1
+        }
+        if not held_out:
+            raise PipelineError(
+                f"no task has enough demonstrations to hold {validation:g} of them out",
+                where="export.<format>.validation",
+                expected=f"{ceil(0.5 / validation)} or more demonstrations of a task",
+                remedy="use more demonstrations, a larger share, or 0",
+            )
+        splits: dict[str, list[str]] = {"train": [], "val": []}
+        for episode_id in self.ids:
+            splits["val" if self.demos[episode_id] in held_out else "train"].append(episode_id)
+        return splits
 
 
 @dataclass(frozen=True)

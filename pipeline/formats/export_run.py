@@ -32,4 +32,5 @@ def kept_episodes(config: Config) -> Episodes:
         load=EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render),
         suites={episode_id: suites[episode_id] for episode_id in run.kept},
         content=run.contents(),
+        demos={row.episode_id: row.demo_id for row in run.rows},
     )

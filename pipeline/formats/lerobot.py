@@ -19,7 +19,7 @@ class LeRobot(Format[LeRobotConfig]):
 
     name: ClassVar = "lerobot"
     title: ClassVar = "LeRobot"
-    recipe: ClassVar = 1
+    recipe: ClassVar = 2
     packages: ClassVar = ("lerobot", "datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
@@ -35,8 +35,14 @@ class LeRobot(Format[LeRobotConfig]):
         return self.folder / self.options.name
 
     def pieces(self, episodes: Episodes) -> dict[str, list[str]]:
-        slices = split(episodes.ids, self.options.parts)
-        return {f"parts/part-{part:05d}": ids for part, ids in enumerate(slices)}
+        # lerobot's splits are ranges of episodes, so each split has parts of its own, one after the other.
+        return {
+            f"parts/{split_name}-{part:05d}": ids
+            for split_name, members in episodes.by_split(self.options.validation).items()
+            for part, ids in enumerate(
+                split(members, max(1, round(self.options.parts * len(members) / len(episodes.ids))))
+            )
+        }
 
     def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
         from pipeline.formats import lerobot_write
@@ -48,6 +54,11 @@ class LeRobot(Format[LeRobotConfig]):
 
         root = work / "dataset" / self.options.name
         lerobot_write.merge([work / piece for piece in pieces], root, work / "cache", repo_id=self.options.name)
+        lengths: dict[str, int] = {}
+        for piece, members in pieces.items():
+            split_name = Path(piece).name.partition("-")[0]
+            lengths[split_name] = lengths.get(split_name, 0) + len(members)
+        lerobot_write.name_splits(root, lengths)
         ids = [episode_id for piece in pieces.values() for episode_id in piece]
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 

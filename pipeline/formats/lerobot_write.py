@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import write_stats
+from lerobot.datasets.utils import write_info, write_stats
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA, check
@@ -51,6 +51,10 @@ EPISODES_MB = 2
 """Size of the files in ``meta/episodes``, which the merge rewrites for each part: an episode is 1 kB in the file and
 more than 100 in memory."""
 
+
+EPISODE_ID = "episode_id"
+"""A column of every frame, because lerobot's tools to delete, split and merge number episodes anew and leave
+``meta/provenance.parquet`` behind: with it, an episode is still found in the manifest."""
 
 SUMMARY, DATASET = "summary.json", "dataset"
 """In a part's folder: what the merge needs beside the dataset, and the dataset."""
@@ -129,6 +133,20 @@ def merge(parts: Sequence[Path], root: Path, cache: Path, *, repo_id: str) -> No
     _write_provenance(root, [row for summary in summaries for row in summary["provenance"]])
 
 
+def name_splits(root: Path, lengths: Mapping[str, int]) -> None:
+    """Write into ``meta/info.json`` which episodes each split has: ranges, one after the other.
+
+    Args:
+        root: of a dataset, as merged.
+        lengths: split to its number of episodes.
+    """
+    file = root / "meta" / "info.json"
+    info = json.loads(file.read_text())
+    ends = np.cumsum(list(lengths.values())).tolist()
+    info["splits"] = {name: f"{end - length}:{end}" for (name, length), end in zip(lengths.items(), ends, strict=True)}
+    write_info(info, root)
+
+
 def features(frames: Frames) -> dict[str, dict[str, Any]]:
     """lerobot's description of the columns."""
     dtype = {"video": "video", "images": "image"}[frames]
@@ -136,7 +154,7 @@ def features(frames: Frames) -> dict[str, dict[str, Any]]:
     columns = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
     for vector in (SCHEMA.state, SCHEMA.joint_state, SCHEMA.action):
         columns[vector.lerobot_key] = {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
-    return columns
+    return columns | {EPISODE_ID: {"dtype": "string", "shape": (1,), "names": None}}
 
 
 def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
@@ -145,6 +163,7 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
     columns = dataset.create_episode_buffer()
     columns |= {"size": steps, "task": [episode.instruction] * steps}
     columns |= {"frame_index": list(range(steps)), "timestamp": [t / SCHEMA.fps_hz for t in range(steps)]}
+    columns[EPISODE_ID] = [episode.episode_id] * steps
     for name in ("state", "joint_state", "action"):
         columns[getattr(SCHEMA, name).lerobot_key] = list(getattr(episode, name))
     encoder = dataset._streaming_encoder
@@ -203,7 +222,7 @@ def _write_statistics(root: Path, counts: Mapping[str, Counts]) -> None:
     """Write ``meta/stats.json`` over lerobot's, from every row and every pixel."""
     exact = {view.lerobot_key: statistics(counts[name]) for name, view in SCHEMA.views.items()}
     data = pq.ParquetDataset(root / "data")
-    for column in [name for name in data.schema.names if name not in exact]:
+    for column in [name for name in data.schema.names if name not in exact and name != EPISODE_ID]:
         values = data.read(columns=[column])[column].combine_chunks()
         flat = values.flatten() if pa.types.is_nested(values.type) else values
         exact[column] = _column_statistics(flat.to_numpy().astype(np.float64).reshape(len(values), -1))

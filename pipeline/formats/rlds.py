@@ -11,7 +11,7 @@ import pyarrow as pa
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Copy, Episodes, Fault, Format, Load, Row, column, split
-from pipeline.formats.rlds_layout import SPLIT, VERSION, by_suite, dataset_of, shard_path
+from pipeline.formats.rlds_layout import VERSION, by_suite, dataset_of, shard_path
 
 
 class Rlds(Format[RldsConfig]):
@@ -29,17 +29,14 @@ class Rlds(Format[RldsConfig]):
     clients: ClassVar = ("openvla_oft",)
 
     def pieces(self, episodes: Episodes) -> dict[str, list[str]]:
-        return {
-            f"dataset/{shard_path(name, shard, len(slices))}": ids
-            for name, slices in self._slices(episodes).items()
-            for shard, ids in enumerate(slices)
-        }
-
-    def _slices(self, episodes: Episodes) -> dict[str, list[list[str]]]:
-        """Set name to the episodes of each of its shards; shards are dealt out by the number of episodes."""
-        sets = by_suite(episodes.ids, episodes.suites, self.options.name)
-        shards = {name: max(1, round(self.options.shards * len(ids) / len(episodes.ids))) for name, ids in sets.items()}
-        return {name: split(ids, shards[name]) for name, ids in sets.items()}
+        pieces: dict[str, list[str]] = {}
+        for split_name, members in episodes.by_split(self.options.validation).items():
+            for name, ids in by_suite(members, episodes.suites, self.options.name).items():
+                # Shards are dealt out by the number of episodes.
+                slices = split(ids, max(1, round(self.options.shards * len(ids) / len(episodes.ids))))
+                for shard, slice_ids in enumerate(slices):
+                    pieces[f"dataset/{shard_path(name, split_name, shard, len(slices))}"] = slice_ids
+        return pieces
 
     def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
         from pipeline.formats import rlds_write
@@ -73,7 +70,7 @@ class Rlds(Format[RldsConfig]):
         builders = "".join(
             f"""\
 builder = tfds.builder_from_directory(f"{{os.environ['DATA']}}/rlds/{dataset}/{VERSION}")
-for episode in builder.as_dataset(split="{SPLIT}"):
+for episode in builder.as_dataset(split="train"):
     for step in episode["steps"]:
         image, action, text = step["observation"]["image"], step["action"], step["language_instruction"]
 """

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from pipeline.formats.base import Row, split
 
 VERSION = "1.0.0"
-SPLIT = "train"
 
 
-def shard_path(name: str, shard: int, shards: int) -> str:
+def shard_path(name: str, split_name: str, shard: int, shards: int) -> str:
     """Path of a shard below the folder of all sets, as TFDS names it."""
-    return f"{name}/{VERSION}/{name}-{SPLIT}.tfrecord-{shard:05d}-of-{shards:05d}"
+    return f"{name}/{VERSION}/{name}-{split_name}.tfrecord-{shard:05d}-of-{shards:05d}"
+
+
+def split_of(shard: Path) -> str:
+    """The split, ``train`` or ``val``, that a shard belongs to."""
+    return shard.name.partition(".")[0].rpartition("-")[2]
 
 
 def dataset_of(row: Row) -> str:

@@ -12,7 +12,7 @@ import tensorflow_datasets as tfds
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Copy, Fault, Row, sampled
-from pipeline.formats.rlds_layout import SPLIT, VERSION, dataset_of
+from pipeline.formats.rlds_layout import VERSION, dataset_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans
 from pipeline.rendering.jpeg import decode
@@ -33,7 +33,11 @@ def check(root: Path, kept: Mapping[str, Row]) -> Iterator[tuple[str, Fault]]:
         info = _info(folder)
         if info.features.to_json() != features().to_json():
             yield "format", Fault("rlds", None, f"features.json of {name} is another", "the one of this version")
-        lengths = dict(zip(info.splits[SPLIT].filenames, info.splits[SPLIT].shard_lengths, strict=True))
+        lengths = {
+            shard: length
+            for split_info in info.splits.values()
+            for shard, length in zip(split_info.filenames, split_info.shard_lengths, strict=True)
+        }
         there = {path.name for path in folder.glob("*.tfrecord-*")}
         if set(lengths) != there:
             yield "format", Fault("rlds", None, f"{name} has the shards {sorted(there)}", f"{sorted(lengths)}")

@@ -16,7 +16,7 @@ import tensorflow_datasets as tfds
 
 from pipeline.episode_schema import SCHEMA, VectorSpec, check
 from pipeline.formats.base import Load
-from pipeline.formats.rlds_layout import SPLIT, VERSION
+from pipeline.formats.rlds_layout import VERSION, split_of
 from pipeline.formats.tfrecord import OVERHEAD_BYTES, framed
 from pipeline.types import Episode
 
@@ -41,17 +41,22 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int]) -> None:
         folder: ``<name>/1.0.0``.
         lengths: each shard of it, in order, to its number of episodes.
     """
-    template = tfds.core.ShardedFileTemplate(
-        data_dir=folder, dataset_name=folder.parent.name, split=SPLIT, filetype_suffix="tfrecord"
-    )
-    stored = sum(shard.stat().st_size - OVERHEAD_BYTES * length for shard, length in lengths.items())
-    info = tfds.core.SplitInfo(
-        name=SPLIT, shard_lengths=list(lengths.values()), num_bytes=stored, filename_template=template
-    )
+    infos = []
+    for split_name in sorted({split_of(shard) for shard in lengths}):
+        template = tfds.core.ShardedFileTemplate(
+            data_dir=folder, dataset_name=folder.parent.name, split=split_name, filetype_suffix="tfrecord"
+        )
+        shards = {shard: length for shard, length in lengths.items() if split_of(shard) == split_name}
+        stored = sum(shard.stat().st_size - OVERHEAD_BYTES * length for shard, length in shards.items())
+        infos.append(
+            tfds.core.SplitInfo(
+                name=split_name, shard_lengths=list(shards.values()), num_bytes=stored, filename_template=template
+            )
+        )
     tfds.folder_dataset.write_metadata(
         data_dir=folder,
         features=features(),
-        split_infos=[info],
+        split_infos=infos,
         version=VERSION,
         filename_template=template,
         check_data=False,  # the check needs TensorFlow

@@ -1,0 +1,78 @@
+"""A validation split holds out whole demonstrations, and lerobot's tools keep the episodes' ids."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import tensorflow_datasets as tfds
+from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from test_writers import IDS, NAME, SET, episode, loop, write_lerobot
+
+from pipeline.errors import PipelineError
+from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.formats.base import Episodes
+from pipeline.formats.export import export
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.rlds import Rlds
+from pipeline.formats.tfrecord import METADATA, columns, records
+
+DEMOS = {episode_id: f"libero_spatial/task/demo_{number // 2}" for number, episode_id in enumerate(IDS)}
+"""Two episodes of each of three demonstrations."""
+
+
+@pytest.fixture(scope="module")
+def episodes() -> Episodes:
+    return Episodes(IDS, episode, dict.fromkeys(IDS, "libero_spatial"), dict.fromkeys(IDS, "content"), DEMOS)
+
+
+def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
+    splits = episodes.by_split(0.34)
+    assert sorted(splits["train"] + splits["val"]) == sorted(IDS)
+    assert len(splits["val"]) == 2
+    sides = [{DEMOS[episode_id] for episode_id in ids} for ids in splits.values()]
+    assert not sides[0] & sides[1]
+    assert episodes.by_split(0.0) == {"train": IDS}
+    with pytest.raises(PipelineError, match=r"(?s)no task has enough demonstrations.*5 or more"):
+        episodes.by_split(0.1)
+
+
+def test_tfds_finds_both_splits(episodes: Episodes, tmp_path: Path) -> None:
+    export(Rlds(tmp_path, RldsConfig(name=NAME, shards=3, validation=0.34)), episodes, loop)
+    info = tfds.builder_from_directory(tmp_path / "rlds" / SET / "1.0.0").info
+    assert {name: split.num_examples for name, split in info.splits.items()} == {"train": 4, "val": 2}
+    for name, ids in episodes.by_split(0.34).items():
+        shards = [tmp_path / "rlds" / SET / "1.0.0" / file for file in info.splits[name].filenames]
+        stored = [columns(record, info.features) for shard in shards for record in records(shard)]
+        assert [steps[f"{METADATA}episode_id"][0].decode() for steps in stored] == ids
+
+
+def episode_ids(dataset: LeRobotDataset) -> list[str]:
+    """By the column of the frames, in the order of the dataset's own indices."""
+    frames = dataset.hf_dataset.with_format(None)
+    ids = dict(zip(frames["episode_index"], frames["episode_id"], strict=True))
+    return [ids[index] for index in sorted(ids)]
+
+
+def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, tmp_path: Path) -> None:
+    target = LeRobot(tmp_path, LeRobotConfig(name=NAME, parts=3, validation=0.34))
+    export(target, episodes, loop)
+    assert json.loads((target.root / "meta" / "info.json").read_text())["splits"] == {"train": "0:4", "val": "4:6"}
+    splits = episodes.by_split(0.34)
+    assert episode_ids(LeRobotDataset(NAME, root=target.root)) == splits["train"] + splits["val"]
+
+
+def test_lerobots_tools_keep_the_episodes_ids(tmp_path: Path) -> None:
+    root = write_lerobot(tmp_path).root
+    dataset = LeRobotDataset(NAME, root=root)
+    assert episode_ids(dataset) == IDS
+    fewer = delete_episodes(dataset, [0, 3], output_dir=tmp_path / "fewer", repo_id="fewer")
+    assert episode_ids(fewer) == [IDS[index] for index in (1, 2, 4, 5)]
+    halves = split_dataset(dataset, {"one": [0, 1, 2], "two": [3, 4, 5]}, output_dir=tmp_path / "halves")
+    assert episode_ids(halves["two"]) == IDS[3:]
+    merged = merge_datasets([halves["two"], halves["one"]], output_repo_id="merged", output_dir=tmp_path / "merged")
+    assert episode_ids(merged) == IDS[3:] + IDS[:3]
+    shutil.rmtree(tmp_path / "halves")
