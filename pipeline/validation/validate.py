@@ -26,7 +26,7 @@ from pipeline.validation import oft, run_checks
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import rendered, witnesses
 
-SLICE = 16
+SLICE = 4
 """So many episodes are checked in one call."""
 
 
