@@ -22,6 +22,7 @@ from pipeline import gl
 from pipeline.config import ComputeConfig, RenderConfig
 from pipeline.errors import PipelineError
 from pipeline.rendering.render import RenderJob
+from pipeline.run.cluster import Workplace
 from pipeline.run.compute import runner
 
 Start = Callable[..., str]
@@ -139,6 +140,12 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     assert "runs 2 threads" in message
     assert "dask worker ADDRESS --nthreads 1" in message
     assert not list((tmp_path / "elsewhere").rglob("data"))
+
+    from distributed import Client
+
+    # As a worker finds out that joins when the work is under way.
+    with Client(address) as client, pytest.raises(PipelineError, match=r"does not see .* other packages or other code"):
+        client.submit(Workplace(Path.cwd(), folder / "token", "another setup").enter).result()
 
 
 def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path) -> None:

@@ -54,10 +54,14 @@ class Workplace:
         global _entered
         if _entered == self:
             return
-        if not self.token.is_file():
-            raise _refusal(f"worker on {platform.node()}", [_not_shared(self)])
+        from distributed import get_worker
+
+        faults = [] if self.token.is_file() else [_not_shared(self)]
         if digest("setup", setup()) != self.setup:
-            raise _refusal(f"worker on {platform.node()}", ["has other packages or other code than the run"])
+            faults.append("has other packages or other code than the run")
+        faults += _crowded(get_worker().state.nthreads)
+        if faults:
+            raise _refusal(f"worker on {platform.node()}", faults)
         _forget()
         _entered = self
 
@@ -143,9 +147,11 @@ def _faults(workplace: Workplace, report: Any, threads: int) -> list[str]:
     for name, ours in setup().items():
         if theirs.get(name) != ours:
             faults.append(f"has {name} {theirs.get(name, 'not installed')}, the run has {ours}")
-    if threads != 1:
-        faults.append(f"runs {threads} threads, and the simulator needs a process for itself")
-    return faults
+    return faults + _crowded(threads)
+
+
+def _crowded(threads: int) -> list[str]:
+    return [] if threads == 1 else [f"runs {threads} threads, and the simulator needs a process for itself"]
 
 
 def _not_shared(workplace: Workplace) -> str:
