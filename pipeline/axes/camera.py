@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pipeline.axes.base import Axis, Frozen, Intervals, Nearest, RenderPerturbation, draw
+from pipeline.axes.base import Axis, Frozen, Intervals, RenderPerturbation, draw
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -83,16 +83,15 @@ class CameraPerturbation(RenderPerturbation):
         camera = model.camera("agentview")
         camera.pos[:], camera.quat[:] = self.pose(camera.pos.copy(), camera.quat.copy())
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """The nearest of all test cameras, whichever task they are for: many tasks share one nominal view."""
-        cameras, compared = _test_cameras(test)
-        if not compared:
-            return Nearest(np.inf, 0)
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """To all test cameras, whichever task they are for: many tasks share one nominal view."""
+        cameras, which = _test_cameras(test)
         own = _embed(*np.array([self._parameters()]).T)
         sphere = _angle_deg(cameras.rays @ own.rays[0])
         turn = 2 * _angle_deg(np.abs(cameras.turns @ own.turns[0]))
         dolly = np.rad2deg(np.abs(cameras.log_scales - own.log_scales[0]))
-        return Nearest(float(np.maximum(np.maximum(sphere, turn), dolly).min()), compared)
+        largest: Floats = np.maximum(np.maximum(sphere, turn), dolly)[which]
+        return largest
 
     def _parameters(self) -> tuple[float, ...]:
         return self.azimuth_deg, self.elevation_deg, self.distance_scale, self.yaw_deg, self.pitch_deg
@@ -123,11 +122,12 @@ def _angle_deg(cosine: Floats) -> Floats:
 
 
 @lru_cache(maxsize=4)
-def _test_cameras(test: TestSet) -> tuple[_Cameras, int]:
-    """The distinct cameras of the test set, and how many of its tasks have one of them."""
+def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
+    """The distinct cameras of the test set, and which of them each test task has."""
     names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
     listed = [[float(task.parameters[name]) for name in names] for task in test.of("camera")]
-    return _embed(*np.unique(np.array(listed).reshape(-1, len(names)), axis=0).T), len(listed)
+    distinct, which = np.unique(np.array(listed).reshape(-1, len(names)), axis=0, return_inverse=True)
+    return _embed(*distinct.T), which.reshape(-1)
 
 
 ByLevel = tuple[Intervals, Intervals, Intervals, Intervals, Intervals]
