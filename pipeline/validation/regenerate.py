@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.identity import versions
+from pipeline.libero.tasks import find_task
 from pipeline.physics.replay import ReplayJob
 from pipeline.rendering.render import RenderJob
 from pipeline.rendering.renderer import GL
@@ -135,7 +136,8 @@ def _rebuild(
     verdict = replay(row)
     if not verdict.kept:
         return None, verdict.reason
-    RenderJob(trajectory_id, streams, trajectories, frames, settings.render)()
+    task = find_task(row["suite"], row["task"])
+    RenderJob(trajectory_id, task, streams, trajectories, frames, settings.render)()
     if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)
