@@ -31,7 +31,8 @@ from pipeline.seeding import digest
 
 Layer = Literal["physics", "pixels", "encoding"]
 
-RECIPES: dict[Layer, int] = {"physics": 1, "pixels": 1, "encoding": 1}
+RECIPES: dict[Layer, int] = {"physics": 1, "pixels": 2, "encoding": 1}
+"""2 of ``pixels``: cameras that lose sight of the task are refused."""
 
 PACKAGES: dict[Layer, tuple[str, ...]] = {
     "physics": (

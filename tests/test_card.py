@@ -67,6 +67,7 @@ ROWS = [
     row("layout", LAYOUT, task=STOVE, reason="reserve_not_needed", steps=None),
     row("camera+background", CAMERA, BACKGROUND),
 ]
+COVERAGE = {"test_tasks": 313, "compared": 313, "smallest": 5.379, "median": 6.12, "p90": 7.34, "largest": 8.56}
 FINDING = {"rows": 3, "test_tasks": 1599, "comparisons": 4797, "smallest": 5.379, "closest": "e", "clearance": 5.0}
 VALIDATION: dict[str, dict[str, Any]] = {"gripper": {"checked": 7, "findings": []}}
 
@@ -77,7 +78,10 @@ def data(tmp_path: Path) -> Path:
     pq.write_table(pa.Table.from_pylist(ROWS), tmp_path / "manifest.parquet")
     column = list(range(1, 8))
     for name, report in {
-        "leakage.json": {"camera": FINDING | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint"}},
+        "leakage.json": {
+            "camera": FINDING
+            | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint", "coverage": {"distance": COVERAGE}}
+        },
         "validation.json": VALIDATION,
         "dataset_statistics.json": {
             NAME: {"action": dict.fromkeys(("mean", "std", "min", "max", "q01", "q99"), column)}
@@ -139,6 +143,7 @@ def test_tables_say_what_the_manifest_says(data: Path) -> None:
     assert cells(text, "layout", "Yield") == ["2", "2", "1", "50%", "goal_not_reached 1", "tracked 1"]
     assert cells(text, "camera", "Yield") == ["2", "2", "2", "100%", "-", "open_loop 2"]
     assert cells(text, "camera", "Distance to the LIBERO-Plus test set")[-2:] == ["5.38", "disjoint"]
+    assert "| camera | distance | 313 | 313 | 5.38 | 6.12 | 7.34 | 8.56 |" in text
     assert "hf download OWNER/NAME" in text
     assert re.search(rf"regenerate ({'|'.join(row['episode_id'] for row in ROWS if row['kept'])}) --manifest", text)
 

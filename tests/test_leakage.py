@@ -128,6 +128,43 @@ def test_draws_are_mostly_clear_and_the_rest_is_counted(axis: str, test: TestSet
         assert finding.verdict == ("overlap" if overlaps else "disjoint")
 
 
+def test_coverage_is_the_distance_of_test_tasks_to_what_is_wanted(test: TestSet) -> None:
+    task = find_task("libero_goal", "turn_on_the_stove")
+
+    def gaussian(sigma_px: float) -> Row:
+        effect = {"sigma_px": sigma_px}
+        fields = {"axis": "noise", "component": "gaussian", "level": 1, "effect": effect, "seed": 1}
+        return row(task, from_json(json.dumps([fields])), f"{sigma_px}")
+
+    # In steps: the weak one stands half a step from severity 1 and 8.5 from severity 10, the reserve does not count.
+    rows = [gaussian(1.5), replace(gaussian(9.5), wanted=False)]
+    found = leakage.check(rows, test)["noise"].coverage
+    assert set(found) == {"motion", "gaussian", "zoom", "fog", "glass"}
+    assert (found["fog"].test_tasks, found["fog"].compared, found["fog"].median) == (272, 0, None)
+    assert (found["gaussian"].test_tasks, found["gaussian"].compared) == (341, 341)
+    assert (found["gaussian"].smallest, found["gaussian"].largest) == (0.5, 8.5)
+    severities = [int(tested.parameters["severity"]) for tested in test.of("noise") if tested.component == "gaussian"]
+    assert found["gaussian"].median == np.median(np.abs(np.array(severities) - 1.5))
+    # Each test task counts with the nearest episode.
+    both = leakage.check([replace(one, wanted=True) for one in rows], test)["noise"].coverage["gaussian"]
+    assert (both.largest, both.compared) == (3.5, 341)
+
+
+def test_coverage_is_by_task_where_a_task_has_test_tasks_of_its_own(test: TestSet) -> None:
+    language = test.of("language")[0]
+    task = find_task(language.suite, language.base)
+    (found,) = leakage.check([row(task, [repeated(language)], "one")], test)["language"].coverage.values()
+    assert (found.test_tasks, found.compared, found.smallest) == (1537, len(test.on(task, "language")), 0)
+
+
+@pytest.mark.parametrize("axis", ["light", "background", "layout"])
+def test_where_near_cannot_be_told_from_far_there_is_no_coverage(axis: str, test: TestSet) -> None:
+    task = tasks(SUITES[2])[3]
+    drawn = get_args(Axes.model_fields[axis].annotation)[0]().sample(seeding.rng(5, axis), task, 0)
+    coverage = leakage.check([row(task, [drawn], "one")], test)[axis].coverage
+    assert {(found.compared, found.median) for found in coverage.values()} == {(0, None)}
+
+
 @pytest.mark.parametrize("robot", ["mounted_panda", "on_the_ground_panda"])
 def test_the_robot_axis_knows_the_benchmarks_postures(robot: str) -> None:
     with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as wheel:
@@ -206,6 +243,7 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     assert done.returncode == 0, done.stderr
     assert re.search(r"noise +9 +1,601 +0 +0\.[45] +0\.25 +disjoint", done.stdout), done.stdout
     assert "noise: steps between the benchmark's severities" in done.stdout
+    assert re.search(r"noise +gaussian +341 +0\.5 +", done.stdout), done.stdout
     report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
     assert (report["noise"]["overlaps"], report["noise"]["verdict"]) == (0, "disjoint")
     assert report["noise"]["smallest"] >= report["noise"]["clearance"]

@@ -208,7 +208,7 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
     shown = stage.frames(VIEWS)
     stage.close()
     streams = streams_of("[]")
-    rendered = render(begun, list(streams.values()), STARTER.render)
+    rendered = render(begun, STOVE, list(streams.values()), STARTER.render)
     for view, frame in zip(VIEWS, shown, strict=True):
         compressed = decode(rendered.streams[streams[view].stream_id][0])
         assert np.abs(compressed.astype(int) - frame).mean() < 2

@@ -28,6 +28,7 @@ from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.rendering.jpeg import decode, encode, to_policy  # noqa: E402
 from pipeline.rendering.render import render  # noqa: E402
 from pipeline.rendering.renderer import Renderer  # noqa: E402
+from pipeline.rendering.sight import LEAST_PX, MOST_OUTSIDE, Sight  # noqa: E402
 from pipeline.run.frame_store import FrameStore, stream_ids  # noqa: E402
 from pipeline.run.streams import Stream, streams_of  # noqa: E402
 from pipeline.scenes.compiled import proprioception  # noqa: E402
@@ -151,7 +152,7 @@ def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path
         Stream("wrist_image", ()),
     ]
     config = RenderConfig()
-    rendered = render(trajectory, streams, config)
+    rendered = render(trajectory, MILK, streams, config)
     assert set(rendered.streams) == {stream.stream_id for stream in streams}
     assert rendered.state.shape == (steps, 8)
     assert rendered.joint_state.shape == (steps, 7)
@@ -181,7 +182,7 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     # LIBERO's head light keeps frames from being black, so put it out as no draw can.
     dark = '<visual><headlight diffuse="0 0 0" ambient="0 0 0" specular="0 0 0"/></visual>'
     unlit = trajectory.model_xml.replace("<worldbody>", f"{dark}<worldbody>", 1)
-    rendered = render(replace(trajectory, model_xml=unlit), streams, RenderConfig())
+    rendered = render(replace(trajectory, model_xml=unlit), MILK, streams, RenderConfig())
     assert rendered.rejected == {streams[1].stream_id: "too_dark"}
     assert set(rendered.streams) == {streams[0].stream_id, streams[2].stream_id}
     store = FrameStore(tmp_path, RenderConfig())
@@ -189,3 +190,62 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     row = store.rows()["t"]
     assert stream_ids(row) == {stream.stream_id for stream in streams}
     assert json.loads(row["rejected"]) == rendered.rejected
+
+
+def test_geoms_are_those_that_pixels_show(whole: dict[Task, Trajectory]) -> None:
+    trajectory = whole[MILK]
+    renderer = Renderer(trajectory.model_xml)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    before = renderer.frame("agentview")
+    seen = renderer.geoms("agentview")
+    assert np.array_equal(renderer.frame("agentview"), before), "looking for geoms changes later frames"
+    milk = renderer.model.geom_bodyid == renderer.model.body("milk_1_main").id
+    renderer.model.geom_group[milk] = 5  # not shown
+    gone = (np.abs(renderer.frame("agentview").astype(int) - before) > 5).any(axis=2)
+    renderer.close()
+    shown = milk[seen] & (seen >= 0)
+    assert shown.sum() > 100
+    assert (gone & shown).sum() > 0.9 * shown.sum()
+    assert (gone & ~shown).sum() < 0.1 * shown.sum()
+
+
+def test_a_camera_that_loses_sight_of_the_task_is_rejected_with_its_reason(whole: dict[Task, Trajectory]) -> None:
+    source = whole[MILK]
+    trajectory = replace(source, states=source.states[:9], actions=source.actions[:8])
+    cameras = {
+        "seen": MOVED,
+        # The basket leaves the frame at its side; then the hand at its top.
+        "task_object_not_seen": CameraPerturbation(component="orientation", level=5, yaw_deg=18.0),
+        "hand_not_seen": CameraPerturbation(component="orientation", level=5, pitch_deg=16.0),
+    }
+    streams = {name: Stream("image", (camera,)) for name, camera in cameras.items()}
+    rendered = render(trajectory, MILK, list(streams.values()), RenderConfig())
+    assert rendered.rejected == {streams[name].stream_id: name for name in cameras if name != "seen"}
+    assert set(rendered.streams) == {streams["seen"].stream_id}
+
+
+def test_what_the_original_does_not_show_either_is_no_reason() -> None:
+    seen = Sight({"milk_1": 300, "basket_1": 900}, 0.0)
+    assert Sight({"milk_1": LEAST_PX, "basket_1": 900}, MOST_OUTSIDE).faults(seen) == []
+    assert Sight({"milk_1": LEAST_PX - 1, "basket_1": 900}, 0.0).faults(seen) == ["task_object_not_seen"]
+    assert Sight({"milk_1": 300, "basket_1": 900}, MOST_OUTSIDE + 0.01).faults(seen) == ["hand_not_seen"]
+    hidden = Sight({"milk_1": 5, "basket_1": 900}, 0.5)
+    assert Sight({"milk_1": 5, "basket_1": 900}, 0.5).faults(hidden) == []
+    assert Sight({"milk_1": 4, "basket_1": 900}, 0.6).faults(hidden) == ["task_object_not_seen", "hand_not_seen"]
+
+
+def test_the_hand_is_outside_where_its_place_is_not_in_the_frame(whole: dict[Task, Trajectory]) -> None:
+    trajectory = whole[MILK]
+    renderer = Renderer(trajectory.model_xml)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    seen = renderer.geoms("agentview")
+    bodies = set(renderer.model.geom_bodyid[seen[seen >= 0]].tolist())
+    within_m = [renderer.data.body(name).xpos for name in ("milk_1_main", "basket_1_main")]
+    assert {renderer.model.body(name).id for name in ("milk_1_main", "basket_1_main")} <= bodies, "these are seen"
+    camera = renderer.data.camera("agentview")
+    ahead_m = -camera.xmat.reshape(3, 3)[:, 2]
+    beside_m = [within_m[0] + [0.0, 2.0, 0.0], within_m[0] - [0.0, 2.0, 0.0], camera.xpos - ahead_m]
+    assert Sight.of(renderer, MILK, np.array([*within_m, camera.xpos + ahead_m])).hand_outside == 0.0
+    assert Sight.of(renderer, MILK, np.array(beside_m)).hand_outside == 1.0
+    assert Sight.of(renderer, MILK, np.array([*within_m, *beside_m])).hand_outside == 3 / 5
+    renderer.close()

@@ -123,6 +123,10 @@ def test_numbers_are_those_of_the_manifest(page: Page, finished: Path) -> None:
     assert words.count("goal_not_reached") == 1
     for finding in json.loads((finished / "leakage.json").read_text()).values():
         assert finding["measure"] in words
+        for component, covered in finding["coverage"].items():
+            figures = [covered[name] for name in ("smallest", "median", "p90", "largest")]
+            shown = " ".join("-" if figure is None else f"{figure:.3g}" for figure in figures)
+            assert f"{component.replace('_', ' ')} {shown} {covered['test_tasks']:,}" in words
 
 
 def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Page, finished: Path) -> None:

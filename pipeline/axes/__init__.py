@@ -61,8 +61,8 @@ class Axes(Frozen):
     language: LanguageAxis | None = None
 
 
-_LAYERS: dict[str, Layer] = {
-    kind.model_fields["axis"].default: kind.layer for kind in get_args(get_args(AnyPerturbation)[0])
+_KINDS: dict[str, type[Perturbation]] = {
+    kind.model_fields["axis"].default: kind for kind in get_args(get_args(AnyPerturbation)[0])
 }
 _PLACE = {axis: place for place, axis in enumerate(Axes.model_fields)}
 
@@ -85,7 +85,12 @@ def axes_of(name: str) -> tuple[str, ...]:
 
 def layer_of(axis: str) -> Layer:
     """The layer that an axis, by its name, changes."""
-    return _LAYERS[axis]
+    return _KINDS[axis].layer
+
+
+def kind_of(axis: str) -> type[Perturbation]:
+    """The perturbations of an axis, by its name."""
+    return _KINDS[axis]
 
 
 def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:
@@ -132,6 +137,7 @@ __all__ = [
     "axes_of",
     "from_json",
     "in_order",
+    "kind_of",
     "layer_of",
     "of_layer",
     "to_json",

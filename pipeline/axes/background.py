@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, Nearest, RenderPerturbation
+from pipeline.axes.base import Axis, Frozen, RenderPerturbation
 from pipeline.catalogue import textures
 from pipeline.catalogue.texture_sources import Source, Texture
 from pipeline.errors import PipelineError
-from pipeline.types import Frame, Task
+from pipeline.types import Floats, Frame, Task
 
 if TYPE_CHECKING:
     import mujoco
@@ -81,6 +81,7 @@ class BackgroundPerturbation(RenderPerturbation):
     fields: ClassVar[tuple[str, ...]] = ("tex_data",)
     clearance: ClassVar[float] = 1.0
     measure: ClassVar[str] = "0 where an image's name or bytes are those of a test task's, else 1"
+    graded: ClassVar[bool] = False
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Write the coverings into the model's textures.
@@ -102,14 +103,14 @@ class BackgroundPerturbation(RenderPerturbation):
             image = np.rot90(textures.pixels(covering.texture, covering.sha256), covering.quarter_turns)
             _cover(model, skin, image, self.colour_scale)
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """Whether a test task shows one of the images, whatever it shows it on."""
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """The same to all test tasks: whether any shows one of the images, whatever it shows it on."""
         shown = _images_of(test)
         overlaps = any(
             textures.normalise(covering.texture) in shown or covering.sha256 in textures.test_images()
             for covering in self.coverings
         )
-        return Nearest(0.0 if overlaps else 1.0, len(test.of("background")))
+        return np.full(len(test.of("background")), 0.0 if overlaps else 1.0)
 
 
 class BackgroundAxis(Axis):

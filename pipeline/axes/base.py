@@ -11,12 +11,14 @@ An axis comes as a pair of small frozen models in one file:
 from __future__ import annotations
 
 from enum import IntEnum
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from pipeline.types import Demo, Frame, RollOut, Scene, Task
+from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
 
 if TYPE_CHECKING:
     import mujoco
@@ -84,6 +86,7 @@ class Perturbation(Frozen):
         level: strength, 1 to 5, by the ranges that the axis states.
         clearance: the least distance to any test task; a draw that comes closer is drawn anew.
         measure: what the distance is and its unit.
+        graded: whether the distance tells near from far, not only same from other.
     """
 
     axis: str
@@ -92,14 +95,31 @@ class Perturbation(Frozen):
 
     clearance: ClassVar[float]
     measure: ClassVar[str]
+    graded: ClassVar[bool] = True
 
     layer: ClassVar[Layer]
     views: ClassVar[frozenset[str]]
     """The views of ``schemas/episode.json`` whose frames this can change; empty for text."""
 
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """The distance to each of the axis's test tasks (N,), in their order, for an episode of ``task``.
+
+        NaN where there is nothing to compare, such as the wordings of another task.
+        """
+        raise NotImplementedError
+
     def nearest(self, test: TestSet, task: Task) -> Nearest:
         """The distance to the nearest of the test tasks that this could coincide with, for an episode of ``task``."""
-        raise NotImplementedError
+        distances = self.distances(test, task)
+        compared = distances[~np.isnan(distances)]
+        return Nearest(float(compared.min(initial=np.inf)), len(compared))
+
+
+@cache
+def on_task(test: TestSet, task: Task, axis: str) -> NDArray[np.intp]:
+    """Which of an axis's test tasks perturb ``task``: their places in ``test.of(axis)``."""
+    bases = [(tested.suite, tested.base) for tested in test.of(axis)]
+    return np.flatnonzero([base == (task.suite, task.name) for base in bases])
 
 
 class TextPerturbation(Perturbation):

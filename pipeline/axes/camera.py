@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pipeline.axes.base import Axis, Frozen, Intervals, Nearest, RenderPerturbation, draw
+from pipeline.axes.base import Axis, Frozen, Intervals, RenderPerturbation, draw
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -83,16 +83,15 @@ class CameraPerturbation(RenderPerturbation):
         camera = model.camera("agentview")
         camera.pos[:], camera.quat[:] = self.pose(camera.pos.copy(), camera.quat.copy())
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """The nearest of all test cameras, whichever task they are for: many tasks share one nominal view."""
-        cameras, compared = _test_cameras(test)
-        if not compared:
-            return Nearest(np.inf, 0)
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """To all test cameras, whichever task they are for: many tasks share one nominal view."""
+        cameras, which = _test_cameras(test)
         own = _embed(*np.array([self._parameters()]).T)
         sphere = _angle_deg(cameras.rays @ own.rays[0])
         turn = 2 * _angle_deg(np.abs(cameras.turns @ own.turns[0]))
         dolly = np.rad2deg(np.abs(cameras.log_scales - own.log_scales[0]))
-        return Nearest(float(np.maximum(np.maximum(sphere, turn), dolly).min()), compared)
+        largest: Floats = np.maximum(np.maximum(sphere, turn), dolly)[which]
+        return largest
 
     def _parameters(self) -> tuple[float, ...]:
         return self.azimuth_deg, self.elevation_deg, self.distance_scale, self.yaw_deg, self.pitch_deg
@@ -123,11 +122,12 @@ def _angle_deg(cosine: Floats) -> Floats:
 
 
 @lru_cache(maxsize=4)
-def _test_cameras(test: TestSet) -> tuple[_Cameras, int]:
-    """The distinct cameras of the test set, and how many of its tasks have one of them."""
+def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
+    """The distinct cameras of the test set, and which of them each test task has."""
     names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
     listed = [[float(task.parameters[name]) for name in names] for task in test.of("camera")]
-    return _embed(*np.unique(np.array(listed).reshape(-1, len(names)), axis=0).T), len(listed)
+    distinct, which = np.unique(np.array(listed).reshape(-1, len(names)), axis=0, return_inverse=True)
+    return _embed(*distinct.T), which.reshape(-1)
 
 
 ByLevel = tuple[Intervals, Intervals, Intervals, Intervals, Intervals]
@@ -139,77 +139,99 @@ def _both_ways(low: float, high: float) -> Intervals:
 
 
 class DistanceRange(Frozen):
-    """The defaults come closer by up to a quarter, where the nearest objects are still in the frame.
-
-    Scales above 2.183 are clear of the test set too, but the orbit centre is so far above the floor arena that its
-    objects leave the frame.
-    """
+    """The test set's scales are 1.15 and 1.19 to 2.00."""
 
     distance_scale: ByLevel = (
-        ((0.882, 0.915),),
-        ((0.849, 0.882),),
-        ((0.816, 0.849),),
-        ((0.783, 0.816),),
-        ((0.75, 0.783),),
+        ((1.08, 1.2),),
+        ((1.2, 1.4),),
+        ((1.4, 1.6),),
+        ((1.6, 1.8),),
+        ((1.8, 2.0),),
     )
 
 
 class SphericalRange(Frozen):
-    """The defaults pass below, between and above the test set's elevations, 0 and 15.
-
-    The lower the camera, the more a cabinet hides of what is behind it, hence at most 10 degrees down.
-    """
+    """The test set's azimuths are whole degrees in [-75, 75], its elevations 0 and 15. The level is the azimuth's."""
 
     azimuth_deg: ByLevel = (
-        ((-12.0, 12.0),),
-        _both_ways(12.0, 24.0),
-        _both_ways(24.0, 36.0),
-        _both_ways(36.0, 48.0),
-        _both_ways(48.0, 60.0),
+        ((-15.0, 15.0),),
+        _both_ways(15.0, 30.0),
+        _both_ways(30.0, 45.0),
+        _both_ways(45.0, 60.0),
+        _both_ways(60.0, 75.0),
     )
-    elevation_deg: ByLevel = (
-        ((-7.0, -5.0), (5.0, 10.0)),
-        ((-8.0, -5.0), (5.0, 10.0)),
-        ((-9.0, -5.0), (5.0, 10.0), (20.0, 21.0)),
-        ((-10.0, -5.0), (5.0, 10.0), (20.0, 23.0)),
-        ((-10.0, -5.0), (5.0, 10.0), (20.0, 25.0)),
-    )
+    elevation_deg: Intervals = ((-2.0, 17.0),)
 
 
 class OrientationRange(Frozen):
-    """A large turn about one of the two axes, each as often as the other, and a small one about the other.
-
-    The test set fills the turns up to 10 degrees, so the levels differ little in the large turn and more in the small
-    one. Looking up by 15 degrees would lose what stands in front, so the default pitches only look down. A yaw loses
-    what stands at one edge of the frame.
+    """The test set turns by 2, 4, 6, 8 or 10 degrees about both axes: each level is about one of these.
 
     Attributes:
-        yaw_deg, pitch_deg: the large turns.
-        other_deg: the small turn.
+        turn_deg: yaw or pitch, each as often as the other; the other one is at most as large, either way.
     """
 
-    yaw_deg: ByLevel = (
-        _both_ways(15.0, 15.4),
-        _both_ways(15.4, 15.8),
-        _both_ways(15.8, 16.2),
-        _both_ways(16.2, 16.6),
-        _both_ways(16.6, 17.0),
+    turn_deg: ByLevel = (
+        _both_ways(1.0, 3.0),
+        _both_ways(3.0, 5.0),
+        _both_ways(5.0, 7.0),
+        _both_ways(7.0, 9.0),
+        _both_ways(9.0, 11.0),
     )
-    pitch_deg: ByLevel = (((15.0, 15.4),), ((15.4, 15.8),), ((15.8, 16.2),), ((16.2, 16.6),), ((16.6, 17.0),))
-    other_deg: ByLevel = (((-1.0, 1.0),), ((-2.0, 2.0),), ((-3.0, 3.0),), ((-4.0, 4.0),), ((-5.0, 5.0),))
+
+
+Aside = Literal["elevation", "distance", "turn"]
+
+
+class AsideRange(Frozen):
+    """What keeps a draw clear of the test cameras: a second change, just larger than the clearance.
+
+    A test camera changes its distance, its place on the sphere or its turn in place, and leaves the other two alone.
+
+    Attributes:
+        elevation_deg: to either side of the test set's elevations, 0 and 15.
+        distance_scale: to either side of the nominal distance, which all test cameras but the dollies keep. A smaller
+            turn than the clearance at one of the dollies' distances is drawn anew.
+        turn_deg: angle of a turn in place, in any direction.
+    """
+
+    elevation_deg: Intervals = ((-8.0, -5.1), (5.1, 9.9))
+    distance_scale: Intervals = ((0.87, 0.914), (1.094, 1.18))
+    turn_deg: Intervals = ((5.1, 8.0),)
+
+    def draw(self, rng: np.random.Generator, kind: Aside) -> dict[str, float]:
+        """The parameters of one kind of change."""
+        match kind:
+            case "elevation":
+                return {"elevation_deg": draw(rng, self.elevation_deg)}
+            case "distance":
+                return {"distance_scale": draw(rng, self.distance_scale)}
+            case "turn":
+                turn_deg, towards = draw(rng, self.turn_deg), rng.uniform(-np.pi, np.pi)
+                return {
+                    "yaw_deg": round(turn_deg * float(np.cos(towards)), 4),
+                    "pitch_deg": round(turn_deg * float(np.sin(towards)), 4),
+                }
+
+
+ASIDES: dict[Component, tuple[Aside, ...]] = {
+    "distance": ("elevation", "turn"),
+    "spherical": ("elevation", "distance", "turn"),
+    "orientation": ("elevation", "distance"),
+}
+"""What a component's draws may change beside what the component is about, each as often as the others."""
 
 
 class CameraAxis(Axis):
-    """The ranges to draw from; the defaults keep clear of LIBERO-Plus's test cameras.
+    """The ranges to draw from: each component spans what LIBERO-Plus's test cameras of its kind do.
 
-    The test set moves on azimuths of whole degrees in [-75, 75] at elevations 0 and 15, at distance scales
-    1.15 to 2.00, and turns in place by 2 to 10 degrees about both axes at once. The pictures of the
-    defaults were checked by eye in all five arenas.
+    There every value is taken, so a draw changes something else as well, which keeps it 5 degrees from all of them:
+    a distance of 1.6 with 6 degrees of elevation is clear. What the defaults show was looked at in all five arenas.
     """
 
     distance: DistanceRange | None = DistanceRange()
     spherical: SphericalRange | None = SphericalRange()
     orientation: OrientationRange | None = OrientationRange()
+    aside: AsideRange = AsideRange()
 
     @model_validator(mode="after")
     def _some_component(self) -> CameraAxis:
@@ -218,13 +240,27 @@ class CameraAxis(Axis):
         return self
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        components = [name for name in ("distance", "spherical", "orientation") if getattr(self, name) is not None]
-        component = components[rng.integers(len(components))]
+        choices = [choice for choice in (self.distance, self.spherical, self.orientation) if choice is not None]
+        chosen = choices[rng.integers(len(choices))]
         level = self.draw_level(rng)
-        drawn = {name: draw(rng, by_level[level - 1]) for name, by_level in getattr(self, component)}
-        if component == "orientation":
-            small = ("yaw_deg", "pitch_deg")[rng.integers(2)]
-            drawn[small] = drawn.pop("other_deg")
+        component: Component
+        match chosen:
+            case DistanceRange():
+                component = "distance"
+                drawn = {"distance_scale": draw(rng, chosen.distance_scale[level - 1])}
+            case SphericalRange():
+                component = "spherical"
+                drawn = {
+                    "azimuth_deg": draw(rng, chosen.azimuth_deg[level - 1]),
+                    "elevation_deg": draw(rng, chosen.elevation_deg),
+                }
+            case OrientationRange():
+                component = "orientation"
+                large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
+                turn_deg = draw(rng, chosen.turn_deg[level - 1])
+                drawn = {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
+        asides = ASIDES[component]
+        drawn |= self.aside.draw(rng, asides[rng.integers(len(asides))])
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
 
 

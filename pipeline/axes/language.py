@@ -11,7 +11,6 @@ keeps the goal as far as ``language_goal.py`` can check.
 from __future__ import annotations
 
 import bisect
-import math
 import re
 from functools import cache
 from itertools import zip_longest
@@ -25,10 +24,10 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
+from pipeline.axes.base import Axis, Level, TextPerturbation, on_task
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
-from pipeline.types import Task
+from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
     from pipeline.testset.benchmark import TestSet
@@ -88,9 +87,11 @@ class LanguagePerturbation(TextPerturbation):
         """The wording that takes the place of ``instruction``."""
         return self.text
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """The distance to the nearest of the task's test instructions; a clearance of about one word in five."""
-        return _nearest(self.text, test, task)
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """To the task's test instructions; a clearance of about one word in five."""
+        distances = np.full(len(test.of("language")), np.nan)
+        distances[on_task(test, task, "language")] = _distances(self.text, test, task)
+        return distances
 
 
 class LanguageAxis(Axis):
@@ -226,10 +227,9 @@ def _edits(one: NDArray[np.uint8], two: NDArray[np.uint8]) -> int:
 
 
 @cache
-def _nearest(text: str, test: TestSet, task: Task) -> Nearest:
+def _distances(text: str, test: TestSet, task: Task) -> list[float]:
     own, wordings = _characters(text), _test_wordings(test, task)
-    distances = (int(_edits(own, wording)) / max(len(own), len(wording), 1) for wording in wordings)
-    return Nearest(min(distances, default=math.inf), len(wordings))
+    return [int(_edits(own, wording)) / max(len(own), len(wording), 1) for wording in wordings]
 
 
 @cache

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, Nearest, PhysicsPerturbation
+from pipeline.axes.base import Axis, Frozen, PhysicsPerturbation, on_task
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, taken
 from pipeline.errors import PipelineError
-from pipeline.types import Demo, RollOut, Scene, Task
+from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 if TYPE_CHECKING:
     from pipeline.testset.benchmark import TestSet
@@ -49,6 +49,7 @@ class LayoutPerturbation(PhysicsPerturbation):
 
     clearance: ClassVar[float] = 1.0
     measure: ClassVar[str] = "1 where no category is shared with a test task of the same LIBERO task, else 0"
+    graded: ClassVar[bool] = False
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         # Drawing a plan must not load the simulator.
@@ -56,15 +57,17 @@ class LayoutPerturbation(PhysicsPerturbation):
 
         return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed, roll_out)
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """By category: infinite where the test tasks on this LIBERO task add nothing of the same category.
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """By category: infinite where a test task on this LIBERO task adds nothing of the same category.
 
         The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
         """
         own = {added.category for added in self.objects}
-        tasks = test.on(task, "layout")
-        shared = any(own & set(_plain(other.parameters["category"])) for other in tasks)
-        return Nearest(0.0 if shared else math.inf, len(tasks))
+        distances = np.full(len(test.of("layout")), np.nan)
+        distances[on_task(test, task, "layout")] = [
+            0.0 if own & set(_plain(other.parameters["category"])) else math.inf for other in test.on(task, "layout")
+        ]
+        return distances
 
 
 class LayoutAxis(Axis):

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
-from pipeline.axes.base import Axis, Frozen, Intervals, Level, Nearest, RenderPerturbation, draw
-from pipeline.types import Frame, Task
+from pipeline.axes.base import Axis, Frozen, Intervals, Level, RenderPerturbation, draw
+from pipeline.types import Floats, Frame, Task
 
 if TYPE_CHECKING:
     import mujoco
@@ -63,6 +63,7 @@ class LightPerturbation(RenderPerturbation):
     )
     clearance: ClassVar[float] = 0.0
     measure: ClassVar[str] = "unknown offline: the test tasks' light values are only in the benchmark's asset archive"
+    graded: ClassVar[bool] = False
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Change every lamp of the model."""
@@ -86,9 +87,9 @@ class LightPerturbation(RenderPerturbation):
             # is taken from the lamps: with more, walls outshine the table, with less, all darkens.
             model.mat_emission += self.fill_scale * SHADOWED_DIFFUSE / 3
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
+    def distances(self, test: TestSet, task: Task) -> Floats:
         """Nothing to compare with: the test tasks are known by number, not by their lamps."""
-        return Nearest(float("inf"), 0)
+        return np.full(len(test.of("light")), np.nan)
 
 
 class LightRange(Frozen):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bisect
-import math
 from functools import cache
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
 
@@ -11,9 +10,9 @@ import numpy as np
 from pydantic import model_validator
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, Nearest, PixelPerturbation
+from pipeline.axes.base import Axis, PixelPerturbation
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
-from pipeline.types import Frame, Task
+from pipeline.types import Floats, Frame, Task
 
 if TYPE_CHECKING:
     from pipeline.testset.benchmark import TestSet
@@ -60,29 +59,32 @@ class NoisePerturbation(PixelPerturbation):
         """
         return self.effect.apply(frame, seeding.rng(self.seed, "noise", frame_index))
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """The distance to the nearest test severity of the same component, whatever its task: 0.5 is half way.
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """To the test severities of the same component, whatever their task: 0.5 is half way to the next.
 
         The clearance keeps to the middle half between two severities. The parameters that do not set the strength
         are not compared, so an equal strength counts as equal.
         """
         name, clean = self.effect.strength
-        tested, compared = _tested(test, self.component, name)
-        if not compared:
-            return Nearest(math.inf, 0)
+        tested, severities = _tested(test, self.component, name)
+        if not tested:
+            return severities
         steps = (clean, *tested)
         value = float(getattr(self.effect, name))
         # Beyond the strongest severity the last step is continued.
         upper = min(max(bisect.bisect_left(steps, value), 1), len(tested))
         severity = upper - (steps[upper] - value) / (steps[upper] - steps[upper - 1])
-        return Nearest(abs(severity - min(max(round(severity), 1), len(tested))), compared)
+        return np.abs(severities - severity)
 
 
 @cache
-def _tested(test: TestSet, component: Component, name: str) -> tuple[tuple[float, ...], int]:
-    """The values of a parameter among a component's test tasks, ascending, and the number of these tasks."""
-    tasks = [tested for tested in test.of("noise") if tested.component == component]
-    return tuple(sorted({float(tested.parameters[name]) for tested in tasks})), len(tasks)
+def _tested(test: TestSet, component: Component, name: str) -> tuple[tuple[float, ...], Floats]:
+    """The values of a parameter among a component's test tasks, ascending, and each test task's place among them,
+    counted from 1: NaN for those of other components."""
+    values = [float(t.parameters[name]) if t.component == component else np.nan for t in test.of("noise")]
+    ascending = sorted({value for value in values if not np.isnan(value)})
+    places = [np.nan if np.isnan(value) else 1.0 + ascending.index(value) for value in values]
+    return tuple(ascending), np.array(places)
 
 
 def _grid(effect: type[E], **parameters: Levels[float]) -> Levels[E]:

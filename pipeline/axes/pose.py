@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field, PositiveFloat
 
-from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation
+from pipeline.axes.base import Axis, PhysicsPerturbation, on_task
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero import bddl
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
@@ -105,28 +105,28 @@ class PosePerturbation(PhysicsPerturbation):
         turned = [c * qw - s * qz, c * qx - s * qy, c * qy + s * qx, c * qz + s * qw]
         return np.array([x + self.dx_m, y + self.dy_m, z, *turned])
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
+    def distances(self, test: TestSet, task: Task) -> Floats:
         """Compared with the test tasks that move the same object of the same task, alone or with others.
 
         These move every other thing as well, each its own way, so even at distance zero the scenes would differ.
         """
-        moves_m = _test_moves_m(test, task).get(self.moved, np.empty((0, 2)))
-        distance_m = np.linalg.norm(moves_m - (self.dx_m, self.dy_m), axis=1).min(initial=math.inf)
-        return Nearest(float(distance_m), len(moves_m))
+        distances_m: Floats = np.linalg.norm(_test_moves_m(test, task, self.moved) - (self.dx_m, self.dy_m), axis=1)
+        return distances_m
 
 
 @cache
-def _test_moves_m(test: TestSet, task: Task) -> dict[str, Floats]:
-    """Object to its displacements (N, 2) in the test tasks that move it, where ``task`` is to move it too."""
-    moves: dict[str, list[tuple[float, float]]] = {}
-    for tested in test.on(task, "pose"):
+def _test_moves_m(test: TestSet, task: Task, moved: str) -> Floats:
+    """(N, 2) the displacement of an object of ``task`` in each of the axis's test tasks; NaN where it has none."""
+    moves_m = np.full((len(test.of("pose")), 2), np.nan)
+    for place, tested in zip(on_task(test, task, "pose"), test.on(task, "pose"), strict=True):
         known = tested.parameters
-        if "target" in known:
-            moves.setdefault(str(known["target"]), []).append((float(known["dx_m"]), float(known["dy_m"])))
+        if known.get("target") == moved:
+            moves_m[place] = known["dx_m"], known["dy_m"]
         # Such as moka_pot_2:0.01,-0.02;plate_1:0,0.03.
         for name, dx_m, dy_m in re.findall(r"([^;:]+):([^,]+),([^;]+)", str(known.get("others", ""))):
-            moves.setdefault(name, []).append((float(dx_m), float(dy_m)))
-    return {name: np.array(displacements_m) for name, displacements_m in moves.items()}
+            if name == moved:
+                moves_m[place] = float(dx_m), float(dy_m)
+    return moves_m
 
 
 class _Settled(NamedTuple):

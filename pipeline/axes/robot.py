@@ -73,6 +73,12 @@ class RobotPerturbation(PhysicsPerturbation):
             raise RefusedError("robot_in_collision")
         return replace(scene, state=state, resolved={**scene.resolved, "robot": {"joints_rad": posture.tolist()}})
 
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """To the offsets of all robot tasks; the arm is the same in all, so ``task`` does not matter."""
+        ids = [int(tested.parameters["id"]) - 1 for tested in test.of("robot")]
+        distances_rad: Floats = np.linalg.norm(benchmark_offsets_rad()[ids] - self.joint_offsets_rad, axis=1)
+        return distances_rad
+
     def nearest(self, test: TestSet, task: Task) -> Nearest:
         """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450; the arm is the same in all
         tasks, so ``task`` does not matter."""

@@ -122,6 +122,7 @@ def render(
         yields=_yields(rows),
         leakage=leakage,
         distances=_distances(leakage),
+        coverage=_coverage(leakage),
         schema=SCHEMA,
         statistics=[_statistics(dataset, figures["action"]) for dataset, figures in statistics.items()],
         validation=table(
@@ -207,6 +208,16 @@ def _yields(rows: Sequence[Mapping[str, Any]]) -> str:
 def _distances(leakage: Mapping[str, Mapping[str, Any]]) -> str:
     columns = ("rows", "test_tasks", "comparisons", "overlaps", "clearance", "smallest", "verdict")
     return table(["axis", *columns], [[axis, *(found[name] for name in columns)] for axis, found in leakage.items()])
+
+
+def _coverage(leakage: Mapping[str, Mapping[str, Any]]) -> str:
+    columns = ("test_tasks", "compared", "smallest", "median", "p90", "largest")
+    body = [
+        [axis, component, *(one[name] for name in columns)]
+        for axis, finding in leakage.items()
+        for component, one in finding["coverage"].items()
+    ]
+    return table(["axis", "component", *columns], body)
 
 
 def _statistics(dataset: str, action: Mapping[str, Sequence[float]]) -> str:

@@ -1,4 +1,4 @@
-"""Panels that show, for each axis, the parameters that a run drew and those of the benchmark's test tasks."""
+"""Panels for each axis: the parameters that a run drew beside those of the test tasks, and how far these are away."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.axes import AnyPerturbation
+from pipeline.axes import AnyPerturbation, kind_of
 from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.language import CLASSES, LanguagePerturbation, distance
@@ -20,6 +20,7 @@ from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.publish.figures import Panel, bars, histogram, scatter, strips
+from pipeline.run import leakage
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 
@@ -50,6 +51,26 @@ class Coverage(NamedTuple):
 
 def of(axis: str, draws: Sequence[Draw], test: TestSet) -> Coverage:
     """The coverage of one axis by the draws on it."""
+    shown = _plots(axis, draws, test)
+    kind = kind_of(axis)
+    if not kind.graded:
+        return shown
+    unit = kind.measure.partition(":")[0].partition(",")[0]
+    return Coverage(shown.note, [*shown.panels, _distances(axis, draws, test, unit)])
+
+
+def _distances(axis: str, draws: Sequence[Draw], test: TestSet, unit: str) -> Panel:
+    """How far each test task is from the nearest draw; those that no draw can be compared with are left out."""
+    least = leakage.distances(axis, [(draw.made, draw.task) for draw in draws], test)
+    components = np.array([task.component for task in test.of(axis)])
+    rows = {
+        component.replace("_", " "): {axis: least[(components == component) & np.isfinite(least)]}
+        for component in dict.fromkeys(components.tolist())
+    }
+    return strips("from each test task to the nearest draw", rows, unit)
+
+
+def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> Coverage:
     made = [draw.made for draw in draws]
     match axis:
         case "camera":

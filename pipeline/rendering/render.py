@@ -16,8 +16,10 @@ from pipeline.axes.light import exposure
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.libero.tasks import find_task
 from pipeline.rendering.jpeg import encode, to_policy
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.sight import Sight
 from pipeline.run.compute import Run
 from pipeline.run.frame_store import FrameStore, Rendered, stream_ids
 from pipeline.run.outcome import rejections, replayed
@@ -25,14 +27,14 @@ from pipeline.run.plan import Row, select
 from pipeline.run.streams import Stream, streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts
 from pipeline.scenes.compiled import proprioception
-from pipeline.types import Trajectory
+from pipeline.types import Task, Trajectory
 
 
-def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
-    """Render the streams of one trajectory: the frame before each executed action.
+def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
+    """Render the streams of one trajectory of a task: the frame before each executed action.
 
     Streams that differ in pixel noise alone share the clean frames they are made from. A perturbed scene whose first
-    frame is black or blown out is not rendered any further.
+    frame is black or blown out is not rendered any further, nor one whose moved camera loses sight of the task.
     """
     variants: dict[str, list[Stream]] = {}
     for stream in streams:
@@ -46,12 +48,21 @@ def render(trajectory: Trajectory, streams: Sequence[Stream], config: RenderConf
         for step in range(steps):
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             proprioceptions.append(proprioception(renderer.data))
+        hand_m = np.array([state[:3] for state, _ in proprioceptions], float)
+        original: Sight | None = None
         for perturbations, members in variants.items():
-            with renderer.perturbed(of_layer(from_json(perturbations), RenderPerturbation)):
+            changes = of_layer(from_json(perturbations), RenderPerturbation)
+            moved = any("cam_pos" in change.fields for change in changes)
+            if moved and original is None:
+                renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+                original = Sight.of(renderer, task, hand_m)
+            with renderer.perturbed(changes):
                 for step in range(steps):
                     renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                     clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
                     faults = [fault for frame in clean.values() if (fault := exposure(frame))]
+                    if step == 0 and moved and original:
+                        faults += Sight.of(renderer, task, hand_m).faults(original)
                     if step == 0 and faults and perturbations != "[]":
                         refused |= {stream.stream_id: faults[0] for stream in members}
                         break
@@ -72,13 +83,14 @@ class RenderJob:
     """One trajectory's share of the rendering, as it is sent to a worker.
 
     Attributes:
-        trajectory_id, streams: what to render.
+        trajectory_id, task, streams: what to render.
         trajectories, frames: folders of the stores.
         config: how frames are encoded.
         device: what renders the run, as OpenGL names it.
     """
 
     trajectory_id: str
+    task: Task
     streams: tuple[Stream, ...]
     trajectories: Path
     frames: Path
@@ -103,7 +115,8 @@ class RenderJob:
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
         earlier = self._earlier(store, device)
         known = {*earlier.streams, *earlier.rejected} if earlier else set()
-        rendered = render(trajectory, [stream for stream in self.streams if stream.stream_id not in known], self.config)
+        missing = [stream for stream in self.streams if stream.stream_id not in known]
+        rendered = render(trajectory, self.task, missing, self.config)
         if earlier:
             rendered = replace(
                 rendered,
@@ -137,6 +150,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     store = FrameStore(folder, config.render)
     judged = verdicts(replayed(rows, trajectories))
     steps = {row.trajectory_id: row.demo_steps for row in rows}
+    tasks = {row.trajectory_id: (row.suite, row.task) for row in rows}
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in store.refresh().items() if row["device"] == device}
@@ -149,7 +163,15 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
                 streams = needed.setdefault(row.trajectory_id, {})
                 streams |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
         jobs = [
-            RenderJob(trajectory_id, tuple(streams.values()), trajectories, folder, config.render, device)
+            RenderJob(
+                trajectory_id,
+                find_task(*tasks[trajectory_id]),
+                tuple(streams.values()),
+                trajectories,
+                folder,
+                config.render,
+                device,
+            )
             for trajectory_id, streams in needed.items()
             if trajectory_id not in stored or stream_ids(stored[trajectory_id]) != set(streams)
         ]

@@ -49,6 +49,16 @@ class Renderer:
         self._renderer.update_scene(self.data, camera, self._option)
         return np.ascontiguousarray(self._renderer.render()[::-1])
 
+    def geoms(self, camera: str) -> NDArray[np.int32]:
+        """(H, W) the geom that each pixel of :meth:`frame` shows, by its number in the model; -1 for none."""
+        self._renderer.enable_segmentation_rendering()
+        try:
+            self._renderer.update_scene(self.data, camera, self._option)
+            number, kind = np.moveaxis(self._renderer.render()[::-1], -1, 0)
+        finally:
+            self._renderer.disable_segmentation_rendering()
+        return np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, number, -1)
+
     @contextmanager
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
         """Apply render-layer perturbations to the model for a moment."""

@@ -1,4 +1,7 @@
-"""The report that a plan keeps clear of the benchmark's test tasks.
+"""The report on a plan and the benchmark's test tasks: that it keeps clear of them, and how near it comes to each.
+
+The two pull against each other: a plan far from all test tasks overlaps with none, and prepares for none. So beside the
+least distance of any pair stands, for each component, how far the test tasks are from what is planned.
 
 Every perturbation is read back from the plan as it was recorded and compared anew, whatever the planner thought. A row
 with several counts for each of its axes: the benchmark perturbs one at a time, but each part must keep its clearance.
@@ -9,10 +12,11 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 from rich import box
 from rich.console import Group
 from rich.table import Table
@@ -25,6 +29,25 @@ from pipeline.files import replaced
 from pipeline.libero.tasks import find_task
 from pipeline.run.plan import Row
 from pipeline.testset.benchmark import TestSet
+from pipeline.types import Floats, Task
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How far the test tasks of one component are from the nearest episode, in the axis's measure.
+
+    Attributes:
+        test_tasks: the benchmark's tasks of this component.
+        compared: those that some episode could be compared with; 0 where the measure does not tell near from far.
+        smallest, median, p90, largest: of their distances, 90 % are at most ``p90``; None when none was compared.
+    """
+
+    test_tasks: int
+    compared: int
+    smallest: float | None
+    median: float | None
+    p90: float | None
+    largest: float | None
 
 
 @dataclass(frozen=True)
@@ -41,6 +64,7 @@ class AxisDistance:
         measure: what the distance is and its unit.
         overlaps: episodes that are closer than that.
         verdict: ``disjoint``, ``overlap``, or ``unknown`` when what the test tasks change cannot be read offline.
+        coverage: component of the test tasks to how far these are from the wanted episodes, reserves left out.
     """
 
     rows: int
@@ -52,23 +76,54 @@ class AxisDistance:
     measure: str
     overlaps: int
     verdict: str
+    coverage: dict[str, Coverage]
 
 
 def check(rows: Sequence[Row], test: TestSet) -> dict[str, AxisDistance]:
     """Axis to finding, in the order of the plan."""
     found: dict[str, list[tuple[Nearest, str]]] = defaultdict(list)
     kinds: dict[str, AnyPerturbation] = {}
+    wanted: dict[str, list[tuple[AnyPerturbation, Task]]] = defaultdict(list)
     known = {(row.suite, row.task) for row in rows}
     tasks = {key: find_task(*key) for key in known}
     for row in rows:
+        task = tasks[row.suite, row.task]
         for perturbation in from_json(row.perturbations):
             kinds[perturbation.axis] = perturbation
-            nearest = perturbation.nearest(test, tasks[row.suite, row.task])
-            found[perturbation.axis].append((nearest, row.episode_id))
-    return {axis: _finding(found[axis], kind, len(test.of(axis))) for axis, kind in kinds.items()}
+            found[perturbation.axis].append((perturbation.nearest(test, task), row.episode_id))
+            if row.wanted:
+                wanted[perturbation.axis].append((perturbation, task))
+    return {
+        axis: _finding(found[axis], kind, len(test.of(axis)), coverage(axis, distances(axis, wanted[axis], test), test))
+        for axis, kind in kinds.items()
+    }
 
 
-def _finding(found: Sequence[tuple[Nearest, str]], kind: AnyPerturbation, test_tasks: int) -> AxisDistance:
+def distances(axis: str, draws: Iterable[tuple[AnyPerturbation, Task]], test: TestSet) -> Floats:
+    """(N,) how far each of an axis's test tasks is from the nearest of some draws on the axis, NaN where it cannot be
+    compared with any, or the axis's measure does not tell near from far."""
+    least = np.full(len(test.of(axis)), np.nan)
+    for perturbation, task in draws:
+        if perturbation.graded:
+            np.fmin(least, perturbation.distances(test, task), out=least)
+    return least
+
+
+def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
+    """What :func:`distances` come to for each component of the axis's test tasks."""
+    components = np.array([tested.component for tested in test.of(axis)])
+    summaries = {}
+    for component in dict.fromkeys(components.tolist()):
+        of_component = least[components == component]
+        compared = of_component[np.isfinite(of_component)]
+        figures = np.quantile(compared, (0.0, 0.5, 0.9, 1.0)).tolist() if len(compared) else (None,) * 4
+        summaries[component] = Coverage(len(of_component), len(compared), *figures)
+    return summaries
+
+
+def _finding(
+    found: Sequence[tuple[Nearest, str]], kind: AnyPerturbation, test_tasks: int, coverage: dict[str, Coverage]
+) -> AxisDistance:
     nearest, closest = min(found, key=lambda pair: pair[0].distance)
     comparisons = sum(one.compared for one, _ in found)
     overlaps = sum(one.distance < kind.clearance for one, _ in found)
@@ -83,6 +138,7 @@ def _finding(found: Sequence[tuple[Nearest, str]], kind: AnyPerturbation, test_t
         measure=kind.measure,
         overlaps=overlaps,
         verdict="overlap" if overlaps else "unknown" if test_tasks and not comparisons else "disjoint",
+        coverage=coverage,
     )
 
 
@@ -92,7 +148,7 @@ def write(findings: dict[str, AxisDistance], path: Path) -> None:
 
 
 def report(findings: dict[str, AxisDistance]) -> Group:
-    """The findings as a person reads them: a table that fits 80 columns, and what each distance is."""
+    """The findings as a person reads them: two tables that fit 80 columns, and what each distance is."""
     table = Table("axis", title="distance to the LIBERO-Plus test set", box=box.SIMPLE)
     for column in ("episodes", "tests", "overlaps", "smallest", "clearance"):
         table.add_column(column, justify="right")
@@ -101,7 +157,20 @@ def report(findings: dict[str, AxisDistance]) -> Group:
         smallest = "-" if finding.smallest is None else f"{finding.smallest:.3g}"
         counts = [f"{count:,}" for count in (finding.rows, finding.test_tasks, finding.overlaps)]
         table.add_row(axis, *counts, smallest, f"{finding.clearance:g}", finding.verdict)
-    return Group(table, *(Text(f"{axis}: {finding.measure}") for axis, finding in findings.items()))
+    covered = Table(
+        "axis",
+        "component",
+        title="from each test task to the nearest wanted episode (-: cannot be said)",
+        box=box.SIMPLE,
+    )
+    for column in ("tests", "smallest", "median", "90 %", "largest"):
+        covered.add_column(column, justify="right")
+    for axis, finding in findings.items():
+        for component, one in finding.coverage.items():
+            figures = (one.smallest, one.median, one.p90, one.largest)
+            shown = ("-" if figure is None else f"{figure:.3g}" for figure in figures)
+            covered.add_row(axis, component, f"{one.test_tasks:,}", *shown)
+    return Group(table, covered, *(Text(f"{axis}: {finding.measure}") for axis, finding in findings.items()))
 
 
 def refuse_overlap(findings: dict[str, AxisDistance]) -> None:

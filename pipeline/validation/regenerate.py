@@ -23,6 +23,7 @@ from pipeline.formats.export import export
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
+from pipeline.libero.tasks import find_task
 from pipeline.physics.replay import ReplayJob
 from pipeline.rendering.render import RenderJob
 from pipeline.run import manifest, plan
@@ -135,7 +136,8 @@ def _rebuild(
     verdict = replay(row)
     if not verdict.kept:
         return None, verdict.reason
-    RenderJob(trajectory_id, streams, trajectories, frames, settings.render, gl.choose().device)()
+    task = find_task(row["suite"], row["task"])
+    RenderJob(trajectory_id, task, streams, trajectories, frames, settings.render, gl.choose().device)()
     if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)
