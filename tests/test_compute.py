@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ def square(number: int) -> int:
 
 
 def process(_: int) -> int:
+    time.sleep(0.1)  # or one worker may do all before the other is asked
     return os.getpid()
 
 
