@@ -103,7 +103,8 @@ def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> Coverage:
 
     scales = {name: values.ravel() for name, values in points("distance_scale").items()}
     return Coverage(
-        f"{len(tested):,} test cameras. A draw is a point in each plot; what it leaves alone stays LIBERO's.",
+        f"{len(tested):,} test cameras. A draw is a point in each plot; what it leaves alone stays LIBERO's. Where it "
+        "lies on a test camera in one plot, it is apart from it in another.",
         [
             scatter("where it stands", points("azimuth_deg", "elevation_deg"), "azimuth (°)", "elevation (°)"),
             strips("how far away", {"scale": scales}, "multiple of the distance"),

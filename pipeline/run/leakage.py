@@ -157,12 +157,8 @@ def report(findings: dict[str, AxisDistance]) -> Group:
         smallest = "-" if finding.smallest is None else f"{finding.smallest:.3g}"
         counts = [f"{count:,}" for count in (finding.rows, finding.test_tasks, finding.overlaps)]
         table.add_row(axis, *counts, smallest, f"{finding.clearance:g}", finding.verdict)
-    covered = Table(
-        "axis",
-        "component",
-        title="from each test task to the nearest wanted episode (-: cannot be said)",
-        box=box.SIMPLE,
-    )
+    covered = Table("axis", "component", title="from each test task to the nearest wanted episode", box=box.SIMPLE)
+    covered.caption = "-: the measure does not tell near from far"
     for column in ("tests", "smallest", "median", "90 %", "largest"):
         covered.add_column(column, justify="right")
     for axis, finding in findings.items():
