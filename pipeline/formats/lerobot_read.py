@@ -66,7 +66,7 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], frames: Frames) -> I
         for key, spec in features(frames).items():
             has = meta.features.get(key, {})
             read[key] = (has.get("dtype"), tuple(has.get("shape", ())), tuple(has.get("names") or ()))
-            wanted[key] = (spec["dtype"], tuple(spec["shape"]), tuple(spec["names"]))
+            wanted[key] = (spec["dtype"], tuple(spec["shape"]), tuple(spec["names"] or ()))
         for file in sorted(meta.root.glob("videos/**/*.mp4")):
             name = str(file.relative_to(meta.root))
             with av.open(str(file)) as video:
