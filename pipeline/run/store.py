@@ -80,16 +80,20 @@ class Store:
 
     def rows(self) -> dict[str, dict[str, Any]]:
         """Trajectory id to its row, for every current file that can be read."""
+        return self._rows()[0]
+
+    def _rows(self) -> tuple[dict[str, dict[str, Any]], bool]:
+        """The rows, and whether the table on disk is these rows and is believed in every one."""
         believed, written_ns = self._table()
-        rows = {}
+        rows, doubted = {}, False
         for path in sorted(self.root.glob("*.h5")):
             status = path.stat()
             row = believed.get(path.stem)
             if row is None or row["bytes"] != status.st_size or status.st_mtime_ns >= written_ns:
-                row = self._read(path.stem, status.st_size)
+                row, doubted = self._read(path.stem, status.st_size), True
             if row is not None and row["made_by"] == self.made_by:
                 rows[path.stem] = row
-        return rows
+        return rows, not doubted and rows == believed
 
     def row(self, trajectory_id: str) -> dict[str, Any] | None:
         """One row, read from the file; None when that is missing, damaged or not current."""
@@ -115,10 +119,11 @@ class Store:
 
     def refresh(self) -> dict[str, dict[str, Any]]:
         """``rows``, written as the table; only for the stage that makes the files."""
-        rows = self.rows()
-        with replaced(self.root / TABLE) as temporary:
-            listed = [row for _, row in sorted(rows.items())]
-            pq.write_table(pa.Table.from_pylist(listed, schema=self._schema), temporary)
+        rows, written = self._rows()
+        if not written:
+            with replaced(self.root / TABLE) as temporary:
+                listed = [row for _, row in sorted(rows.items())]
+                pq.write_table(pa.Table.from_pylist(listed, schema=self._schema), temporary)
         return rows
 
     def keep(self, trajectory_ids: Iterable[str]) -> None:
