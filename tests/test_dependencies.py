@@ -67,4 +67,4 @@ def test_a_stage_opens_all_that_it_declares_and_needs_nothing_else(stage: str, f
         for name in declared(stage)
         if name not in NOT_OPENED and not any(path.is_relative_to(tmp_path / name) for path in opened)
     ]
-    assert idle == [], f"{stage} declares what it does not open"
+    assert idle == [], f"{stage} declares what it does not open: {idle}"

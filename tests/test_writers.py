@@ -461,7 +461,7 @@ def test_lerobot_refuses_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) 
         write_lerobot(tmp_path, load=partial(load_spoilt, spoil=spoil))
     assert files(tmp_path / "lerobot") == {"earlier": b"set"}
     # Of the three parts the two that are whole stay, for the next time.
-    assert [path.name for path in sorted((tmp_path / ".work").rglob("part-*"))] == ["part-00000", "part-00001"]
+    assert [path.name for path in sorted((tmp_path / ".work").rglob("train-*"))] == ["train-00000", "train-00001"]
     write_lerobot(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["lerobot", "lerobot.json"]
 
