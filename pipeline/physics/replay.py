@@ -187,7 +187,10 @@ def replay_plan(
     """
     twins = [row for row in rows if row.role == "twin"]
     verdicts = _replay(twins, twins, {}, demos, config, folder, run)
-    return _replay(rows, twins, verdicts, demos, config, folder, run)
+    verdicts = _replay(rows, twins, verdicts, demos, config, folder, run)
+    # The table tells of what was just replayed, so that whoever comes next opens no file for it.
+    TrajectoryStore(folder).refresh()
+    return verdicts
 
 
 def _replay(
