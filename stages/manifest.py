@@ -12,18 +12,20 @@ from pipeline.run.stage import main
 
 def run(config: Config) -> None:
     data = config.data
-    run = outcome.read(config)
+    episodes = outcome.read(config)
     table = manifest.build(
-        run,
+        episodes,
         places=registry.places(registry.formats_of(data, config.export)),
         columns=registry.columns(),
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 
-    rows = {row.episode_id: row for row in run.rows}
+    rows = {row.episode_id: row for row in episodes.rows}
     frames = FrameStore(data / "frames", config.render)
-    motions = {name: frames.motion(name) for name in dict.fromkeys(rows[episode].trajectory_id for episode in run.kept)}
-    sets = by_suite(run.kept, {row.episode_id: row.suite for row in run.rows}, config.export.rlds.name)
+    motions = {
+        name: frames.motion(name) for name in dict.fromkeys(rows[episode].trajectory_id for episode in episodes.kept)
+    }
+    sets = by_suite(episodes.kept, {episode: row.suite for episode, row in rows.items()}, config.export.rlds.name)
     figures = {
         name: motion_statistics.openvla([motions[rows[episode].trajectory_id] for episode in members])
         for name, members in sets.items()

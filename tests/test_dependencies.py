@@ -52,7 +52,7 @@ def test_a_stage_opens_all_that_it_declares_and_needs_nothing_else(stage: str, f
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
     with opened_files(tmp_path) as opened:
         done = subprocess.run(
-            [sys.executable, f"stages/{STAGES[stage]['cmd'].split()[1].removeprefix('stages/')}", file],
+            [sys.executable, STAGES[stage]["cmd"].split()[1], file],
             cwd=tmp_path,
             env=environment,
             capture_output=True,

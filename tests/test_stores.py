@@ -25,7 +25,7 @@ from pipeline.run import outcome, plan
 from pipeline.run.compute import loop
 from pipeline.run.frame_store import FrameStore, Rendered
 from pipeline.run.store import TABLE
-from pipeline.run.trajectory_store import TrajectoryStore, verdicts
+from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
 
@@ -214,4 +214,4 @@ def test_reserves_are_replayed_where_frames_may_be_rejected_after_all_physics(ro
     assert [verdict.reason for verdict in plan.select(both, kept).values()] == ["kept", "reserve_not_needed"]
     rejected = plan.select(both, kept, {both[0].episode_id: "too_dark"})
     assert [verdict.reason for verdict in rejected.values()] == ["too_dark", "kept"]
-    assert plan.pending([row for row in both if row.wanted], verdicts({})) == ["a"]
+    assert plan.pending([row for row in both if row.wanted], verdicts_of({})) == ["a"]

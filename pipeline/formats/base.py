@@ -87,6 +87,10 @@ class Episodes:
             splits["val" if self.demos[episode_id] in held_out else "train"].append(episode_id)
         return splits
 
+    def slices(self, members: Sequence[str], pieces: int) -> list[list[str]]:
+        """Some of the episodes in slices (see ``split``): as many of ``pieces`` as they are of all, at least one."""
+        return split(members, max(1, round(pieces * len(members) / len(self.ids))))
+
 
 @dataclass(frozen=True)
 class Fault:

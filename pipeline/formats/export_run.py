@@ -26,11 +26,10 @@ def export_run(target: Format[Any], config: Config) -> None:
 def kept_episodes(config: Config) -> Episodes:
     """The kept episodes of a run, in the order they are written."""
     run = outcome.read(config)
-    suites = {row.episode_id: row.suite for row in run.rows}
     return Episodes(
         ids=run.kept,
         load=EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render),
-        suites={episode_id: suites[episode_id] for episode_id in run.kept},
+        suites={row.episode_id: row.suite for row in run.rows},
         content=run.contents(),
         demos={row.episode_id: row.demo_id for row in run.rows},
     )

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig
-from pipeline.formats.base import Copy, Episodes, Fault, Format, Load, Row, column, split
+from pipeline.formats.base import Copy, Episodes, Fault, Format, Load, Row, column
 
 
 class LeRobot(Format[LeRobotConfig]):
@@ -39,9 +39,7 @@ class LeRobot(Format[LeRobotConfig]):
         return {
             f"parts/{split_name}-{part:05d}": ids
             for split_name, members in episodes.by_split(self.options.validation).items()
-            for part, ids in enumerate(
-                split(members, max(1, round(self.options.parts * len(members) / len(episodes.ids))))
-            )
+            for part, ids in enumerate(episodes.slices(members, self.options.parts))
         }
 
     def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:

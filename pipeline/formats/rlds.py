@@ -10,7 +10,7 @@ import pyarrow as pa
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import RldsConfig
-from pipeline.formats.base import Copy, Episodes, Fault, Format, Load, Row, column, split
+from pipeline.formats.base import Copy, Episodes, Fault, Format, Load, Row, column
 from pipeline.formats.rlds_layout import VERSION, by_suite, dataset_of, shard_path
 
 
@@ -32,8 +32,7 @@ class Rlds(Format[RldsConfig]):
         pieces: dict[str, list[str]] = {}
         for split_name, members in episodes.by_split(self.options.validation).items():
             for name, ids in by_suite(members, episodes.suites, self.options.name).items():
-                # Shards are dealt out by the number of episodes.
-                slices = split(ids, max(1, round(self.options.shards * len(ids) / len(episodes.ids))))
+                slices = episodes.slices(ids, self.options.shards)
                 for shard, slice_ids in enumerate(slices):
                     pieces[f"dataset/{shard_path(name, split_name, shard, len(slices))}"] = slice_ids
         return pieces

@@ -23,8 +23,7 @@ from pipeline.physics.success import verdict
 from pipeline.physics.tracking import Route, follow
 from pipeline.run.compute import Run
 from pipeline.run.plan import Row, pending
-from pipeline.run.trajectory_store import TrajectoryStore
-from pipeline.run.trajectory_store import verdicts as verdicts_of
+from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
 

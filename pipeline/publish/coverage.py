@@ -42,21 +42,21 @@ class Draw(NamedTuple):
     resolved: Any
 
 
-class Coverage(NamedTuple):
+class AxisPlots(NamedTuple):
     """What is shown of one axis: what there is to say of the test set, and the plots."""
 
     note: str
     panels: list[Panel]
 
 
-def of(axis: str, draws: Sequence[Draw], test: TestSet) -> Coverage:
+def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     """The coverage of one axis by the draws on it."""
     shown = _plots(axis, draws, test)
     kind = kind_of(axis)
     if not kind.graded:
         return shown
     unit = kind.measure.partition(":")[0].partition(",")[0]
-    return Coverage(shown.note, [*shown.panels, _distances(axis, draws, test, unit)])
+    return AxisPlots(shown.note, [*shown.panels, _distances(axis, draws, test, unit)])
 
 
 def _distances(axis: str, draws: Sequence[Draw], test: TestSet, unit: str) -> Panel:
@@ -70,7 +70,7 @@ def _distances(axis: str, draws: Sequence[Draw], test: TestSet, unit: str) -> Pa
     return strips("from each test task to the nearest draw", rows, unit)
 
 
-def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> Coverage:
+def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     made = [draw.made for draw in draws]
     match axis:
         case "camera":
@@ -89,10 +89,10 @@ def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> Coverage:
             return _pose([p for p in made if isinstance(p, PosePerturbation)], test)
         case "robot":
             return _robot([p for p in made if isinstance(p, RobotPerturbation)], test)
-    return Coverage("Nothing is plotted of this axis.", [])
+    return AxisPlots("Nothing is plotted of this axis.", [])
 
 
-def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> Coverage:
+def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("camera")]
 
     def points(*names: str) -> dict[str, Floats]:
@@ -102,7 +102,7 @@ def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> Coverage:
         return {"benchmark": np.unique(shown, axis=0), "camera": own}
 
     scales = {name: values.ravel() for name, values in points("distance_scale").items()}
-    return Coverage(
+    return AxisPlots(
         f"{len(tested):,} test cameras. A draw is a point in each plot; what it leaves alone stays LIBERO's. Where it "
         "lies on a test camera in one plot, it is apart from it in another.",
         [
@@ -113,7 +113,7 @@ def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> Coverage:
     )
 
 
-def _light(draws: Sequence[LightPerturbation], test: TestSet) -> Coverage:
+def _light(draws: Sequence[LightPerturbation], test: TestSet) -> AxisPlots:
     columns = {
         "brightness": ("multiple of the diffuse light", [float(np.mean(p.diffuse_scale_rgb)) for p in draws]),
         "tint": ("saturation", [1 - min(p.diffuse_scale_rgb) / max(*p.diffuse_scale_rgb, 1e-9) for p in draws]),
@@ -122,27 +122,27 @@ def _light(draws: Sequence[LightPerturbation], test: TestSet) -> Coverage:
         "tilt": ("lamps tilted by (°)", [p.tilt_deg for p in draws]),
     }
     shown = [strips(name, {"draws": {"light": np.array(values)}}, label) for name, (label, values) in columns.items()]
-    return Coverage(
+    return AxisPlots(
         f"{len(test.of('light')):,} test tasks, whose values are unknown offline: they are published only within the "
         f"benchmark's asset archive. {sum(p.shadows for p in draws)} of {len(draws)} draws cast shadows.",
         shown,
     )
 
 
-def _background(draws: Sequence[BackgroundPerturbation], test: TestSet) -> Coverage:
+def _background(draws: Sequence[BackgroundPerturbation], test: TestSet) -> AxisPlots:
     names = [covering.texture for p in draws for covering in p.coverings]
     tested = test.of("background")
     images = {task.parameters[part] for task in tested for part in ("surface", "wall") if part in task.parameters}
     # Such as procedural:brick/028 or metaworld:floor2.png.
     sources = Counter(name.rpartition("/" if "/" in name else ":")[0] for name in names)
-    return Coverage(
+    return AxisPlots(
         f"{len(set(names))} different images in {len(draws)} draws. The {len(tested):,} test tasks show {len(images)}; "
         "a run stops where one of them is shared, by name or by content.",
         [bars("images by source and family", sources, "background", "uses")],
     )
 
 
-def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> Coverage:
+def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> AxisPlots:
     rows = {}
     for component in dict.fromkeys(task.component for task in test.of("noise")):
         own = [p for p in draws if p.component == component]
@@ -155,14 +155,14 @@ def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> Coverage:
             steps, values = np.array([(0.0, float(clean)), *ladder]).T
             at = np.interp([float(getattr(p.effect, name)) for p in own], values, steps)
         rows[component] = {"benchmark": severities, "noise": at}
-    return Coverage(
+    return AxisPlots(
         f"{len(test.of('noise')):,} test tasks at ten severities of each kind; a draw stands where its strength would, "
         "on the benchmark's scale.",
         [strips("strength by kind", rows, "severity")],
     )
 
 
-def _language(draws: Sequence[tuple[Task, LanguagePerturbation]], test: TestSet) -> Coverage:
+def _language(draws: Sequence[tuple[Task, LanguagePerturbation]], test: TestSet) -> AxisPlots:
     tested = test.of("language")
     original = {(t.suite, t.base): find_task(t.suite, t.base).instruction for t in tested}
     far = np.array([distance(str(t.parameters["text"]), original[t.suite, t.base]) for t in tested])
@@ -171,7 +171,7 @@ def _language(draws: Sequence[tuple[Task, LanguagePerturbation]], test: TestSet)
         name.replace("_", " "): {"language": np.array([away for component, away in own if component == name])}
         for name in CLASSES
     }
-    return Coverage(
+    return AxisPlots(
         f"{len(tested):,} test instructions, of no stated class. The distance is the share of characters to edit.",
         [
             histogram(
@@ -185,7 +185,7 @@ def _language(draws: Sequence[tuple[Task, LanguagePerturbation]], test: TestSet)
     )
 
 
-def _layout(draws: Sequence[Draw], test: TestSet) -> Coverage:
+def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("layout")]
     places = [pair.split(",") for known in tested for pair in str(known["positions"]).split(";") if pair]
     own, counts = [], []
@@ -200,7 +200,7 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> Coverage:
     }
     groups = {"benchmark": np.unique(np.array(places, float).reshape(-1, 2), axis=0), "layout": np.array(own)}
     number = {"benchmark": np.array([float(known["count"]) for known in tested]), "layout": np.array(counts, float)}
-    return Coverage(
+    return AxisPlots(
         f"{len(tested):,} test tasks. Objects of {len(categories)} categories were added; a run stops where a test "
         "task of the same LIBERO task adds one of these.",
         [
@@ -210,11 +210,11 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> Coverage:
     )
 
 
-def _pose(draws: Sequence[PosePerturbation], test: TestSet) -> Coverage:
+def _pose(draws: Sequence[PosePerturbation], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("pose") if "dx_m" in task.parameters]
     moves = np.array([[float(known["dx_m"]), float(known["dy_m"])] for known in tested]).reshape(-1, 2)
     own = np.array([[p.dx_m, p.dy_m] for p in draws]).reshape(-1, 2)
-    return Coverage(
+    return AxisPlots(
         f"{len(test.of('pose')):,} test tasks, of which {len(tested):,} move the target, and all of which move "
         "everything else as well. The turn is this project's own.",
         [
@@ -226,13 +226,13 @@ def _pose(draws: Sequence[PosePerturbation], test: TestSet) -> Coverage:
     )
 
 
-def _robot(draws: Sequence[RobotPerturbation], test: TestSet) -> Coverage:
+def _robot(draws: Sequence[RobotPerturbation], test: TestSet) -> AxisPlots:
     ids = [int(task.parameters["id"]) - 1 for task in test.of("robot")]
     tested = benchmark_offsets_rad()[ids].reshape(-1, 7)
     own = np.array([p.joint_offsets_rad for p in draws]).reshape(-1, 7)
     joints = {f"joint {n + 1}": {"benchmark": np.unique(tested[:, n]), "robot": own[:, n]} for n in range(7)}
     norms = {"benchmark": np.linalg.norm(tested, axis=1), "robot": np.linalg.norm(own, axis=1)}
-    return Coverage(
+    return AxisPlots(
         f"{len(ids):,} test tasks with {len(set(ids))} different offsets.",
         [
             histogram("size of the offset", norms, np.arange(0.025, 0.6, 0.05), "norm (rad)"),

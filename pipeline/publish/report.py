@@ -20,7 +20,7 @@ from pipeline.files import replaced
 from pipeline.libero.tasks import find_task
 from pipeline.publish import clips, coverage, figures, yields
 from pipeline.publish.clips import Clip
-from pipeline.publish.coverage import Coverage, Draw
+from pipeline.publish.coverage import AxisPlots, Draw
 from pipeline.publish.figures import Panel
 from pipeline.publish.sheets import describe
 from pipeline.publish.yields import Rows, Table
@@ -176,7 +176,7 @@ def _by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
     return groups
 
 
-def _coverage(asked: Rows, test: TestSet) -> dict[str, tuple[Coverage, Table]]:
+def _coverage(asked: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
     """Axis to its coverage by kept episodes, and its yields by component and level."""
     draws: dict[str, list[Draw]] = {}
     rows: dict[str, list[Mapping[str, Any]]] = {}

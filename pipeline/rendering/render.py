@@ -25,7 +25,7 @@ from pipeline.run.frame_store import FrameStore, Rendered, stream_ids
 from pipeline.run.outcome import rejections, replayed
 from pipeline.run.plan import Row, select
 from pipeline.run.streams import Stream, streams_of
-from pipeline.run.trajectory_store import TrajectoryStore, verdicts
+from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Task, Trajectory
 
@@ -60,12 +60,13 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
                 for step in range(steps):
                     renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                     clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
-                    faults = [fault for frame in clean.values() if (fault := exposure(frame))]
-                    if step == 0 and moved and original:
-                        faults += Sight.of(renderer, task, hand_m).faults(original)
-                    if step == 0 and faults and perturbations != "[]":
-                        refused |= {stream.stream_id: faults[0] for stream in members}
-                        break
+                    if step == 0 and changes:
+                        faults = [fault for frame in clean.values() if (fault := exposure(frame))]
+                        if moved and original:
+                            faults += Sight.of(renderer, task, hand_m).faults(original)
+                        if faults:
+                            refused |= {stream.stream_id: faults[0] for stream in members}
+                            break
                     for stream in members:
                         frame = clean[stream.view]
                         for noise in of_layer(stream.perturbations, PixelPerturbation):
@@ -148,10 +149,10 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     """
     device = gl.choose().device
     store = FrameStore(folder, config.render)
-    judged = verdicts(replayed(rows, trajectories))
+    judged = verdicts_of(replayed(rows, trajectories))
     steps = {row.trajectory_id: row.demo_steps for row in rows}
     tasks = {row.trajectory_id: (row.suite, row.task) for row in rows}
-    undone: set[str] = set()
+    undone: list[RenderJob] = []
     while True:
         stored = {name: row for name, row in store.refresh().items() if row["device"] == device}
         rejected = rejections(rows, stored)
@@ -177,15 +178,14 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
         ]
         if not jobs:
             return set(needed)
-        keys = {f"{job.trajectory_id} {sorted(stream.stream_id for stream in job.streams)}" for job in jobs}
-        if keys == undone:
+        if jobs == undone:
             raise PipelineError(
                 f"{len(jobs)} trajectories were rendered and are still not there, such as this one",
                 where=store.path(jobs[0].trajectory_id),
                 expected=f"files written by workers into this folder, rendered on {device}",
                 remedy="check that all workers see this folder and have the same versions and OpenGL device",
             )
-        undone = keys
+        undone = jobs
         # The longest first, so that no worker is left alone with one at the end.
-        jobs.sort(key=lambda job: -steps[job.trajectory_id] * len(job.streams))
-        run(RenderJob.__call__, jobs, "render")
+        longest_first = sorted(jobs, key=lambda job: -steps[job.trajectory_id] * len(job.streams))
+        run(RenderJob.__call__, longest_first, "render")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from pipeline.run import plan
 from pipeline.run.frame_store import FrameStore
 from pipeline.run.store import Store
 from pipeline.run.streams import streams_of
-from pipeline.run.trajectory_store import TrajectoryStore, verdicts
+from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.seeding import digest
 from pipeline.types import Verdict
 
@@ -26,7 +27,7 @@ class Outcome:
     Attributes:
         rows: the plan.
         trajectories: trajectory id to its row in the table of replays.
-        frames: trajectory id to its row in the table of frames; empty before the render stage.
+        frames: trajectory id to its row in the table of frames.
         verdicts: episode id to verdict.
     """
 
@@ -35,7 +36,7 @@ class Outcome:
     frames: Mapping[str, Mapping[str, Any]]
     verdicts: Mapping[str, Verdict]
 
-    @property
+    @cached_property
     def kept(self) -> list[str]:
         """Ids of the kept episodes, in the order they are written: shuffled, because readers walk shards in order."""
         ids = [row.episode_id for row in self.rows if self.verdicts[row.episode_id].kept]
@@ -62,7 +63,7 @@ def replayed(rows: Sequence[plan.Row], folder: Path) -> dict[str, dict[str, Any]
     """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
-    _refuse_missing(plan.pending(rows, verdicts(trajectories)), store, "replay")
+    _refuse_missing(plan.pending(rows, verdicts_of(trajectories)), store, "replay")
     return trajectories
 
 
@@ -93,7 +94,7 @@ def read(config: Config) -> Outcome:
     trajectories = replayed(rows, config.data / "trajectories")
     store = FrameStore(config.data / "frames", config.render)
     frames = store.rows()
-    judged = plan.select(rows, verdicts(trajectories), rejections(rows, frames))
+    judged = plan.select(rows, verdicts_of(trajectories), rejections(rows, frames))
     needed = dict.fromkeys(row.trajectory_id for row in rows if judged[row.episode_id].kept)
     _refuse_missing([trajectory_id for trajectory_id in needed if trajectory_id not in frames], store, "render")
     return Outcome(rows, trajectories, frames, judged)

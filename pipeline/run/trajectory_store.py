@@ -65,7 +65,7 @@ class TrajectoryStore(Store):
             )
 
 
-def verdicts(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Verdict]:
+def verdicts_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Verdict]:
     """Trajectory id to verdict, from the rows of the table."""
     return {trajectory_id: Verdict(row["kept"], row["reason"]) for trajectory_id, row in rows.items()}
 

@@ -31,7 +31,7 @@ SLICE = 4
 
 
 @dataclass
-class Outcome:
+class Results:
     """What checks came to, over any number of episodes.
 
     Attributes:
@@ -46,7 +46,7 @@ class Outcome:
         self.checked[check] += checked
         self.findings[check] += found
 
-    def add(self, other: Outcome) -> None:
+    def add(self, other: Results) -> None:
         for check, checked in other.checked.items():
             self.note(check, other.findings[check], checked)
 
@@ -64,7 +64,7 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
     data = config.data.resolve()
     rows = manifest.read(data / "manifest.parquet")
     kept = {row["episode_id"]: row for row in rows if row["kept"]}
-    total = Outcome()
+    total = Results()
     total.note("counts", run_checks.counts(data, rows), len(rows))
     with scratch(data / ".work" / "validate") as cache:
         opened = []
@@ -83,8 +83,8 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
         columns = [column.name for one in opened for column in one.columns]
         ordered = sorted(kept.values(), key=lambda row: [str(row[column]) for column in columns])
         slices = [ordered[start : start + SLICE] for start in range(0, len(ordered), SLICE)]
-        for outcome in run(job, slices, "validate"):
-            total.add(outcome)
+        for results in run(job, slices, "validate"):
+            total.add(results)
     if not any(finding.dataset == "rlds" for finding in total.findings["readable"]):
         # OFT's reader stops at what is damaged.
         sets = oft.datasets(data / "rlds")
@@ -115,13 +115,13 @@ class EpisodesJob:
     cache: Path
     witnesses: frozenset[str]
 
-    def __call__(self, rows: Sequence[Row]) -> Outcome:
-        outcome = Outcome()
+    def __call__(self, rows: Sequence[Row]) -> Results:
+        results = Results()
         for row in rows:
-            self._check(row, outcome)
-        return outcome
+            self._check(row, results)
+        return results
 
-    def _check(self, row: Row, outcome: Outcome) -> None:
+    def _check(self, row: Row, results: Results) -> None:
         episode_id = row["episode_id"]
         copies, missing, unreadable = [], [], []
         for one in self.formats:
@@ -132,8 +132,8 @@ class EpisodesJob:
                     missing.append(Fault(one.name, episode_id, "is not in the dataset", "every kept episode"))
             except PipelineError as error:
                 unreadable.append(Fault(one.name, episode_id, str(error), "an episode that can be read"))
-        outcome.note("ids", missing, 0)
-        outcome.note("readable", unreadable)
+        results.note("ids", missing, 0)
+        results.note("readable", unreadable)
         language = self.config.plan.axes.language
         case = Case(
             row=row,
@@ -143,6 +143,6 @@ class EpisodesJob:
             bank=language.bank if language else None,
         )
         for name, check in CHECKS.items():
-            outcome.note(name, check(case))
+            results.note(name, check(case))
         if episode_id in self.witnesses:
-            outcome.note("rendered", rendered(case))
+            results.note("rendered", rendered(case))
