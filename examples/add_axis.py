@@ -4,7 +4,6 @@ Both classes in a file of ``pipeline/axes``, and their names in its ``__init__.p
 configurations can name. CONTRIBUTING.md has the steps.
 """
 
-import math
 import sys
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -13,13 +12,13 @@ import mujoco
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, Nearest, RenderPerturbation
+from pipeline.axes.base import Axis, RenderPerturbation
 from pipeline.libero.tasks import find_task
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
 from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Task
+from pipeline.types import Floats, Task
 
 
 class LensPerturbation(RenderPerturbation):
@@ -37,8 +36,8 @@ class LensPerturbation(RenderPerturbation):
     def apply(self, model: mujoco.MjModel) -> None:
         model.cam_fovy[model.camera("agentview").id] *= self.fovy_scale
 
-    def nearest(self, test: TestSet, task: Task) -> Nearest:
-        return Nearest(math.inf, 0)
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        return np.empty(0)
 
 
 class LensAxis(Axis):

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.axes import AnyPerturbation, kind_of
 from pipeline.axes.background import BackgroundPerturbation
+from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.language import CLASSES, LanguagePerturbation, distance
 from pipeline.axes.layout import LayoutPerturbation
@@ -53,7 +54,7 @@ def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     """The coverage of one axis by the draws on it."""
     shown = _plots(axis, draws, test)
     kind = kind_of(axis)
-    if not kind.graded:
+    if not kind.graded or not test.of(axis):
         return shown
     unit = kind.measure.partition(":")[0].partition(",")[0]
     return AxisPlots(shown.note, [*shown.panels, _distances(axis, draws, test, unit)])
@@ -89,7 +90,19 @@ def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
             return _pose([p for p in made if isinstance(p, PosePerturbation)], test)
         case "robot":
             return _robot([p for p in made if isinstance(p, RobotPerturbation)], test)
-    return AxisPlots("Nothing is plotted of this axis.", [])
+    return _numbers(axis, made, test)
+
+
+def _numbers(axis: str, draws: Sequence[Perturbation], test: TestSet) -> AxisPlots:
+    """An axis that has no plots of its own: the level and every parameter that is one number."""
+    names = [name for name, field in kind_of(axis).model_fields.items() if field.annotation in (int, float)]
+    return AxisPlots(
+        f"{len(test.of(axis)):,} test tasks.",
+        [
+            strips(name.replace("_", " "), {"draws": {axis: np.array([getattr(p, name) for p in draws], float)}}, name)
+            for name in ("level", *names)
+        ],
+    )
 
 
 def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> AxisPlots:

@@ -34,8 +34,8 @@ COLOURS = {
     "noise": "#9467d6",
     "language": "#e4572e",
 }
-COMBINED = "#b0794a"
-"""For episodes that are perturbed on several axes."""
+OTHER = "#b0794a"
+"""For episodes that are perturbed on several axes, and for an axis without a colour of its own."""
 
 INK = "#010203"
 """A colour that nothing else has; it becomes the page's."""
@@ -68,7 +68,7 @@ class Panel(NamedTuple):
 
 
 def colour(group: str) -> str:
-    return GREY if group in REFERENCES else COLOURS.get(group, COMBINED)
+    return GREY if group in REFERENCES else COLOURS.get(group, OTHER)
 
 
 def panel(title: str, draw: Callable[[Axes], None], height_in: float = HEIGHT_IN) -> Panel:
