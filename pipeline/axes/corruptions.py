@@ -11,11 +11,11 @@ import math
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from pipeline.axes.base import Frozen
+from pipeline.axes.jit import compiled
 from pipeline.types import Floats, Frame
 
 Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
@@ -30,7 +30,7 @@ def _to_frame(image: NDArray[np.floating]) -> Frame:
     return (image.clip(0, 1) * 255).astype(np.uint8, order="C")
 
 
-@njit(cache=True)
+@compiled
 def _blur_columns(image: Floats, half_kernel: Floats) -> Floats:
     """(N, M) convolved along axis 0 with a symmetric kernel, given from its centre outwards; edges repeated."""
     blurred: Floats = image * half_kernel[0]
@@ -92,7 +92,7 @@ class Gaussian(Frozen):
         return _to_frame(_gaussian_blur(frame / 255, self.sigma_px))
 
 
-@njit(cache=True)
+@compiled
 def _add_resampled(total: Pixels, image: Pixels, rows: Samples, columns: Samples) -> None:
     """Add to ``total`` (H, W, 3) the image interpolated bilinearly at H rows and W columns."""
     for i, y in enumerate(rows[0]):
@@ -178,7 +178,7 @@ class Fog(Frozen):
         return _to_frame((image + self.density * veil) * brightest / (brightest + self.density))
 
 
-@njit(cache=True)
+@compiled
 def _scatter(frame: Frame, offsets: NDArray[np.int8], delta_px: int) -> None:
     """In place and pixel after pixel, from bottom right to top left, replace each by one of its neighbours.
 

@@ -19,12 +19,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 import numpy as np
 import yaml
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
 from pipeline.axes.base import Axis, Level, TextPerturbation, on_task
+from pipeline.axes.jit import compiled
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
 from pipeline.types import Floats, Task
@@ -213,7 +213,7 @@ def _characters(text: str) -> NDArray[np.uint8]:
     return np.frombuffer(normalise(text).encode(), np.uint8)
 
 
-@njit(cache=True)
+@compiled
 def _edits(one: NDArray[np.uint8], two: NDArray[np.uint8]) -> int:
     """Levenshtein distance, row by row: ``row[j]`` is that of what was read of ``one`` to the first j of ``two``."""
     row = np.arange(len(two) + 1)

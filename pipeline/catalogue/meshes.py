@@ -1,4 +1,8 @@
-"""A Wavefront OBJ with its materials to a MuJoCo model of one object: visual meshes, and a convex hull for contacts."""
+"""A Wavefront OBJ with its materials to a MuJoCo model of one object: visual meshes, and a convex hull for contacts.
+
+trimesh takes seconds to import, and every process of a run imports this module, but hardly any converts a mesh: so it
+is imported where it is used.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-import fast_simplification
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -62,6 +64,8 @@ def convert(
     Raises:
         PipelineError: when it is not a readable OBJ, or too flat or broken for a hull.
     """
+    import trimesh
+
     try:
         parts = _parts(obj, size_m, np.eye(3) if turn is None else turn)
         points = np.concatenate([part.vertices for part in parts])
@@ -96,6 +100,8 @@ def convert(
 
 
 def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: NDArray[np.float64]) -> list[_Part]:
+    import trimesh
+
     scene = trimesh.load_scene(obj, process=False)
     meshes = [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     every = np.concatenate([mesh.vertices @ turn.T for mesh in meshes])
@@ -131,6 +137,9 @@ def _simplified(
     """Fewer faces; a small part and a textured one keep theirs, as collapsing edges would distort the texture."""
     if uv is not None or len(faces) < _SMALL_PART:
         return vertices, faces, uv
+    import fast_simplification
+    import trimesh
+
     # Faces that share places but not vertices (for normals of their own) would come apart.
     merged = trimesh.Trimesh(vertices, faces, process=False)
     merged.merge_vertices(merge_norm=True, merge_tex=True)
