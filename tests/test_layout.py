@@ -21,7 +21,9 @@ from pipeline.libero.tasks import tasks
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
 from pipeline.physics.roll_out import roll_out
-from pipeline.scenes.placement import CLEARANCE_M, place
+from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.sight import Sight
+from pipeline.scenes.placement import CLEARANCE_M, SEEN_PX, enough_seen, place
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Scene
 
@@ -153,6 +155,26 @@ def test_objects_touch_the_table_only_and_the_demonstration_passes_them_by(
             one, other = contact.geom
             if added[one] != added[other]:
                 assert model.geom_bodyid[other if added[one] else one] == table
+
+
+def test_every_object_shows_as_much_as_was_recorded(changed: Scene) -> None:
+    renderer = Renderer(changed.model_xml)
+    renderer.restore(changed.state, renderer.model.site_rgba[:, 3].astype(np.float32))
+    rendered_px = Sight.of(renderer, PLATE, np.zeros((1, 3))).added_px
+    renderer.close()
+    recorded_px = [placed["seen_px"] for placed in changed.resolved["layout"]["objects"]]
+    assert min(rendered_px) >= SEEN_PX
+    # At an outline, a ray may meet another thing than is drawn.
+    np.testing.assert_allclose(recorded_px, rendered_px, rtol=0.1, atol=10)
+
+
+@pytest.mark.parametrize(
+    ("seen_px", "enough"),
+    [([SEEN_PX], True), ([SEEN_PX - 1], False), ([0, 99], True), ([0, 0, 99], False), ([0, 99, 99, 99, 99], True)],
+)
+def test_one_object_at_most_may_be_hidden(seen_px: list[int], enough: bool) -> None:
+    assert enough_seen(seen_px) is enough
+    assert Sight({}, 0.0, tuple(seen_px)).faults(Sight({}, 0.0)) == ([] if enough else ["added_objects_not_seen"])
 
 
 def test_the_demonstration_still_succeeds_among_the_objects(

@@ -19,7 +19,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
 from pipeline.rendering.jpeg import encode, to_policy
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.sight import Sight
+from pipeline.rendering.sight import CAMERA, Sight
 from pipeline.run.compute import Run
 from pipeline.run.frame_store import FrameStore, Rendered, stream_ids
 from pipeline.run.outcome import rejections, replayed
@@ -34,7 +34,8 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
     """Render the streams of one trajectory of a task: the frame before each executed action.
 
     Streams that differ in pixel noise alone share the clean frames they are made from. A perturbed scene whose first
-    frame is black or blown out is not rendered any further, nor one whose moved camera loses sight of the task.
+    frame is black or blown out is not rendered any further, nor one whose agent view does not show what it should (see
+    ``Sight``): a moved camera the task, any camera the objects that were added.
     """
     variants: dict[str, list[Stream]] = {}
     for stream in streams:
@@ -49,21 +50,20 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             proprioceptions.append(proprioception(renderer.data))
         hand_m = np.array([state[:3] for state, _ in proprioceptions], float)
-        original: Sight | None = None
+        renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+        original = Sight.of(renderer, task, hand_m)
         for perturbations, members in variants.items():
             changes = of_layer(from_json(perturbations), RenderPerturbation)
             moved = any("cam_pos" in change.fields for change in changes)
-            if moved and original is None:
-                renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
-                original = Sight.of(renderer, task, hand_m)
             with renderer.perturbed(changes):
                 for step in range(steps):
                     renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
                     clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
-                    if step == 0 and changes:
-                        faults = [fault for frame in clean.values() if (fault := exposure(frame))]
-                        if moved and original:
-                            faults += Sight.of(renderer, task, hand_m).faults(original)
+                    if step == 0:
+                        faults = [fault for frame in clean.values() if changes and (fault := exposure(frame))]
+                        if any(SCHEMA.views[view].camera == CAMERA for view in clean):
+                            sight = Sight.of(renderer, task, hand_m) if moved else original
+                            faults += sight.faults(original)
                         if faults:
                             refused |= {stream.stream_id: faults[0] for stream in members}
                             break

@@ -1,4 +1,4 @@
-"""What an episode's agent view shows of its task: the things that the task is about, and the hand that moves them."""
+"""What an episode's agent view shows of the things that the task is about, of the hand, and of added objects."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.libero import bddl
 from pipeline.rendering.renderer import Renderer
+from pipeline.scenes.placement import added_objects, enough_seen
 from pipeline.types import Floats, Task
 
 CAMERA = "agentview"
@@ -26,10 +27,12 @@ class Sight:
     Attributes:
         things_px: thing to the number of pixels that show it in the restored state.
         hand_outside: share of an episode's steps at which the hand is outside of the frame.
+        added_px: the same as ``things_px`` for each object that the layout axis added.
     """
 
     things_px: dict[str, int]
     hand_outside: float
+    added_px: tuple[int, ...] = ()
 
     @classmethod
     def of(cls, renderer: Renderer, task: Task, hand_m: Floats) -> Sight:
@@ -51,17 +54,24 @@ class Sight:
         return cls(
             {thing: int(trees[model.body(f"{thing}_main").rootid[0]]) for thing in _things(task)},
             float(np.mean((np.abs(x) > reach) | (np.abs(y) > reach))),
+            tuple(int(trees[model.body(name).rootid[0]]) for name in added_objects(model)),
         )
 
     def faults(self, original: Sight) -> list[str]:
-        """What a moved camera shows too little of, where the scene's own camera shows more; none when it is enough.
+        """What a camera shows too little of; none when it is enough.
 
-        ``task_object_not_seen`` when a thing shows on fewer than ``LEAST_PX`` pixels, ``hand_not_seen`` when the hand
-        is outside of the frame for more than ``MOST_OUTSIDE`` of the steps.
+        Where the scene's own camera shows more: ``task_object_not_seen`` when a thing shows on fewer than ``LEAST_PX``
+        pixels, ``hand_not_seen`` when the hand is outside of the frame for more than ``MOST_OUTSIDE`` of the steps.
+        ``added_objects_not_seen`` when fewer of these show than the layout axis asks for.
         """
         lost = any(px < min(LEAST_PX, original.things_px[thing]) for thing, px in self.things_px.items())
         away = self.hand_outside > max(MOST_OUTSIDE, original.hand_outside)
-        return [*(["task_object_not_seen"] if lost else []), *(["hand_not_seen"] if away else [])]
+        faults = {
+            "task_object_not_seen": lost,
+            "hand_not_seen": away,
+            "added_objects_not_seen": bool(self.added_px) and not enough_seen(self.added_px),
+        }
+        return [name for name, holds in faults.items() if holds]
 
 
 def _things(task: Task) -> set[str]:

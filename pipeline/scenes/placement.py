@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections import Counter
 from collections.abc import Sequence
 
@@ -11,11 +13,13 @@ from numpy.typing import NDArray
 
 from pipeline import seeding
 from pipeline.catalogue.object_model import ObjectModel
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
 from pipeline.scenes.swept_path import SweptPath
 from pipeline.types import Demo, Floats, RollOut, Scene
 
+_BODY = "layout"
 SCENES, DRAWS = 12, 80
 """How often a whole scene is begun, and how often one object's place is drawn in it, before giving up."""
 DRAW_CLEARANCE_M, CLEARANCE_M = 0.02, 0.015
@@ -27,6 +31,9 @@ FRAME = 0.8
 """Share of the agent view's half width that an object's middle stays within."""
 HIDDEN = 0.05
 """Largest share of the visible part of a task's objects that added objects may cover."""
+SEEN_PX, PLACED_PX = 20, 30
+"""Pixels of 256 x 256 on which an added object must show in the first frame of the agent view, and where it is placed:
+more, because it is placed by rays, which meet somewhat other pixels at outlines than are drawn."""
 _SETTLE_S, _REST_S = 1.0, 0.25
 _STILL_M, _TILT_DEG, _SLID_M = 2e-4, 15.0, 0.03
 _DISTURBED_M = 1e-3
@@ -46,7 +53,7 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
     Raises:
         RefusedError: when no place was found; the reason is the one that most places were refused for.
     """
-    names = [f"layout{number}" for number in range(len(objects))]
+    names = [f"{_BODY}{number}" for number in range(len(objects))]
     model_xml = _with(scene.model_xml, objects, names)
     placement = _Placement(
         model_xml, scene.state, roll_out(scene, demo), objects, names, bddl.read(demo.task.bddl_file).of_interest
@@ -65,12 +72,24 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
             [scene.state[: 1 + nq], settled.ravel(), scene.state[1 + nq :], np.zeros(6 * len(names))]
         )
         placed = [
-            {"name": model.name, "position_m": pose[:3].tolist(), "quaternion_wxyz": pose[3:].tolist()}
-            for model, pose in zip(objects, settled, strict=True)
+            {"name": model.name, "position_m": pose[:3].tolist(), "quaternion_wxyz": pose[3:].tolist(), "seen_px": px}
+            for model, pose, px in zip(objects, settled, placement.seen_px(settled), strict=True)
         ]
         resolved = {"objects": placed, "scenes": attempt + 1, "rejected": dict(sorted(rejected.items()))}
         return Scene(model_xml, state, {**scene.resolved, "layout": resolved})
     raise RefusedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
+
+
+def added_objects(model: mujoco.MjModel) -> list[str]:
+    """The bodies of the objects that were added to a scene, in their order."""
+    names = (model.body(body).name for body in range(model.nbody))
+    return [name for name in names if re.fullmatch(rf"{_BODY}\d+", name)]
+
+
+def enough_seen(seen_px: Sequence[int], least_px: int = SEEN_PX) -> bool:
+    """Whether all added objects but one at most, and at least one, show on ``least_px`` pixels."""
+    seen = sum(px >= least_px for px in seen_px)
+    return seen >= max(1, len(seen_px) - 1)
 
 
 def _with(model_xml: str, objects: Sequence[ObjectModel], names: Sequence[str]) -> str:
@@ -106,7 +125,7 @@ class _Placement:
         self._data = mujoco.MjData(self._model)
         self.old_nq = self._model.nq - 7 * len(names)
         self._old_nv = self._model.nv - 6 * len(names)
-        self._state, self._states, self._objects = state, states, objects
+        self._state, self._states, self._objects, self._names = state, states, objects, names
         self._added = np.isin(self._model.geom_bodyid, [self._model.body(name).id for name in names])
         self._swept = SweptPath(self._model, self._added, states[:, 1 : 1 + self.old_nq])
         self._parked = np.array([[50.0 + 5 * number, 0.0, 50.0, 1.0, 0.0, 0.0, 0.0] for number in range(len(names))])
@@ -178,7 +197,49 @@ class _Placement:
             return poses, "in_the_way"
         if self._hidden(rest) > HIDDEN:
             return poses, "hides_target"
+        if not enough_seen(self.seen_px(rest), PLACED_PX):
+            return poses, "not_seen"
         return rest, None
+
+    def seen_px(self, poses: Floats) -> list[int]:
+        """On how many pixels of the agent view's first frame each object shows: a ray through each pixel near it."""
+        self._put(self._state, poses)
+        half_px = SCHEMA.frame.shape[0] / 2
+        counts = []
+        for name, model, pose in zip(self._names, self._objects, poses, strict=True):
+            pixels = self._pixels_near(model, pose, half_px)
+            x, y = ((pixels + 0.5) / half_px - 1).T * self._eye_slope
+            rays = np.column_stack([x, -y, -np.ones(len(x))]) @ self._eye_axes.T
+            hit = self._first_hit(rays)[0]
+            body = self._model.body(name).id
+            counts.append(int((self._model.geom_bodyid[hit[hit >= 0]] == body).sum()))
+        return counts
+
+    def _pixels_near(self, model: ObjectModel, pose: Floats, half_px: float) -> NDArray[np.float64]:
+        """(P, 2) columns and rows of the pixels in a rectangle around an object."""
+        low, high, _ = model.shape
+        corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
+        turn = np.empty(9)
+        mujoco.mju_quat2Mat(turn, pose[3:])
+        x, y, z = ((corners @ turn.reshape(3, 3).T + pose[:3] - self._eye_m) @ self._eye_axes).T
+        at_px = (np.column_stack([x, -y]) / (-z * self._eye_slope)[:, None] + 1) * half_px
+        # The bounds are those of what collides; what is drawn may be somewhat larger.
+        first = np.clip(at_px.min(axis=0) - 4, 0, 2 * half_px).astype(int)
+        last = np.clip(at_px.max(axis=0) + 5, 0, 2 * half_px).astype(int)
+        columns, rows = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
+        return np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
+
+    def _first_hit(self, rays: Floats) -> tuple[NDArray[np.int32], Floats]:
+        """(R,) the geom that each ray (R, 3) from the agent camera meets first, -1 for none, and where, in its length.
+
+        Only what is drawn counts: collision geometry does not.
+        """
+        hit, distance = np.full(len(rays), -1, np.int32), np.zeros(len(rays))
+        drawn = np.array([0, 1, 0, 0, 0, 0], np.uint8)
+        mujoco.mj_multiRay(
+            self._model, self._data, self._eye_m, rays.ravel(), drawn, 1, -1, hit, distance, len(rays), 1e3
+        )
+        return hit, distance
 
     def _simulated(self, poses: Floats, held: bool) -> tuple[tuple[Floats, Floats], Floats]:
         """The objects' poses (N, 7) at the end and ``_REST_S`` before, and where all other bodies are (B, 3)."""
@@ -223,12 +284,7 @@ class _Placement:
         worst = 0.0
         for step in np.linspace(0, len(self._states) - 1, _VIEWED_STATES).round().astype(int):
             self._put(self._states[step], poses)
-            rays = self._target_points() - self._eye_m
-            hit, distance = np.full(len(rays), -1, np.int32), np.zeros(len(rays))
-            drawn = np.array([0, 1, 0, 0, 0, 0], np.uint8)
-            mujoco.mj_multiRay(
-                self._model, self._data, self._eye_m, rays.ravel(), drawn, 1, -1, hit, distance, len(rays), 1e3
-            )
+            hit, distance = self._first_hit(self._target_points() - self._eye_m)
             visible = self._targets[self._model.geom_bodyid[hit]] & (hit >= 0)
             # A distance of 1 is the point itself.
             covered = self._added[hit] & (hit >= 0) & (distance < 1.0)
