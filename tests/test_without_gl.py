@@ -64,10 +64,7 @@ def stage(name: str, folder: Path, environment: dict[str, str]) -> subprocess.Co
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize("asked", [{}, {"MUJOCO_GL": "egl"}], ids=str)
-def test_physics_runs_and_rendering_says_what_to_install(
-    tmp_path: Path, machine: dict[str, str], asked: dict[str, str]
-) -> None:
+def test_physics_runs_and_rendering_says_what_to_install(tmp_path: Path, machine: dict[str, str]) -> None:
     config = tiny_config(tmp_path) | {
         "demos": {"source": "starter", "tasks": [f"{STOVE.suite}/{STOVE.name}"]},
         "plan": {"seed": 7, "axes": {"robot": {}}, "episodes": {"robot": 1}},
@@ -77,16 +74,18 @@ def test_physics_runs_and_rendering_says_what_to_install(
     (tmp_path / "tiny.yaml").write_text(yaml.safe_dump(config))
     link_testset(tmp_path)
     for name in ("plan", "replay"):
-        done = stage(name, tmp_path, machine | asked)
+        # Asking for a back end by name is no reason to load it.
+        done = stage(name, tmp_path, machine | {"MUJOCO_GL": "egl"})
         assert done.returncode == 0, done.stderr
     assert "loaded of OpenGL: []" in done.stdout
     assert "replayed 2 trajectories" in done.stdout
 
-    done = stage("render", tmp_path, machine | asked)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert done.stderr.startswith("error: ")
-    assert gl.REMEDY in done.stderr
+    for asked in ({}, {"MUJOCO_GL": "egl"}):
+        done = stage("render", tmp_path, machine | asked)
+        assert done.returncode == 1
+        assert "Traceback" not in done.stderr
+        assert done.stderr.startswith("error: ")
+        assert gl.REMEDY in done.stderr
 
 
 def test_preview_says_what_to_install(tmp_path: Path, machine: dict[str, str]) -> None:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
 from pipeline.axes.base import Axis, Frozen, Intervals, Level, RenderPerturbation, draw
+from pipeline.libero import bddl
 from pipeline.types import Floats, Frame, Task
 
 if TYPE_CHECKING:
@@ -29,6 +30,13 @@ SHADOWED_DIFFUSE, SHADOWED_SPECULAR = 0.7, 0.5
 """Most light that lamps with shadows may add up to. Without shadows all lamps are drawn in one pass, which cuts their
 sum off at the colour of what they shine on; with shadows each has a pass of its own, nothing is cut off, and the
 kitchen's three lamps of 0.8 each would make its table white."""
+
+SHOWN_DIFFUSE = 0.8
+"""Most light that lamps add up to once they are changed: that of one lamp of LIBERO's. Its kitchen has a directional
+lamp beside its two, and of their sum a half could go without a trace, because the sum is cut off all the same."""
+
+LEAST_SHININESS = 0.1
+"""Of a polished surface; at 0, as LIBERO's floors have it, a highlight is spread over all of the surface."""
 
 DARK_LEVEL, DARK_SHARE = 10, 0.6
 BRIGHT_LEVEL, BRIGHT_SHARE = 250, 0.25
@@ -59,7 +67,8 @@ class LightPerturbation(RenderPerturbation):
 
     views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
     fields: ClassVar[tuple[str, ...]] = (
-        *("light_diffuse", "light_specular", "light_pos", "light_dir", "light_castshadow", "mat_emission"),
+        *("light_diffuse", "light_specular", "light_pos", "light_dir", "light_castshadow"),
+        *("mat_emission", "mat_specular", "mat_shininess"),
     )
     clearance: ClassVar[float] = 0.0
     measure: ClassVar[str] = "unknown offline: the test tasks' light values are only in the benchmark's asset archive"
@@ -67,8 +76,15 @@ class LightPerturbation(RenderPerturbation):
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Change every lamp of the model."""
+        _limit(model.light_diffuse, model.light_directional, SHOWN_DIFFUSE)
         model.light_diffuse *= np.array(self.diffuse_scale_rgb)
-        model.light_specular *= self.specular_scale
+        if self.specular_scale > 1:
+            # What a surface reflects as a highlight it does not scatter. The root brings 2 to 30 to 0.9 to 0.6.
+            scattered = self.specular_scale ** (-1 / 6)
+            model.light_diffuse *= scattered
+            model.light_specular *= self.specular_scale
+            model.mat_specular[:] = np.maximum(model.mat_specular, 1 - scattered**2)
+            model.mat_shininess[:] = np.maximum(model.mat_shininess, LEAST_SHININESS)
         if self.orbit_deg:
             orbit = _rotation(np.array([0.0, 0.0, 1.0]), self.orbit_deg)
             model.light_pos[:] = model.light_pos @ orbit.T
@@ -144,11 +160,11 @@ class LightAxis(Axis):
         *("diffuse", "direction", "specular", "shadows", "combined"),
     )
     ranges: tuple[LightRange, LightRange, LightRange, LightRange, LightRange] = (
-        _range((0.75, 0.85), (1.1, 1.2), (0.05, 0.15), (2, 3), (10, 30), (2, 6), (0.42, 0.5)),
-        _range((0.6, 0.75), (1.2, 1.35), (0.15, 0.25), (3, 5), (30, 60), (6, 11), (0.32, 0.42)),
-        _range((0.45, 0.6), (1.35, 1.5), (0.25, 0.35), (5, 9), (60, 100), (11, 17), (0.2, 0.32)),
-        _range((0.25, 0.45), (1.5, 1.7), (0.35, 0.48), (9, 16), (100, 140), (17, 24), (0.1, 0.2)),
-        _range((0.05, 0.25), (1.7, 2.0), (0.48, 0.62), (16, 30), (140, 180), (24, 32), (0.0, 0.1)),
+        _range((0.7, 0.8), (1.25, 1.4), (0.15, 0.25), (3, 4), (20, 40), (5, 8), (0.42, 0.5)),
+        _range((0.58, 0.7), (1.4, 1.55), (0.25, 0.33), (4, 6), (40, 65), (8, 12), (0.32, 0.42)),
+        _range((0.44, 0.58), (1.55, 1.7), (0.33, 0.42), (6, 10), (65, 100), (12, 18), (0.2, 0.32)),
+        _range((0.25, 0.44), (1.7, 1.85), (0.42, 0.52), (10, 17), (100, 140), (18, 24), (0.1, 0.2)),
+        _range((0.05, 0.25), (1.85, 2.0), (0.52, 0.65), (17, 30), (140, 180), (24, 32), (0.0, 0.1)),
     )
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LightPerturbation:
@@ -157,16 +173,20 @@ class LightAxis(Axis):
         properties: tuple[Property, ...] = ("diffuse", "direction", "specular", "shadows")
         drawn: dict[str, object] = {}
         for name in properties if component == "combined" else (component,):
-            drawn |= self._draw(rng, name, level)
+            drawn |= self._draw(rng, name, level, task)
         return LightPerturbation.model_validate({"component": component, "level": level, **drawn})
 
-    def _draw(self, rng: np.random.Generator, component: str, level: Level) -> dict[str, object]:
+    def _draw(self, rng: np.random.Generator, component: str, level: Level, task: Task) -> dict[str, object]:
         ranges = self.ranges[level - 1]
         match component:
             case "diffuse":
                 # Not both: a brighter lamp drives its tint back to white.
                 if rng.random() < 0.5:
-                    return {"diffuse_scale_rgb": [draw(rng, ranges.brightness_scale)] * 3}
+                    scales = ranges.brightness_scale
+                    if "Kitchen" in bddl.read(task.bddl_file).problem:
+                        # It is as bright as can be already.
+                        scales = tuple((low, high) for low, high in scales if high <= 1) or scales
+                    return {"diffuse_scale_rgb": [draw(rng, scales)] * 3}
                 tint = colorsys.hsv_to_rgb(rng.random(), draw(rng, ranges.saturation), 1.0)
                 return {"diffuse_scale_rgb": [round(channel, 4) for channel in tint]}
             case "specular":
