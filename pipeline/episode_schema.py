@@ -28,8 +28,8 @@ class ViewSpec(_Model):
     """One camera: its name in MuJoCo and its key in LeRobot; its key here is its name in RLDS.
 
     Attributes:
-        lerobot_camera: what LeRobot's columns about the camera begin with; lerobot takes every name with ``image`` in it
-            for an image's.
+        lerobot_camera: what LeRobot's columns about the camera begin with; without ``image``, which lerobot takes for
+            the name of an image.
         seen_from: the frame that the view's extrinsics lead to.
     """
 

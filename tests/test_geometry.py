@@ -225,7 +225,7 @@ def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:
 
 
 def test_the_example_runs_on_it(run: Path) -> None:
-    command = [sys.executable, REPOSITORY / "examples" / "back_project.py", str(run)]
+    command = [sys.executable, str(REPOSITORY / "examples" / "back_project.py"), str(run)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()

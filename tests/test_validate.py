@@ -74,7 +74,7 @@ def take_credit(tree: Tree) -> None:
 
 
 def mirror_camera(tree: Tree) -> None:
-    tree["episode_metadata"]["image_intrinsics"] = tree["episode_metadata"]["image_intrinsics"] * [-1, 1, 1]
+    tree["episode_metadata"]["image_intrinsics"] = np.abs(tree["episode_metadata"]["image_intrinsics"])
 
 
 IN_RLDS: dict[tuple[str, Task], Callable[[Tree], None]] = {

@@ -63,9 +63,9 @@ class LeRobot(Format[LeRobotConfig]):
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
-        from pipeline.formats import lerobot_read, lerobot_write
+        from pipeline.formats import lerobot_columns, lerobot_read
 
-        return lerobot_read.check(self.root, cache, kept, lerobot_write.features(self.options.frames, self.extras))
+        return lerobot_read.check(self.root, cache, kept, lerobot_columns.features(self.options.frames, self.extras))
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_read

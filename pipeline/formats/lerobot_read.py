@@ -22,7 +22,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Copy, Fault, Row, sampled
-from pipeline.formats.lerobot_write import INSTANCES, OBJECT_POSES, camera_column, geometry_columns, local_only
+from pipeline.formats.lerobot_columns import INSTANCES, OBJECT_POSES, camera_column, geometry_columns
+from pipeline.formats.lerobot_write import local_only
 from pipeline.types import Extra, Geometry
 
 UNREADABLE = (

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import av
 import cv2
@@ -31,16 +31,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import write_info, write_stats
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MatrixSpec, check, named
+from pipeline.episode_schema import MATRICES, SCHEMA, check
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Load
 from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
+from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, Frames, camera_column, features
 from pipeline.formats.lerobot_video import VideoEncoder
 from pipeline.run.motion_statistics import describe
 from pipeline.types import Episode, Extra, Floats, Frame
-
-Frames = Literal["video", "images"]
-"""``video`` is H.264 made from the stored frames; ``images`` are the stored JPEG files, three times as large."""
 
 PART_VIDEO_MB = 16
 """lerobot rewrites a video file for each episode that it appends: small files here, its own 200 MB after the merge."""
@@ -52,13 +50,6 @@ EPISODES_MB = 2
 """Size of the files in ``meta/episodes``, which the merge rewrites for each part: an episode is 1 kB in the file and
 more than 100 in memory."""
 
-
-EPISODE_ID = "episode_id"
-"""A column of every frame, because lerobot's tools to delete, split and merge number episodes anew and leave
-``meta/provenance.parquet`` behind: with it, an episode is still found in the manifest."""
-
-INSTANCES, OBJECT_POSES = "instances", "object_poses"
-"""Columns of every frame with extras: a JSON list of names, and the poses of what it names, row by row."""
 
 SUMMARY, DATASET = "summary.json", "dataset"
 """In a part's folder: what the merge needs beside the dataset, and the dataset."""
@@ -152,42 +143,6 @@ def name_splits(root: Path, lengths: Mapping[str, int]) -> None:
     ends = np.cumsum(list(lengths.values())).tolist()
     info["splits"] = {name: f"{end - length}:{end}" for (name, length), end in zip(lengths.items(), ends, strict=True)}
     write_info(info, root)
-
-
-def camera_column(view: str, name: str) -> str:
-    """The column of every frame with a matrix (row by row) or a map (PNG in base64) of a view.
-
-    Maps are text, and no name begins with ``observation``, because lerobot's policies take such columns and all images.
-    """
-    return f"{SCHEMA.views[view].lerobot_camera}.{name}"
-
-
-def geometry_columns(extras: Collection[Extra] = ()) -> dict[str, dict[str, Any]]:
-    """lerobot's description of the columns of cameras and extras."""
-    columns: dict[str, dict[str, Any]] = {}
-    text = {"dtype": "string", "shape": (1,), "names": None}
-    for view in SCHEMA.views:
-        columns |= {camera_column(view, name): _flat(getattr(SCHEMA, name)) for name in MATRICES}
-        columns |= {camera_column(view, name): dict(text) for name in MAPS if name in extras}
-    if "object_poses" in extras:
-        columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
-    return columns | ({INSTANCES: text} if named(extras) else {})
-
-
-def _flat(spec: MatrixSpec) -> dict[str, Any]:
-    rows, columns = spec.shape
-    names = [f"{row}_{column}" for row in range(rows) for column in range(columns)]
-    return {"dtype": spec.dtype, "shape": (rows * columns,), "names": names}
-
-
-def features(frames: Frames, extras: Collection[Extra] = ()) -> dict[str, dict[str, Any]]:
-    """lerobot's description of the columns."""
-    dtype = {"video": "video", "images": "image"}[frames]
-    frame = {"dtype": dtype, "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
-    columns = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
-    for vector in (SCHEMA.state, SCHEMA.joint_state, SCHEMA.action):
-        columns[vector.lerobot_key] = {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
-    return columns | {EPISODE_ID: {"dtype": "string", "shape": (1,), "names": None}} | geometry_columns(extras)
 
 
 def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:

@@ -18,7 +18,7 @@ from pipeline.types import Extra, Floats, Geometry, Trajectory
 
 
 def see(
-    renderer: Renderer, trajectory: Trajectory, stream: Stream, instances: Instances, extras: Collection[Extra]
+    renderer: Renderer, trajectory: Trajectory, stream: Stream, instances: Instances | None, extras: Collection[Extra]
 ) -> Geometry:
     """The geometry of a view through a trajectory; with extras, before each executed action.
 
@@ -26,7 +26,7 @@ def see(
         renderer: of the trajectory's scene.
         trajectory: what happens.
         stream: the view, and what changes its camera.
-        instances: numbers the scene's things.
+        instances: numbers the scene's things, for segmentation.
         extras: what to make beside the matrices.
     """
     view = SCHEMA.views[stream.view]
@@ -39,7 +39,7 @@ def see(
             surfaces = renderer.surfaces(view.camera)
             if "depth" in maps:
                 maps["depth"].append(encode_exactly(to_policy(_in_units(surfaces.depth_m))))
-            if "segmentation" in maps:
+            if "segmentation" in maps and instances:
                 maps["segmentation"].append(encode_exactly(to_policy(instances.ids(surfaces))))
     return Geometry(intrinsics, extrinsics, maps)
 

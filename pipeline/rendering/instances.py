@@ -40,16 +40,16 @@ class Instances:
         rows = SCHEMA.object_poses.shape[0]
         if len(self.names) > rows:
             raise PipelineError(f"a scene of {task.name} has {len(self.names)} things", expected=f"{rows} or fewer")
-        parts = [model.body(number).name for number in range(model.nbody)]
+        bodies = [model.body(number).name for number in range(model.nbody)]
         self._bodies = {ROBOT: model.body("robot0_base").id, GRIPPER: model.body("gripper0_right_gripper").id}
-        for body, name in enumerate(parts):
+        for body, name in enumerate(bodies):
             if name.endswith("table") and model.body_parentid[body] == 0:
                 self._bodies[TABLE] = body
         own = [*(f"{thing}_main" for thing in things), *(f"layout{number}" for number in range(len(added)))]
         self._bodies |= {len(COMMON) + place: model.body(name).id for place, name in enumerate(own)}
-        whole = {body: place for place, body in self._bodies.items() if place != GRIPPER}
-        of_body = np.array([whole.get(int(root), ROOM) for root in model.body_rootid], np.uint8)
-        of_body[[name.startswith("gripper0_") for name in parts]] = GRIPPER
+        place_of_tree = {body: place for place, body in self._bodies.items() if place != GRIPPER}
+        of_body = np.array([place_of_tree.get(int(root), ROOM) for root in model.body_rootid], np.uint8)
+        of_body[[name.startswith("gripper0_") for name in bodies]] = GRIPPER
         self._of_geom = of_body[model.geom_bodyid]
         for geom in np.flatnonzero(self._of_geom == ROOM).tolist():
             name = model.geom(geom).name

@@ -49,11 +49,12 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
     steps = len(trajectory.actions)
     renderer = Renderer(trajectory.model_xml)
     try:
-        instances = Instances(renderer.model, trajectory, task)
+        instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
         for step in range(steps):
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             proprioceptions.append(proprioception(renderer.data))
-            poses.append(instances.poses(renderer.data))
+            if instances:
+                poses.append(instances.poses(renderer.data))
         hand_m = np.array([state[:3] for state, _ in proprioceptions], float)
         original: Sight | None = None
         for perturbations, members in variants.items():
@@ -93,7 +94,7 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
         rejected=refused,
         geometry=geometry,
         object_poses=np.stack(poses) if "object_poses" in config.extras else None,
-        instances=instances.names if named(config.extras) else (),
+        instances=instances.names if instances else (),
     )
 
 
