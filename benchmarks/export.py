@@ -26,7 +26,7 @@ from pipeline.formats.base import Episodes, Format
 from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
-from pipeline.types import Episode
+from pipeline.types import Episode, Geometry
 
 PER_PART = 150
 """Episodes in a part of the large configurations."""
@@ -54,6 +54,7 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
         action=rng.uniform(-1, 1, (steps, *SCHEMA.action.shape)).astype(np.float32),
         instruction="put the black bowl on the plate",
         provenance={column: episode_id if column == "episode_id" else column for column in SCHEMA.provenance},
+        geometry=dict.fromkeys(SCHEMA.views, Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))),
     )
 
 

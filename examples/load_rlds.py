@@ -27,14 +27,18 @@ def main(run: Path) -> None:
 
 def show(episode: Mapping[str, Any]) -> None:
     """Print what an episode holds; its fields are those of ``features.json``."""
-    metadata = {name: value.decode() for name, value in episode["episode_metadata"].items()}
+    metadata = episode["episode_metadata"]
+    episode_id, axis, level = (metadata[name].decode() for name in ("episode_id", "axis", "level"))
     steps = list(episode["steps"])
     actions = np.stack([step["action"] for step in steps])
-    print(f"  first episode: {metadata['episode_id']}, {metadata['axis']} of level {metadata['level']}")
+    print(f"  first episode: {episode_id}, {axis} of level {level}")
     print(f"  instruction: {steps[0]['language_instruction'].decode()}")
     print(f"  actions: {actions.shape}")
     for name, value in steps[0]["observation"].items():
         print(f"  {name}: {value.shape} {value.dtype}")
+    for view in ("image", "wrist_image"):
+        intrinsics = metadata[f"{view}_intrinsics"]  # of the turned frame; examples/back_project.py uses it
+        print(f"  {view}: focal length {intrinsics[1, 1]:.1f} px, mirrored: {intrinsics[0, 0] < 0}")
 
 
 if __name__ == "__main__":

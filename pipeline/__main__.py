@@ -111,7 +111,9 @@ def _push(arguments: argparse.Namespace) -> int:
     # What it needs takes seconds to import, which the other commands can do without.
     from pipeline.publish import push
 
-    (target,) = (one for one in formats_of(config.data, config.export) if one.name == arguments.format)
+    (target,) = (
+        one for one in formats_of(config.data, config.export, config.render.extras) if one.name == arguments.format
+    )
     upload = push.prepare(target)
     print(upload.summary())
     if not arguments.really:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import yaml
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from pipeline.axes import AnyAxis, Axes, axes_of
 from pipeline.axes.base import Frozen
@@ -14,6 +14,7 @@ from pipeline.errors import PipelineError
 from pipeline.export_config import Count, ExportConfig
 from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import select_tasks
+from pipeline.types import Extra
 
 
 class DemosConfig(Frozen):
@@ -111,11 +112,21 @@ class ReplayConfig(Frozen):
     fixture_seed: int = Field(default=0, ge=0, lt=2**32)
 
 
+def _each_once(extras: tuple[Extra, ...]) -> tuple[Extra, ...]:
+    return tuple(sorted(set(extras)))
+
+
 class RenderConfig(Frozen):
-    """How episodes are rendered; the size is that of ``schemas/episode.json``."""
+    """How episodes are rendered; the size is that of ``schemas/episode.json``.
+
+    Attributes:
+        extras: what is made beside the frames, and put into all datasets: ``depth`` and ``segmentation`` of both views,
+            and ``object_poses``.
+    """
 
     encoding: Literal["jpeg"] = "jpeg"
     jpeg_quality: int = Field(default=95, ge=50, le=100)
+    extras: Annotated[tuple[Extra, ...], AfterValidator(_each_once)] = ()
 
 
 class ComputeConfig(Frozen):

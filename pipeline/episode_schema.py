@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from typing import Self
+from collections.abc import Collection
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 
 from pipeline.errors import PipelineError
 from pipeline.files import schema_file
-from pipeline.types import Episode
+from pipeline.types import Episode, Extra
 
 SCHEMA_FILE = schema_file("episode.json")
 
@@ -24,10 +25,18 @@ class _Model(BaseModel):
 
 
 class ViewSpec(_Model):
-    """One camera: its name in MuJoCo and its key in LeRobot; its key here is its name in RLDS."""
+    """One camera: its name in MuJoCo and its key in LeRobot; its key here is its name in RLDS.
+
+    Attributes:
+        lerobot_camera: what LeRobot's columns about the camera begin with; without ``image``, which lerobot takes for
+            the name of an image.
+        seen_from: the frame that the view's extrinsics lead to.
+    """
 
     camera: str
     lerobot_key: str
+    lerobot_camera: str
+    seen_from: Literal["world", "end_effector"]
 
 
 class FrameSpec(_Model):
@@ -37,6 +46,34 @@ class FrameSpec(_Model):
     dtype: str
     names: tuple[str, str, str]
     encoding: str
+
+
+class MatrixSpec(_Model):
+    """A matrix of a view's camera, the same at every step."""
+
+    shape: tuple[int, int]
+    dtype: str
+    meaning: str
+
+
+class MapSpec(_Model):
+    """A picture of numbers for each step of a view, of the frame's size."""
+
+    dtype: str
+    encoding: str
+    meaning: str
+
+
+class DepthSpec(MapSpec):
+    """``unit_m`` is what a number of 1 means."""
+
+    unit_m: float
+
+
+class PosesSpec(MatrixSpec):
+    """A row for each of ``instances``, at every step; units stand in the names of its columns."""
+
+    names: tuple[str, ...]
 
 
 class VectorSpec(_Model):
@@ -86,6 +123,11 @@ class EpisodeSchema(_Model):
     min_steps: int
     views: dict[str, ViewSpec]
     frame: FrameSpec
+    intrinsics: MatrixSpec
+    extrinsics: MatrixSpec
+    depth: DepthSpec
+    segmentation: MapSpec
+    object_poses: PosesSpec
     state: StateSpec
     joint_state: VectorSpec
     action: ActionSpec
@@ -95,8 +137,24 @@ class EpisodeSchema(_Model):
 SCHEMA = EpisodeSchema.model_validate_json(SCHEMA_FILE.read_text())
 
 
-def check(episode: Episode) -> None:
+MATRICES = ("intrinsics", "extrinsics")
+"""What each view of an episode has once."""
+
+MAPS: tuple[Extra, ...] = ("depth", "segmentation")
+"""What each view of an episode has at each step on request."""
+
+
+def named(extras: Collection[Extra]) -> bool:
+    """Whether episodes with these extras have a table of names."""
+    return bool({"segmentation", "object_poses"} & set(extras))
+
+
+def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     """Refuse an episode that training would misread or choke on.
+
+    Args:
+        episode: to be written.
+        extras: what it must have beside the frames.
 
     Raises:
         PipelineError: naming the episode and the field.
@@ -106,14 +164,15 @@ def check(episode: Episode) -> None:
         raise _fault(
             episode, "action", f"has {steps} steps", f"at least {SCHEMA.min_steps}, the chunk policies predict"
         )
-    _check_vector(episode, "state", episode.state, SCHEMA.state, steps)
-    _check_vector(episode, "joint_state", episode.joint_state, SCHEMA.joint_state, steps)
-    _check_vector(episode, "action", episode.action, SCHEMA.action, steps)
+    _check_array(episode, "state", episode.state, SCHEMA.state, steps)
+    _check_array(episode, "joint_state", episode.joint_state, SCHEMA.joint_state, steps)
+    _check_array(episode, "action", episode.action, SCHEMA.action, steps)
     low, high = SCHEMA.action.range
     if episode.action.min() < low or episode.action.max() > high:
         found = f"spans [{episode.action.min():g}, {episode.action.max():g}]"
         raise _fault(episode, "action", found, f"[{low:g}, {high:g}], as the controller clips it")
     _check_frames(episode, steps)
+    _check_geometry(episode, steps, extras)
     if not episode.instruction.strip() or "_" in episode.instruction:
         # OpenVLA-OFT's loader spins for ever on an empty text; an underscore betrays a file name.
         raise _fault(episode, "instruction", f"is {episode.instruction!r}", "words, without underscores")
@@ -125,14 +184,6 @@ def check(episode: Episode) -> None:
         raise _fault(episode, "provenance", f"holds something other than text in {wrong}", "text only")
     if episode.provenance["episode_id"] != episode.episode_id:
         raise _fault(episode, "provenance", f"names episode {episode.provenance['episode_id']!r}", "its own episode_id")
-
-
-def _check_vector(episode: Episode, field: str, values: NDArray[np.float32], spec: VectorSpec, steps: int) -> None:
-    expected = f"({steps}, {spec.shape[0]}) of {spec.dtype}"
-    if values.shape != (steps, *spec.shape) or values.dtype != np.dtype(spec.dtype):
-        raise _fault(episode, field, f"is {values.shape} of {values.dtype}", expected)
-    if not np.isfinite(values).all():
-        raise _fault(episode, field, "holds NaN or infinity", "finite numbers")
 
 
 def _check_frames(episode: Episode, steps: int) -> None:
@@ -153,6 +204,33 @@ def _check_frames(episode: Episode, steps: int) -> None:
                 raise _fault(episode, view, f"frame {index} is {found}", f"{expected}")
             if not data.endswith(JPEG_END):
                 raise _fault(episode, view, f"frame {index} is cut short", "a whole JPEG file")
+
+
+def _check_geometry(episode: Episode, steps: int, extras: Collection[Extra]) -> None:
+    if set(episode.geometry) != set(SCHEMA.views):
+        raise _fault(episode, "geometry", f"has the views {sorted(episode.geometry)}", f"{sorted(SCHEMA.views)}")
+    for view, geometry in episode.geometry.items():
+        for name in MATRICES:
+            _check_array(episode, f"{view}_{name}", getattr(geometry, name), getattr(SCHEMA, name))
+        lengths = {name: len(files) for name, files in geometry.maps.items()}
+        if lengths != {name: steps for name in MAPS if name in extras}:
+            raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each that is asked for")
+    if ("object_poses" in extras) != (episode.object_poses is not None):
+        raise _fault(episode, "object_poses", "are there or are not", "what render.extras asks for")
+    if episode.object_poses is not None:
+        _check_array(episode, "object_poses", episode.object_poses, SCHEMA.object_poses, steps)
+    if named(extras) != bool(episode.instances):
+        raise _fault(episode, "instances", f"has {len(episode.instances)} names", "some with segmentation or poses")
+
+
+def _check_array(
+    episode: Episode, field: str, values: NDArray[np.float32], spec: VectorSpec | MatrixSpec, *steps: int
+) -> None:
+    if values.shape != (*steps, *spec.shape) or values.dtype != np.dtype(spec.dtype):
+        expected = f"{(*steps, *spec.shape)} of {spec.dtype}"
+        raise _fault(episode, field, f"is {values.shape} of {values.dtype}", expected)
+    if not np.isfinite(values).all():
+        raise _fault(episode, field, "holds NaN or infinity", "finite numbers")
 
 
 def _fault(episode: Episode, field: str, what: str, expected: str) -> PipelineError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 """(H, W, 3) RGB."""
+Extra = Literal["depth", "segmentation", "object_poses"]
+"""What the render stage makes beside the frames when it is asked to."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,21 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
+class Geometry:
+    """Where a view is seen from, and what it sees beside colours; conventions are those of ``schemas/episode.json``.
+
+    Attributes:
+        intrinsics: (3, 3) float32, camera to pixels of the stored frame.
+        extrinsics: (4, 4) float32, camera to the frame that the view is seen from: the world, or the end effector.
+        maps: ``depth`` and ``segmentation``, where they were asked for, to T PNG files, turned like the frames.
+    """
+
+    intrinsics: NDArray[np.float32]
+    extrinsics: NDArray[np.float32]
+    maps: Mapping[Extra, Sequence[bytes]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Episode:
     """What a policy sees, ready for the writers; names, units and signs are those of ``schemas/episode.json``.
 
@@ -132,6 +149,9 @@ class Episode:
         action: (T, 7) float32.
         instruction: the text the policy is prompted with.
         provenance: flat, JSON-serialisable, the columns named in ``schemas/episode.json``.
+        geometry: view name to where it is seen from.
+        object_poses: (T, 24, 7) float32, None where they were not asked for.
+        instances: names of the things that segmentation and poses number; none without those.
     """
 
     episode_id: str
@@ -141,6 +161,9 @@ class Episode:
     action: NDArray[np.float32]
     instruction: str
     provenance: Mapping[str, str]
+    geometry: Mapping[str, Geometry]
+    object_poses: NDArray[np.float32] | None = None
+    instances: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(self.action)

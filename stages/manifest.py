@@ -15,7 +15,7 @@ def run(config: Config) -> None:
     episodes = outcome.read(config)
     table = manifest.build(
         episodes,
-        places=registry.places(registry.formats_of(data, config.export)),
+        places=registry.places(registry.formats_of(data, config.export, config.render.extras)),
         columns=registry.columns(),
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))

@@ -25,7 +25,7 @@ from pipeline.formats.export import export
 from pipeline.formats.rlds import Rlds
 from pipeline.run import motion_statistics
 from pipeline.run.compute import loop
-from pipeline.types import Episode
+from pipeline.types import Episode, Geometry
 from pipeline.validation import oft, oft_check
 
 NAME = "libero_tiny"
@@ -54,6 +54,7 @@ def episode(name: str) -> Episode:
         action=action,
         instruction=f"Put the bowl {name} on the plate",
         provenance=dict.fromkeys(SCHEMA.provenance, "") | {"episode_id": name},
+        geometry={view: Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32)) for view in SCHEMA.views},
     )
 
 
@@ -168,7 +169,7 @@ FAULTS: dict[str, Callable[[Episode], Episode]] = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_check_catches_a_bad_episode(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rlds_write, "check", lambda _: None)
+    monkeypatch.setattr(rlds_write, "check", lambda *_: None)
     found = oft_check.check_run(write(tmp_path, partial(spoilt, FAULTS[fault])))[NAME]
     assert found["violations"][0].startswith(fault)
     assert (found["episodes"], found["passed_by"]) == (3, 1)

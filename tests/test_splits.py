@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tensorflow_datasets as tfds
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from test_writers import IDS, NAME, SET, episode, loop, write_lerobot
+from test_writers import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, RldsConfig
@@ -66,7 +68,7 @@ def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, tmp_path: Path) ->
 
 
 def test_lerobots_tools_keep_the_episodes_ids(tmp_path: Path) -> None:
-    root = write_lerobot(tmp_path).root
+    root = write_lerobot(tmp_path, with_extras, extras=EXTRAS).root
     dataset = LeRobotDataset(NAME, root=root)
     assert episode_ids(dataset) == IDS
     fewer = delete_episodes(dataset, [0, 3], output_dir=tmp_path / "fewer", repo_id="fewer")
@@ -76,3 +78,7 @@ def test_lerobots_tools_keep_the_episodes_ids(tmp_path: Path) -> None:
     merged = merge_datasets([halves["two"], halves["one"]], output_repo_id="merged", output_dir=tmp_path / "merged")
     assert episode_ids(merged) == IDS[3:] + IDS[:3]
     shutil.rmtree(tmp_path / "halves")
+    seen = with_extras(IDS[3]).geometry["image"]
+    for step in (0, 7):
+        assert np.array_equal(merged[step]["camera.agent.extrinsics"].reshape(4, 4), seen.extrinsics)
+        assert base64.b64decode(merged[step]["camera.agent.depth"]) == seen.maps["depth"][step]

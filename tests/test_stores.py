@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ from pipeline.physics.replay import replay_plan
 from pipeline.rendering.render import render_plan
 from pipeline.run import outcome, plan
 from pipeline.run.compute import loop
-from pipeline.run.frame_store import FrameStore, Rendered
+from pipeline.run.frame_store import FrameStore
 from pipeline.run.store import TABLE
+from pipeline.run.streams import streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
@@ -177,12 +179,9 @@ def test_a_rejection_that_is_no_longer_planned_is_forgotten(
 ) -> None:
     store, trajectory_id = FrameStore(tmp_path, config.render), rows[0].trajectory_id
     render_plan(rows[:1], config, replayed, tmp_path, loop)
-    twin = store.load(trajectory_id, store.rows()[trajectory_id]["streams"])
-    store.save(
-        trajectory_id,
-        Rendered(twin.replay_mode, twin.state, twin.joint_state, twin.action, twin.streams, {"earlier": "too_dark"}),
-        gl.choose().device,
-    )
+    geometry = [stream.geometry.stream_id for stream in streams_of(rows[0].perturbations).values()]
+    twin = store.load(trajectory_id, store.rows()[trajectory_id]["streams"], geometry)
+    store.save(trajectory_id, replace(twin, rejected={"earlier": "too_dark"}), gl.choose().device)
     render_plan(rows[:1], config, replayed, tmp_path, loop)
     row = store.rows()[trajectory_id]
     assert json.loads(row["rejected"]) == {}

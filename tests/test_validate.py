@@ -73,6 +73,10 @@ def take_credit(tree: Tree) -> None:
     tree["episode_metadata"]["demo_origin"] = "expanded"
 
 
+def mirror_camera(tree: Tree) -> None:
+    tree["episode_metadata"]["image_intrinsics"] = np.abs(tree["episode_metadata"]["image_intrinsics"])
+
+
 IN_RLDS: dict[tuple[str, Task], Callable[[Tree], None]] = {
     ("camera", STOVE): swap_cameras,
     ("camera", MILK): flip_gripper,
@@ -82,12 +86,14 @@ IN_RLDS: dict[tuple[str, Task], Callable[[Tree], None]] = {
     ("noise", MILK): truncate,
     ("language", BOWL): end_early,
     ("clean", MILK): take_credit,
+    ("language", MILK): mirror_camera,
 }
 """Axis and task to what is done to the episode's example."""
 
 
+SEEN_FROM = "camera.agent.extrinsics"
 BLACK, CHANGED, LATE = ("noise", STOVE), ("clean", STOVE), ("camera", BOWL)
-"""In LeRobot black from one camera, with another action, and timed late."""
+"""In LeRobot black from one camera that has another place, with another action, and timed late."""
 
 EXPECTED = {
     ("jpeg", "rlds", ("camera", STOVE)),
@@ -101,6 +107,8 @@ EXPECTED = {
     ("flags", "rlds", ("noise", MILK)),
     ("flags", "rlds", ("language", BOWL)),
     ("provenance", "rlds", ("clean", MILK)),
+    ("geometry", "rlds", ("language", MILK)),
+    ("geometry", "lerobot", BLACK),
     ("video", "lerobot", BLACK),
     ("alive", "lerobot", BLACK),
     ("motion", "lerobot", CHANGED),
@@ -148,9 +156,10 @@ def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
 def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
     (table_file,) = (root / "data").rglob("*.parquet")
     table = pq.read_table(table_file)
-    found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp")}
+    found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp", SEEN_FROM)}
     of = np.array(table["episode_index"])
     found["action"][np.flatnonzero(of == index[CHANGED])[3], 0] += 0.001
+    found[SEEN_FROM][of == index[BLACK], 3] += 1.0
     # All but the last: there may be no frame behind that.
     found["timestamp"][np.flatnonzero(of == index[LATE])[:-1]] += np.float32(1 / SCHEMA.fps_hz)
     for name, values in found.items():
@@ -231,11 +240,11 @@ def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory])
     state = np.zeros((len(action), 8), np.float32)
     state[:, 6:] = trajectory.states[:-1, 8:10]
     joints = np.zeros((len(action), 7), np.float32)
-    made = Episode("milk", {}, state, joints, action, "", {})
+    made = Episode("milk", {}, state, joints, action, "", {}, {})
 
     def found(sign: float) -> list[Fault]:
         commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
-        copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {}, {})
+        copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {}, {}, {})
         return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], None)))
 
     assert found(1.0) == []

@@ -26,6 +26,7 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import dataset_to_policy_features
 from numpy.typing import NDArray
 
 from pipeline import seeding
@@ -37,13 +38,18 @@ from pipeline.formats.base import Episodes, split
 from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
-from pipeline.types import Episode
+from pipeline.formats.tfrecord import columns
+from pipeline.types import Episode, Extra, Geometry
+from pipeline.validation import oft
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
 NAME = "synthetic"
 SET = f"{NAME}_spatial"
 REPO = NAME
 MIN_PSNR_DB = 36.0
+
+MATRICES = {"intrinsics": (3, 3), "extrinsics": (4, 4)}
+EXTRAS: tuple[Extra, ...] = ("depth", "segmentation", "object_poses")
 
 Tree = dict[str, bytes]
 
@@ -61,6 +67,9 @@ def episode(episode_id: str) -> Episode:
         cv2.circle(canvas, (40 + 8 * t, 120 + 3 * t), 24, (gray, 120, 90), -1, cv2.LINE_AA)
         return cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
+    def matrix(size: int) -> NDArray[np.float32]:
+        return rng.normal(size=(size, size)).astype(np.float32)
+
     action = rng.uniform(-1, 1, (steps, 7)).astype(np.float32)
     action[:, 6] = np.where(np.arange(steps) < 6, -1, 1)
     return Episode(
@@ -74,6 +83,29 @@ def episode(episode_id: str) -> Episode:
         action=action,
         instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
         provenance={column: f"{column} of {episode_id}" for column in SCHEMA.provenance} | {"episode_id": episode_id},
+        geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
+    )
+
+
+@cache
+def with_extras(episode_id: str) -> Episode:
+    """The same episode with depth, segmentation and poses."""
+    source, rng = episode(episode_id), seeding.rng("test_writers", "extras", episode_id)
+    steps = len(source)
+
+    def maps() -> dict[Extra, list[bytes]]:
+        ramp = np.add.outer(np.arange(256), np.arange(256)) + rng.integers(65000, size=(steps, 1, 1))
+        small = (ramp // 64 % 24).astype(np.uint8)
+        return {
+            "depth": [cv2.imencode(".png", each.astype(np.uint16))[1].tobytes() for each in ramp],
+            "segmentation": [cv2.imencode(".png", each)[1].tobytes() for each in small],
+        }
+
+    return replace(
+        source,
+        geometry={view: replace(seen, maps=maps()) for view, seen in source.geometry.items()},
+        object_poses=rng.normal(size=(steps, 24, 7)).astype(np.float32),
+        instances=("nothing", "robot", episode_id),
     )
 
 
@@ -107,16 +139,23 @@ def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -
     return Episodes(IDS, load, dict.fromkeys(IDS, "libero_spatial"), dict.fromkeys(IDS, content))
 
 
-def write_rlds(out: Path, load: Callable[[str], Episode] = episode, run: Any = loop) -> Rlds:
-    target = Rlds(out, RldsConfig(name=NAME, shards=3))
+def write_rlds(
+    out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, extras: Sequence[Extra] = ()
+) -> Rlds:
+    target = Rlds(out, RldsConfig(name=NAME, shards=3), extras)
     export(target, episodes(load), run)
     return target
 
 
 def write_lerobot(
-    out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, frames: Any = "video", name: str = NAME
+    out: Path,
+    load: Callable[[str], Episode] = episode,
+    run: Any = loop,
+    frames: Any = "video",
+    name: str = NAME,
+    extras: Sequence[Extra] = (),
 ) -> LeRobot:
-    target = LeRobot(out, LeRobotConfig(name=name, parts=3, frames=frames))
+    target = LeRobot(out, LeRobotConfig(name=name, parts=3, frames=frames), extras)
     export(target, episodes(load), run)
     return target
 
@@ -195,8 +234,12 @@ def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
             # TensorFlow decodes JPEG with the fast DCT: one grey level off in the mean, measured 5 at most.
             off = np.abs(found[view].astype(int) - pixels(source.frames[view][0]))
             assert (off.mean() < 1.5, off.max() <= 8) == (True, True)
-        metadata = {name.removeprefix("metadata/"): str(text) for name, text in found.items() if "/" in name}
-        assert metadata == {"file_path": source.provenance["demo_source"], **source.provenance}
+        metadata = {name.removeprefix("metadata/"): value for name, value in found.items() if "/" in name}
+        for view, seen in source.geometry.items():
+            np.testing.assert_array_equal(metadata.pop(f"{view}_intrinsics"), seen.intrinsics)
+            np.testing.assert_array_equal(metadata.pop(f"{view}_extrinsics"), seen.extrinsics)
+        texts = {name: str(text) for name, text in metadata.items()}
+        assert texts == {"file_path": source.provenance["demo_source"], **source.provenance}
 
 
 def test_rlds_features_are_openvlas(written: Written) -> None:
@@ -226,7 +269,9 @@ def test_rlds_features_are_openvlas(written: Written) -> None:
         "joint_state": ((7,), np.float32),
     }
     assert observation["image"].encoding_format == "jpeg"
-    assert set(features["episode_metadata"]) == {"file_path", *SCHEMA.provenance}
+    matrices = {f"{view}_{name}": shape for view in SCHEMA.views for name, shape in MATRICES.items()}
+    assert set(features["episode_metadata"]) == {"file_path", *matrices, *SCHEMA.provenance}
+    assert {name: features["episode_metadata"][name].shape for name in matrices} == matrices
     assert (builder.info.name, str(builder.info.version)) == (SET, "1.0.0")
     assert builder.info.splits["train"].shard_lengths == [2, 2, 2]
 
@@ -283,6 +328,11 @@ def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
         for key in ("state", "joint_state", "action"):
             name = key if key == "action" else f"observation.{key}"
             np.testing.assert_array_equal(np.stack([item[name] for item in items]), getattr(source, key))
+        for key, view in (("agent", "image"), ("wrist", "wrist_image")):
+            for name, shape in MATRICES.items():
+                for item in items:
+                    matrix = item[f"camera.{key}.{name}"].numpy().reshape(shape)
+                    np.testing.assert_array_equal(matrix, getattr(source.geometry[view], name))
         for key, view in (("image", "image"), ("image2", "wrist_image")):
             decoded = [item[f"observation.images.{key}"].numpy().transpose(1, 2, 0) * 255 for item in items]
             for shown, frame in zip(decoded, source.frames[view], strict=True):
@@ -413,6 +463,44 @@ def test_bytes_do_not_depend_on_the_workers(written: Written, tmp_path: Path) ->
     assert not {"mujoco", "robosuite", "libero", "tensorflow"} & modules
 
 
+@pytest.mark.slow
+def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
+    """Both formats hand out the files and numbers that went in; what is not extra stays as it is without them."""
+    rlds = write_rlds(tmp_path, with_extras, extras=EXTRAS)
+    lerobot_set = write_lerobot(tmp_path, with_extras, extras=EXTRAS)
+    plain, tree = rlds_write.features(), rlds_write.features(EXTRAS)
+    rows = {episode_id: {**rlds.record().places[episode_id], "episode_id": episode_id} for episode_id in IDS}
+    for episode_id, row in rows.items():
+        source = with_extras(episode_id)
+        for copy in (rlds.read(row, tmp_path / "cache"), lerobot_set.read(row, tmp_path / "cache")):
+            assert copy is not None
+            assert copy.object_poses is not None
+            np.testing.assert_array_equal(copy.object_poses, source.object_poses)
+            assert tuple(copy.instances) == tuple(source.instances)
+            assert {view: seen.maps for view, seen in copy.geometry.items()} == {
+                view: seen.maps for view, seen in source.geometry.items()
+            }
+        shard, place = row["rlds_shard"], row["rlds_index"]
+        record = list(records(rlds.folder / SET / "1.0.0" / shard))[place]
+        before = columns(list(records(written.version / shard))[place], plain)
+        after = columns(record, tree)
+        assert before.keys() < after.keys()
+        assert [name for name in before if not np.array_equal(before[name], after[name])] == []
+        first = next(iter(tree.deserialize_example_np(record)["steps"]))["observation"]
+        for name, dtype in (("image_depth", np.uint16), ("wrist_image_segmentation", np.uint8)):
+            view, _, extra = name.rpartition("_")
+            file = source.geometry[view].maps["depth" if extra == "depth" else "segmentation"][0]
+            np.testing.assert_array_equal(first[name][..., 0], cv2.imdecode(np.frombuffer(file, np.uint8), -1))
+            assert first[name].dtype == dtype
+    assert [found.name for found in oft.read(rlds.folder / SET / "1.0.0")] == IDS
+    assert_lerobot_episodes(lerobot_set.root)
+    with_, without = (LeRobotDataset(REPO, root=made.root).meta.features for made in (lerobot_set, written.lerobot))
+    assert without.items() < with_.items()
+    assert dataset_to_policy_features(with_) == dataset_to_policy_features(without), "policies take what they took"
+    checks = [*rlds.check(rows, tmp_path), *lerobot_set.check({}, tmp_path)]
+    assert [fault for check, fault in checks if check == "format"] == []
+
+
 def truncated(source: Episode, steps: int) -> Episode:
     frames = {view: frames[:steps] for view, frames in source.frames.items()}
     arrays = {name: getattr(source, name)[:steps] for name in ("state", "joint_state", "action")}
@@ -431,6 +519,8 @@ BAD: dict[str, tuple[str, Callable[[Episode], Episode]]] = {
         "wrist_image",
         lambda e: replace(e, frames={**e.frames, "wrist_image": e.frames["wrist_image"][1:]}),
     ),
+    "lost camera": ("geometry", lambda e: replace(e, geometry={})),
+    "depth unasked": ("image maps", lambda e: replace(e, geometry=with_extras(e.episode_id).geometry)),
     "lost view": ("frames", lambda e: replace(e, frames={"image": e.frames["image"]})),
     "no image": ("image", lambda e: replace(e, frames={**e.frames, "image": [b"noise"] * len(e)})),
     "cut image": ("image", lambda e: replace(e, frames={**e.frames, "image": [f[:-99] for f in e.frames["image"]]})),

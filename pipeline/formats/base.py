@@ -22,7 +22,7 @@ from pydantic import BaseModel
 
 from pipeline.errors import PipelineError
 from pipeline.seeding import digest
-from pipeline.types import Episode, Frame
+from pipeline.types import Episode, Extra, Frame, Geometry
 
 Load = Callable[[str], Episode]
 """Episode id to episode; picklable, called in worker processes."""
@@ -121,6 +121,9 @@ class Copy:
         frames: (view, step) to the decoded frame, for ``sampled`` steps.
         marks: what else stands at each step, by the dataset's own names, each (T,).
         place: where it lies, by the format's columns of the manifest.
+        geometry: view to where it is seen from.
+        object_poses: (T, 24, 7), None where the dataset has none.
+        instances: names of the things that segmentation and poses number.
         encoded: view to the image file of every step; None where frames are stored otherwise.
     """
 
@@ -131,6 +134,9 @@ class Copy:
     frames: Mapping[tuple[str, int], Frame]
     marks: Mapping[str, NDArray[Any]]
     place: Mapping[str, Any]
+    geometry: Mapping[str, Geometry]
+    object_poses: NDArray[Any] | None = None
+    instances: Sequence[str] = ()
     encoded: Mapping[str, Sequence[bytes]] | None = None
 
     def __len__(self) -> int:
@@ -158,6 +164,7 @@ class Format(ABC, Generic[Options]):
     Args:
         data: the run's folder.
         options: the format's section of the configuration.
+        extras: what the episodes have beside the frames.
     """
 
     name: ClassVar[str]
@@ -176,9 +183,10 @@ class Format(ABC, Generic[Options]):
     clients: ClassVar[tuple[str, ...]]
     """The clients of ``finetune.yaml`` that train on this format."""
 
-    def __init__(self, data: Path, options: Options) -> None:
+    def __init__(self, data: Path, options: Options, extras: Sequence[Extra] = ()) -> None:
         self.data = data
         self.options = options
+        self.extras = tuple(extras)
 
     @property
     def folder(self) -> Path:

@@ -34,6 +34,7 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
         {package: version(package) for package in target.packages},
         SCHEMA.model_dump(mode="json"),
         target.options.model_dump(mode="json"),
+        target.extras,
         list(target.pieces(episodes).items()),
         [episodes.content[episode_id] for episode_id in episodes.ids],
     )[:16]

@@ -19,7 +19,7 @@ class LeRobot(Format[LeRobotConfig]):
 
     name: ClassVar = "lerobot"
     title: ClassVar = "LeRobot"
-    recipe: ClassVar = 2
+    recipe: ClassVar = 3
     packages: ClassVar = ("lerobot", "datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
@@ -45,7 +45,9 @@ class LeRobot(Format[LeRobotConfig]):
     def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
         from pipeline.formats import lerobot_write
 
-        lerobot_write.write_part(path, episode_ids, load, repo_id=self.options.name, frames=self.options.frames)
+        lerobot_write.write_part(
+            path, episode_ids, load, repo_id=self.options.name, frames=self.options.frames, extras=self.extras
+        )
 
     def assemble(self, work: Path, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, int]]:
         from pipeline.formats import lerobot_write
@@ -61,14 +63,14 @@ class LeRobot(Format[LeRobotConfig]):
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
-        from pipeline.formats import lerobot_read
+        from pipeline.formats import lerobot_columns, lerobot_read
 
-        return lerobot_read.check(self.root, cache, kept, self.options.frames)
+        return lerobot_read.check(self.root, cache, kept, lerobot_columns.features(self.options.frames, self.extras))
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_read
 
-        return lerobot_read.read(self.root, cache, row["episode_id"])
+        return lerobot_read.read(self.root, cache, row["episode_id"], self.extras)
 
     def repository_path(self, file: str) -> str:
         # lerobot looks at the root of the repository.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -17,10 +19,12 @@ import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Copy, Fault, Row, sampled
-from pipeline.formats.lerobot_write import Frames, features, local_only
+from pipeline.formats.lerobot_columns import INSTANCES, OBJECT_POSES, camera_column, geometry_columns
+from pipeline.formats.lerobot_write import local_only
+from pipeline.types import Extra, Geometry
 
 UNREADABLE = (
     AssertionError,
@@ -52,7 +56,7 @@ class LeRobotSet:
     provenance: Mapping[str, Mapping[str, Any]]
 
 
-def check(root: Path, cache: Path, kept: Mapping[str, Row], frames: Frames) -> Iterator[tuple[str, Fault]]:
+def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str, Any]) -> Iterator[tuple[str, Fault]]:
     """Frame rate, robot, the columns' names and shapes, the videos' own frame rate; as many episodes as were kept.
 
     Raises:
@@ -63,7 +67,7 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], frames: Frames) -> I
         meta = opened.data.meta
         read: dict[str, Any] = {"fps": meta.fps, "robot_type": meta.robot_type}
         wanted: dict[str, Any] = {"fps": SCHEMA.fps_hz, "robot_type": SCHEMA.robot_type}
-        for key, spec in features(frames).items():
+        for key, spec in columns.items():
             has = meta.features.get(key, {})
             read[key] = (has.get("dtype"), tuple(has.get("shape", ())), tuple(has.get("names") or ()))
             wanted[key] = (spec["dtype"], tuple(spec["shape"]), tuple(spec["names"] or ()))
@@ -83,15 +87,15 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], frames: Frames) -> I
         yield "ids", Fault("lerobot", episode_id, "is in the dataset", "kept episodes alone")
 
 
-def read(root: Path, cache: Path, episode_id: str) -> Copy | None:
-    """An episode; None when the dataset does not have it.
+def read(root: Path, cache: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
+    """An episode with these extras; None when the dataset does not have it.
 
     Raises:
         PipelineError: when it cannot be read.
     """
     with _readable(root):
         opened = _open(root, cache)
-        return _copy(opened, episode_id) if episode_id in opened.provenance else None
+        return _copy(opened, episode_id, extras) if episode_id in opened.provenance else None
 
 
 @contextmanager
@@ -119,7 +123,7 @@ def _opened(root: Path, cache: Path, modified_ns: int) -> LeRobotSet:
     return LeRobotSet(data, {row["episode_id"]: row for row in rows})
 
 
-def _copy(opened: LeRobotSet, episode_id: str) -> Copy:
+def _copy(opened: LeRobotSet, episode_id: str, extras: tuple[Extra, ...]) -> Copy:
     data = opened.data
     provenance = opened.provenance[episode_id]
     index = provenance["episode_index"]
@@ -128,6 +132,7 @@ def _copy(opened: LeRobotSet, episode_id: str) -> Copy:
     vectors = {"action": SCHEMA.action, "state": SCHEMA.state, "joint_state": SCHEMA.joint_state}
     # Without the images of every step, where they are not videos.
     plain = [*(spec.lerobot_key for spec in vectors.values()), "episode_index", "task_index", *MARKS]
+    plain += geometry_columns(extras)
     table = data.hf_dataset.select_columns(plain).with_format("numpy")[start:stop]
     if set(table["episode_index"].tolist()) != {index} or len(table["action"]) != rows["length"]:
         raise ValueError(f"rows {start} to {stop} are not the {rows['length']} steps of episode {index}")
@@ -146,4 +151,23 @@ def _copy(opened: LeRobotSet, episode_id: str) -> Copy:
         frames=frames,
         marks={name: table[name] for name in MARKS},
         place={"lerobot_episode_index": index},
+        geometry={view: _geometry(table, view, extras) for view in SCHEMA.views},
+        object_poses=table[OBJECT_POSES].reshape(-1, *SCHEMA.object_poses.shape) if OBJECT_POSES in table else None,
+        instances=json.loads(_constant(table, INSTANCES)) if named(extras) else (),
     )
+
+
+def _geometry(table: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
+    matrices = {
+        name: _constant(table, camera_column(view, name)).reshape(getattr(SCHEMA, name).shape) for name in MATRICES
+    }
+    texts = {name: table[camera_column(view, name)] for name in MAPS if name in extras}
+    return Geometry(**matrices, maps={name: list(map(base64.b64decode, files)) for name, files in texts.items()})
+
+
+def _constant(table: Mapping[str, Any], column: str) -> Any:
+    """What a column has at every step of an episode."""
+    first, *others = table[column]
+    if any(np.any(other != first) for other in others):
+        raise ValueError(f"{column} is not the same at every step")
+    return first

@@ -7,12 +7,13 @@ Two things of lerobot's are replaced: its video encoder (see ``lerobot_video``),
 
 from __future__ import annotations
 
+import base64
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import av
 import cv2
@@ -30,16 +31,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import write_info, write_stats
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import SCHEMA, check
+from pipeline.episode_schema import MATRICES, SCHEMA, check
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Load
 from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
+from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, Frames, camera_column, features
 from pipeline.formats.lerobot_video import VideoEncoder
 from pipeline.run.motion_statistics import describe
-from pipeline.types import Episode, Floats, Frame
-
-Frames = Literal["video", "images"]
-"""``video`` is H.264 made from the stored frames; ``images`` are the stored JPEG files, three times as large."""
+from pipeline.types import Episode, Extra, Floats, Frame
 
 PART_VIDEO_MB = 16
 """lerobot rewrites a video file for each episode that it appends: small files here, its own 200 MB after the merge."""
@@ -52,15 +51,13 @@ EPISODES_MB = 2
 more than 100 in memory."""
 
 
-EPISODE_ID = "episode_id"
-"""A column of every frame, because lerobot's tools to delete, split and merge number episodes anew and leave
-``meta/provenance.parquet`` behind: with it, an episode is still found in the manifest."""
-
 SUMMARY, DATASET = "summary.json", "dataset"
 """In a part's folder: what the merge needs beside the dataset, and the dataset."""
 
 
-def write_part(path: Path, episode_ids: Sequence[str], load: Load, *, repo_id: str, frames: Frames) -> None:
+def write_part(
+    path: Path, episode_ids: Sequence[str], load: Load, *, repo_id: str, frames: Frames, extras: tuple[Extra, ...] = ()
+) -> None:
     """Write a dataset of some of the episodes, and a summary; a process writes one at a time.
 
     The bytes, videos included, depend on the episodes, their order and the encoder's version alone.
@@ -71,6 +68,7 @@ def write_part(path: Path, episode_ids: Sequence[str], load: Load, *, repo_id: s
         load: reads one episode; one at a time is in memory.
         repo_id: the dataset's name, as on the hub; nothing is sent or fetched.
         frames: how frames are stored.
+        extras: what the episodes have beside them.
 
     Raises:
         PipelineError: when an episode breaks the schema.
@@ -81,7 +79,7 @@ def write_part(path: Path, episode_ids: Sequence[str], load: Load, *, repo_id: s
     dataset = LeRobotDataset.create(
         repo_id,
         SCHEMA.fps_hz,
-        features(frames),
+        features(frames, extras),
         root=path / DATASET,
         robot_type=SCHEMA.robot_type,
         use_videos=frames == "video",
@@ -96,7 +94,7 @@ def write_part(path: Path, episode_ids: Sequence[str], load: Load, *, repo_id: s
     try:
         for episode_id in episode_ids:
             episode = load(episode_id)
-            check(episode)
+            check(episode, extras)
             for view, counted in _add(dataset, episode).items():
                 counts[view] += counted
             provenance.append(dict(episode.provenance))
@@ -147,16 +145,6 @@ def name_splits(root: Path, lengths: Mapping[str, int]) -> None:
     write_info(info, root)
 
 
-def features(frames: Frames) -> dict[str, dict[str, Any]]:
-    """lerobot's description of the columns."""
-    dtype = {"video": "video", "images": "image"}[frames]
-    frame = {"dtype": dtype, "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
-    columns = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
-    for vector in (SCHEMA.state, SCHEMA.joint_state, SCHEMA.action):
-        columns[vector.lerobot_key] = {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
-    return columns | {EPISODE_ID: {"dtype": "string", "shape": (1,), "names": None}}
-
-
 def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
     """Save an episode, and return the levels of each view's frames."""
     steps = len(episode)
@@ -166,6 +154,14 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
     columns[EPISODE_ID] = [episode.episode_id] * steps
     for name in ("state", "joint_state", "action"):
         columns[getattr(SCHEMA, name).lerobot_key] = list(getattr(episode, name))
+    for view_name, seen in episode.geometry.items():
+        columns |= {camera_column(view_name, name): [getattr(seen, name).ravel()] * steps for name in MATRICES}
+        for name, files in seen.maps.items():
+            columns[camera_column(view_name, name)] = [base64.b64encode(file).decode() for file in files]
+    if episode.object_poses is not None:
+        columns[OBJECT_POSES] = [poses.ravel() for poses in episode.object_poses]
+    if episode.instances:
+        columns[INSTANCES] = [json.dumps(list(episode.instances))] * steps
     encoder = dataset._streaming_encoder
     if encoder is None:
         # ``datasets``, which lerobot hands the columns to, takes a whole image file for an image.
@@ -222,7 +218,8 @@ def _write_statistics(root: Path, counts: Mapping[str, Counts]) -> None:
     """Write ``meta/stats.json`` over lerobot's, from every row and every pixel."""
     exact = {view.lerobot_key: statistics(counts[name]) for name, view in SCHEMA.views.items()}
     data = pq.ParquetDataset(root / "data")
-    for column in [name for name in data.schema.names if name not in exact and name != EPISODE_ID]:
+    texts = {field.name for field in data.schema if field.type in (pa.string(), pa.large_string())}
+    for column in [name for name in data.schema.names if name not in {*exact, *texts}]:
         values = data.read(columns=[column])[column].combine_chunks()
         flat = values.flatten() if pa.types.is_nested(values.type) else values
         exact[column] = _column_statistics(flat.to_numpy().astype(np.float64).reshape(len(values), -1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from pipeline.export_config import ExportConfig
 from pipeline.formats.base import Format
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
+from pipeline.types import Extra
 
 FORMATS: tuple[type[Format[Any]], ...] = (
     Rlds,
@@ -18,9 +20,9 @@ FORMATS: tuple[type[Format[Any]], ...] = (
 )
 
 
-def formats_of(data: Path, options: ExportConfig) -> list[Format[Any]]:
-    """Every format's dataset of a run whose folder is ``data``."""
-    return [kind(data, getattr(options, kind.name)) for kind in FORMATS]
+def formats_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
+    """Every format's dataset of a run whose folder is ``data`` and whose episodes have these extras."""
+    return [kind(data, getattr(options, kind.name), extras) for kind in FORMATS]
 
 
 def columns() -> list[pa.Field]:

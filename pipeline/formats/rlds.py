@@ -19,7 +19,7 @@ class Rlds(Format[RldsConfig]):
 
     name: ClassVar = "rlds"
     title: ClassVar = "RLDS"
-    recipe: ClassVar = 1
+    recipe: ClassVar = 2
     packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
     columns: ClassVar = (
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
@@ -40,7 +40,7 @@ class Rlds(Format[RldsConfig]):
     def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
         from pipeline.formats import rlds_write
 
-        rlds_write.write_shard(path, episode_ids, load)
+        rlds_write.write_shard(path, episode_ids, load, self.extras)
 
     def assemble(self, work: Path, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
         from pipeline.formats import rlds_write
@@ -48,7 +48,7 @@ class Rlds(Format[RldsConfig]):
         shards = {work / piece: ids for piece, ids in pieces.items()}
         for folder in dict.fromkeys(path.parent for path in shards):
             lengths = {path: len(ids) for path, ids in shards.items() if path.parent == folder}
-            rlds_write.write_metadata(folder, lengths)
+            rlds_write.write_metadata(folder, lengths, self.extras)
         return {
             episode_id: {"rlds_shard": path.name, "rlds_index": index}
             for path, ids in shards.items()
@@ -58,12 +58,12 @@ class Rlds(Format[RldsConfig]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import rlds_read
 
-        return rlds_read.check(self.folder, kept)
+        return rlds_read.check(self.folder, kept, self.extras)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import rlds_read
 
-        return rlds_read.read(self.folder, row)
+        return rlds_read.read(self.folder, row, self.extras)
 
     def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
         builders = "".join(

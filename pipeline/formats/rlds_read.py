@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -9,13 +10,14 @@ from typing import Any
 
 import tensorflow_datasets as tfds
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Copy, Fault, Row, sampled
 from pipeline.formats.rlds_layout import VERSION, dataset_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans
 from pipeline.rendering.jpeg import decode
+from pipeline.types import Extra, Geometry
 
 MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")
 """Columns that tell steps apart."""
@@ -24,14 +26,14 @@ Place = tuple[Path, int]
 """Shard, and place in it."""
 
 
-def check(root: Path, kept: Mapping[str, Row]) -> Iterator[tuple[str, Fault]]:
+def check(root: Path, kept: Mapping[str, Row], extras: tuple[Extra, ...]) -> Iterator[tuple[str, Fault]]:
     """The feature tree of this version, all shards there and whole, and as many episodes as were kept."""
     stored = 0
     present = {file.parent.parent.name for file in root.glob("*/*/dataset_info.json")}
     for name in sorted(present | {dataset_of(row) for row in kept.values()}):
         folder = root / name / VERSION
         info = _info(folder)
-        if info.features.to_json() != features().to_json():
+        if info.features.to_json() != features(extras).to_json():
             yield "format", Fault("rlds", None, f"features.json of {name} is another", "the one of this version")
         lengths = {
             shard: length
@@ -55,7 +57,7 @@ def check(root: Path, kept: Mapping[str, Row]) -> Iterator[tuple[str, Fault]]:
         yield "ids", Fault("rlds", None, f"has {stored} episodes, foreign ones or some twice", f"{len(kept)}")
 
 
-def read(root: Path, row: Row) -> Copy | None:
+def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
     """A kept episode, from the place that the manifest says or, where that is wrong, from wherever it lies.
 
     Raises:
@@ -70,7 +72,7 @@ def read(root: Path, row: Row) -> Copy | None:
         place = _places(shards).get(episode_id)
         steps = _columns(place)
     try:
-        return None if place is None or steps is None else _copy(steps, place)
+        return None if place is None or steps is None else _copy(steps, place, extras)
     except KeyError as error:
         raise PipelineError(f"has no feature {error}", where=f"episode {episode_id}") from error
 
@@ -111,7 +113,13 @@ def _opened(folder: Path, modified_ns: int) -> Any:
     return tfds.builder_from_directory(folder).info
 
 
-def _copy(steps: Mapping[str, Any], place: Place) -> Copy:
+def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
+    matrices = {name: steps[f"{METADATA}{view}_{name}"] for name in MATRICES}
+    maps = {name: steps[f"observation/{view}_{name}"].tolist() for name in MAPS if name in extras}
+    return Geometry(**matrices, maps=maps)
+
+
+def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> Copy:
     shard, index = place
     return Copy(
         dataset="rlds",
@@ -125,5 +133,8 @@ def _copy(steps: Mapping[str, Any], place: Place) -> Copy:
         },
         marks={name: steps[name] for name in MARKS},
         place={"rlds_shard": shard.name, "rlds_index": index},
+        geometry={view: _geometry(steps, view, extras) for view in SCHEMA.views},
+        object_poses=steps["observation/object_poses"] if "object_poses" in extras else None,
+        instances=json.loads(steps[f"{METADATA}instances"][0]) if named(extras) else (),
         encoded={view: steps[f"observation/{view}"].tolist() for view in SCHEMA.views},
     )

@@ -1,11 +1,13 @@
 """Shards and metadata of RLDS sets, written without TensorFlow.
 
 Feature names, shapes and dtypes are those of the ``libero_*_no_noops`` sets that OpenVLA published (hub:
-``openvla/modified_libero_rlds``), plus provenance in ``episode_metadata``, which their loaders ignore.
+``openvla/modified_libero_rlds``), plus provenance and the cameras' matrices in ``episode_metadata``, and extras in
+``observation``; their loaders ignore both.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -13,16 +15,17 @@ from typing import Any
 
 import numpy as np
 import tensorflow_datasets as tfds
+from numpy.typing import NDArray
 
-from pipeline.episode_schema import SCHEMA, VectorSpec, check
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MapSpec, MatrixSpec, VectorSpec, check, named
 from pipeline.formats.base import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
 from pipeline.formats.tfrecord import OVERHEAD_BYTES, framed
-from pipeline.types import Episode
+from pipeline.types import Episode, Extra
 
 
-def write_shard(path: Path, episode_ids: Sequence[str], load: Load) -> None:
-    """Write a TFRecord file of episodes.
+def write_shard(path: Path, episode_ids: Sequence[str], load: Load, extras: tuple[Extra, ...] = ()) -> None:
+    """Write a TFRecord file of episodes that have these extras.
 
     Raises:
         PipelineError: when an episode breaks the schema.
@@ -30,16 +33,17 @@ def write_shard(path: Path, episode_ids: Sequence[str], load: Load) -> None:
     with path.open("wb") as file:
         for episode_id in episode_ids:
             episode = load(episode_id)
-            check(episode)
-            file.write(framed(_serialize(episode)))
+            check(episode, extras)
+            file.write(framed(_serialize(episode, extras)))
 
 
-def write_metadata(folder: Path, lengths: Mapping[Path, int]) -> None:
+def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extra, ...] = ()) -> None:
     """Write what TFDS reads beside the shards.
 
     Args:
         folder: ``<name>/1.0.0``.
         lengths: each shard of it, in order, to its number of episodes.
+        extras: what the episodes have beside the frames.
     """
     infos = []
     for split_name in sorted({split_of(shard) for shard in lengths}):
@@ -55,7 +59,7 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int]) -> None:
         )
     tfds.folder_dataset.write_metadata(
         data_dir=folder,
-        features=features(),
+        features=features(extras),
         split_infos=infos,
         version=VERSION,
         filename_template=template,
@@ -65,7 +69,7 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int]) -> None:
 
 
 @cache
-def features() -> Any:
+def features(extras: tuple[Extra, ...] = ()) -> Any:
     """The feature tree (``tfds.features.FeaturesDict``)."""
     frame = partial(
         tfds.features.Image,
@@ -76,6 +80,10 @@ def features() -> Any:
     rotated = f"rotated by {SCHEMA.image_rotation_deg} degrees"
     observation = {view: frame(doc=f"{spec.camera}, {rotated}") for view, spec in SCHEMA.views.items()}
     observation |= {"state": _vector(SCHEMA.state), "joint_state": _vector(SCHEMA.joint_state)}
+    for name in (name for name in MAPS if name in extras):
+        observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
+    if "object_poses" in extras:
+        observation["object_poses"] = _matrix(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
     step = {
         "observation": observation,
@@ -89,6 +97,9 @@ def features() -> Any:
     }
     metadata = {"file_path": tfds.features.Text(doc="the demonstration's source")}
     metadata |= {column: tfds.features.Text() for column in SCHEMA.provenance}
+    metadata |= {f"{view}_{name}": _matrix(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
+    if named(extras):
+        metadata["instances"] = tfds.features.Text(doc="JSON list of names; segmentation and poses have places in it")
     return tfds.features.FeaturesDict({"steps": tfds.features.Dataset(step), "episode_metadata": metadata})
 
 
@@ -96,26 +107,37 @@ def _vector(spec: VectorSpec) -> Any:
     return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=", ".join(spec.names))
 
 
-def _serialize(episode: Episode) -> bytes:
+def _matrix(spec: MatrixSpec) -> Any:
+    return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=spec.meaning)
+
+
+def _map(spec: MapSpec) -> Any:
+    height, width, _ = SCHEMA.frame.shape
+    return tfds.features.Image(
+        shape=(height, width, 1), dtype=np.dtype(spec.dtype), encoding_format=spec.encoding, doc=spec.meaning
+    )
+
+
+def _serialize(episode: Episode, extras: tuple[Extra, ...]) -> bytes:
     """``tf.train.Example`` of an episode; left to itself, protobuf orders its map anew in every process."""
-    example = _serializer().get_tf_example(features().encode_example(_tree(episode)))
+    example = _serializer(extras).get_tf_example(features(extras).encode_example(_tree(episode)))
     return bytes(example.SerializeToString(deterministic=True))
 
 
 @cache
-def _serializer() -> Any:
-    return tfds.core.ExampleSerializer(features().get_serialized_info())
+def _serializer(extras: tuple[Extra, ...] = ()) -> Any:
+    return tfds.core.ExampleSerializer(features(extras).get_serialized_info())
 
 
 def _tree(episode: Episode) -> dict[str, Any]:
     last = len(episode) - 1
+    columns: dict[str, Sequence[Any] | NDArray[Any]] = {**episode.frames}
+    columns |= {"state": episode.state, "joint_state": episode.joint_state}
+    columns |= {} if episode.object_poses is None else {"object_poses": episode.object_poses}
+    columns |= {f"{view}_{name}": files for view, seen in episode.geometry.items() for name, files in seen.maps.items()}
     steps = [
         {
-            "observation": {
-                **{view: frames[t] for view, frames in episode.frames.items()},
-                "state": episode.state[t],
-                "joint_state": episode.joint_state[t],
-            },
+            "observation": {name: values[t] for name, values in columns.items()},
             "action": episode.action[t],
             "discount": 1.0,
             "reward": float(t == last),
@@ -126,7 +148,7 @@ def _tree(episode: Episode) -> dict[str, Any]:
         }
         for t in range(len(episode))
     ]
-    return {
-        "steps": steps,
-        "episode_metadata": {"file_path": episode.provenance["demo_source"], **episode.provenance},
-    }
+    metadata: dict[str, Any] = {"file_path": episode.provenance["demo_source"], **episode.provenance}
+    metadata |= {f"{view}_{name}": getattr(seen, name) for view, seen in episode.geometry.items() for name in MATRICES}
+    metadata |= {"instances": json.dumps(list(episode.instances))} if episode.instances else {}
+    return {"steps": steps, "episode_metadata": metadata}

@@ -53,6 +53,12 @@ class Bddl:
         return tuple(name for name in dict.fromkeys(put) if name in self.objects)
 
     @property
+    def things(self) -> tuple[str, ...]:
+        """The fixtures and objects, without the table or the floor that they stand on."""
+        kinds = {**self.fixtures, **self.objects}
+        return tuple(name for name, kind in kinds.items() if not kind.endswith(("table", "floor")))
+
+    @property
     def receptacles(self) -> tuple[str, ...]:
         """The movable objects that the goal puts others on or in, none twice; basket_1 for basket_1_contain_region."""
         places = [fact[2] for fact in self.goal if fact[0] in ("on", "in")]

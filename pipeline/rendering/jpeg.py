@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.types import Frame
 
 if TYPE_CHECKING:
     from pipeline.config import RenderConfig
 
+Pixels = TypeVar("Pixels", bound=np.generic)
 
-def to_policy(frame: Frame) -> Frame:
+
+def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
     """Turn a raw LIBERO frame by 180 degrees, as OpenVLA trains and evaluates on it.
 
     This is the only place where frames are turned. LIBERO's raw frames have their first row at the bottom.
@@ -26,6 +29,14 @@ def encode(frame: Frame, config: RenderConfig) -> bytes:
     done, packed = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
     if not done:
         raise RuntimeError("OpenCV could not encode a frame as JPEG")
+    return packed.tobytes()
+
+
+def encode_exactly(pixels: NDArray[Any]) -> bytes:
+    """PNG file of (H, W) uint8 or uint16."""
+    done, packed = cv2.imencode(".png", pixels)
+    if not done:
+        raise RuntimeError("OpenCV could not encode a picture as PNG")
     return packed.tobytes()
 
 

@@ -14,9 +14,11 @@ from pipeline import gl
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
 from pipeline.axes.light import exposure
 from pipeline.config import Config, RenderConfig
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
+from pipeline.rendering.geometry import see
+from pipeline.rendering.instances import Instances
 from pipeline.rendering.jpeg import encode, to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import CAMERA, Sight
@@ -35,7 +37,8 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
 
     Streams that differ in pixel noise alone share the clean frames they are made from. A perturbed scene whose first
     frame is black or blown out is not rendered any further, nor one whose agent view does not show what it should (see
-    ``Sight``): a moved camera the task, any camera the objects that were added.
+    ``Sight``): a moved camera the task, any camera the objects that were added. Streams that differ in colours alone
+    share their geometry.
     """
     variants: dict[str, list[Stream]] = {}
     for stream in streams:
@@ -43,12 +46,16 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     refused: dict[str, str] = {}
     proprioceptions: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
+    poses: list[NDArray[np.float32]] = []
     steps = len(trajectory.actions)
     renderer = Renderer(trajectory.model_xml)
     try:
+        instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
         for step in range(steps):
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             proprioceptions.append(proprioception(renderer.data))
+            if instances:
+                poses.append(instances.poses(renderer.data))
         hand_m = np.array([state[:3] for state, _ in proprioceptions], float)
         renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
         original = Sight.of(renderer, task, hand_m)
@@ -72,11 +79,23 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
                         for noise in of_layer(stream.perturbations, PixelPerturbation):
                             frame = noise.apply(frame, step)
                         encoded[stream.stream_id].append(encode(to_policy(frame), config))
+        shared = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in refused)
+        geometry = {view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in shared}
     finally:
         renderer.close()
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
     shown = {stream_id: frames for stream_id, frames in encoded.items() if stream_id not in refused}
-    return Rendered(trajectory.mode, state, joint_state, trajectory.actions.astype(np.float32), shown, refused)
+    return Rendered(
+        replay_mode=trajectory.mode,
+        state=state,
+        joint_state=joint_state,
+        action=trajectory.actions.astype(np.float32),
+        streams=shown,
+        rejected=refused,
+        geometry=geometry,
+        object_poses=np.stack(poses) if "object_poses" in config.extras else None,
+        instances=instances.names if instances else (),
+    )
 
 
 @dataclass(frozen=True)
@@ -123,16 +142,18 @@ class RenderJob:
                 rendered,
                 streams={**rendered.streams, **earlier.streams},
                 rejected={**rendered.rejected, **earlier.rejected},
+                geometry={**rendered.geometry, **earlier.geometry},
             )
         store.save(self.trajectory_id, rendered, device)
 
     def _earlier(self, store: FrameStore, device: str) -> Rendered | None:
         """What is stored of the wanted streams, from the same device."""
-        wanted = {stream.stream_id for stream in self.streams}
+        wanted = {stream.stream_id: stream.geometry.stream_id for stream in self.streams}
         row = store.row(self.trajectory_id)
         if row is None or row["device"] != device:
             return None
-        stored = store.load(self.trajectory_id, sorted(wanted & set(row["streams"])))
+        streams = sorted(wanted.keys() & set(row["streams"]))
+        stored = store.load(self.trajectory_id, streams, {wanted[stream_id] for stream_id in streams})
         return replace(stored, rejected={name: why for name, why in stored.rejected.items() if name in wanted})
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -13,6 +14,19 @@ from pipeline import gl
 from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.types import Frame
+
+
+class Surfaces(NamedTuple):
+    """What each pixel shows, in the orientation of LIBERO's raw observations.
+
+    Attributes:
+        depth_m: (H, W) float32, along the axis that the camera looks along.
+        number, kind: (H, W) the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 for none.
+    """
+
+    depth_m: NDArray[np.float32]
+    number: NDArray[np.int32]
+    kind: NDArray[np.int32]
 
 
 class Renderer:
@@ -51,13 +65,24 @@ class Renderer:
 
     def geoms(self, camera: str) -> NDArray[np.int32]:
         """(H, W) the geom that each pixel of :meth:`frame` shows, by its number in the model; -1 for none."""
+        _, number, kind = self.surfaces(camera)
+        return np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, number, -1)
+
+    def surfaces(self, camera: str) -> Surfaces:
+        """What each pixel of :meth:`frame` shows of the restored state."""
         self._renderer.enable_segmentation_rendering()
         try:
             self._renderer.update_scene(self.data, camera, self._option)
             number, kind = np.moveaxis(self._renderer.render()[::-1], -1, 0)
         finally:
             self._renderer.disable_segmentation_rendering()
-        return np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, number, -1)
+        # The depth buffer still has what was drawn last: one drawing serves both.
+        buffer = np.empty(number.shape, np.float32)
+        mujoco.mjr_readPixels(None, buffer, self._renderer._rect, self._renderer._mjr_context)
+        near, far = np.array([self.model.vis.map.znear, self.model.vis.map.zfar]) * self.model.stat.extent
+        # MuJoCo's buffer is 1 at the near plane and 0 at the far one, as mujoco.Renderer inverts it.
+        depth_m = near * far / (near + buffer.astype(float) * (far - near))
+        return Surfaces(depth_m.astype(np.float32), number, kind)
 
     @contextmanager
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:

@@ -80,6 +80,4 @@ def _things(task: Task) -> set[str]:
     A region, such as a drawer of a cabinet or the burner of a stove, stands for the thing that it belongs to.
     """
     known = bddl.read(task.bddl_file)
-    kinds = {**known.objects, **known.fixtures}
-    things = [name for name, kind in kinds.items() if not kind.endswith(("table", "floor"))]
-    return {thing for name in known.of_interest for thing in things if f"{name}_".startswith(f"{thing}_")}
+    return {thing for name in known.of_interest for thing in known.things if f"{name}_".startswith(f"{thing}_")}

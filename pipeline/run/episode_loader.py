@@ -33,7 +33,9 @@ class EpisodeLoader:
     def __call__(self, episode_id: str) -> Episode:
         row = _rows_by_id(edition(self.plan_file))[episode_id]
         shown = streams_of(row.perturbations)
-        rendered = FrameStore(self.frames, self.config).load(row.trajectory_id, [s.stream_id for s in shown.values()])
+        geometry = {view: stream.geometry.stream_id for view, stream in shown.items()}
+        store = FrameStore(self.frames, self.config)
+        rendered = store.load(row.trajectory_id, [s.stream_id for s in shown.values()], set(geometry.values()))
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
         known |= {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
         return Episode(
@@ -44,6 +46,9 @@ class EpisodeLoader:
             action=rendered.action,
             instruction=row.instruction,
             provenance={name: str(known[name]) for name in SCHEMA.provenance},
+            geometry={view: rendered.geometry[name] for view, name in geometry.items()},
+            object_poses=rendered.object_poses,
+            instances=rendered.instances,
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.config import RenderConfig
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.identity import fingerprint
 from pipeline.run.store import Store
+from pipeline.types import Geometry
+
+_SHOWN = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
+"""The schema's parts that say what files of a store hold."""
 
 _COLUMNS = {
     "device": pa.string(),
@@ -37,6 +41,9 @@ class Rendered:
         state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
         streams: stream id to K encoded frames.
         rejected: stream id to the reason why it was not rendered.
+        geometry: id of a stream's geometry to what it is.
+        object_poses: (K, 24, 7), None where they were not asked for.
+        instances: names of the things that segmentation and poses number; none without those.
     """
 
     replay_mode: str
@@ -45,6 +52,9 @@ class Rendered:
     action: NDArray[np.float32]
     streams: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
     rejected: Mapping[str, str] = field(default_factory=dict)
+    geometry: Mapping[str, Geometry] = field(default_factory=dict)
+    object_poses: NDArray[np.float32] | None = None
+    instances: Sequence[str] = ()
 
 
 class FrameStore(Store):
@@ -59,8 +69,7 @@ class FrameStore(Store):
     """
 
     def __init__(self, root: Path, config: RenderConfig):
-        cameras = {view: spec.camera for view, spec in SCHEMA.views.items()}
-        shown = [SCHEMA.frame.model_dump(), cameras, SCHEMA.image_rotation_deg]
+        shown = [SCHEMA.model_dump(include=_SHOWN), SCHEMA.image_rotation_deg]
         made_by = fingerprint("encoding", config.model_dump(), shown)
         super().__init__(root, made_by, "render", _COLUMNS, _describe)
 
@@ -79,18 +88,32 @@ class FrameStore(Store):
                 file[name] = getattr(rendered, name)
             streams = file.create_group("streams")
             for stream_id, frames in sorted(rendered.streams.items()):
-                streams[f"{stream_id}/bytes"] = np.frombuffer(b"".join(frames), np.uint8)
-                streams[f"{stream_id}/ends"] = np.cumsum([len(frame) for frame in frames])
+                _pack(streams.create_group(stream_id), frames)
+            views = file.create_group("geometry")
+            for geometry_id, geometry in sorted(rendered.geometry.items()):
+                view = views.create_group(geometry_id)
+                for name in MATRICES:
+                    view[name] = getattr(geometry, name)
+                for name, files in geometry.maps.items():
+                    _pack(view.create_group(name), files)
+            if rendered.object_poses is not None:
+                file["object_poses"] = rendered.object_poses
+            file.attrs["instances"] = list(rendered.instances)
             file.attrs["rejected"] = json.dumps(dict(rendered.rejected), sort_keys=True)
 
-    def load(self, trajectory_id: str, streams: Sequence[str]) -> Rendered:
+    def load(self, trajectory_id: str, streams: Sequence[str], geometry: Collection[str] = ()) -> Rendered:
         """Read the named streams of a trajectory.
 
+        Args:
+            trajectory_id: which trajectory.
+            streams: ids of streams.
+            geometry: ids of the geometry to read with them.
+
         Raises:
-            PipelineError: when the file or one of the streams is not there.
+            PipelineError: when the file, one of the streams or its geometry is not there.
         """
         with self.opened(trajectory_id) as file:
-            missing = set(streams) - set(file["streams"])
+            missing = {*streams, *geometry} - {*file["streams"], *file["geometry"]}
             if missing:
                 raise PipelineError(
                     f"streams {sorted(missing)} were not rendered",
@@ -104,6 +127,9 @@ class FrameStore(Store):
                 action=file["action"][()],
                 streams={name: _frames(file[f"streams/{name}"]) for name in streams},
                 rejected=json.loads(file.attrs["rejected"]),
+                geometry={name: _geometry(file[f"geometry/{name}"]) for name in geometry},
+                object_poses=file["object_poses"][()] if "object_poses" in file else None,
+                instances=file.attrs["instances"].tolist(),
             )
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -117,6 +143,16 @@ def stream_ids(row: Mapping[str, Any]) -> set[str]:
     return {*row["streams"], *json.loads(row["rejected"])}
 
 
+def _pack(group: h5py.Group, files: Sequence[bytes]) -> None:
+    group["bytes"] = np.frombuffer(b"".join(files), np.uint8)
+    group["ends"] = np.cumsum([len(one) for one in files])
+
+
+def _geometry(view: h5py.Group) -> Geometry:
+    matrices = {name: view[name][()] for name in MATRICES}
+    return Geometry(**matrices, maps={name: _frames(view[name]) for name in MAPS if name in view})
+
+
 def _frames(stream: h5py.Group) -> list[bytes]:
     packed = stream["bytes"][()].tobytes()
     ends = stream["ends"][()].tolist()
@@ -125,7 +161,7 @@ def _frames(stream: h5py.Group) -> list[bytes]:
 
 def _describe(file: h5py.File) -> dict[str, Any]:
     # Every part is looked up, so that a file that lacks one is made again.
-    lengths = {name: len(file[name]) for name in ("state", "joint_state", "action")}
+    lengths = {name: len(file[name]) for name in ("state", "joint_state", "action", "geometry")}
     return {
         "device": str(file.attrs["device"]),
         "replay_mode": str(file.attrs["replay_mode"]),

@@ -25,6 +25,12 @@ class Stream:
     def stream_id(self) -> str:
         return digest("stream", self.view, to_json(self.perturbations))[:16]
 
+    @property
+    def geometry(self) -> Stream:
+        """The view under what changes its camera alone: streams that have it in common see the same surfaces."""
+        changes = (p for p in self.perturbations if isinstance(p, RenderPerturbation))
+        return Stream(self.view, tuple(p for p in changes if any(name.startswith("cam_") for name in p.fields)))
+
 
 def streams_of(perturbations_json: str) -> dict[str, Stream]:
     """View name to the stream that shows it, for an episode with these perturbations."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import MATRICES, SCHEMA
 from pipeline.formats.base import Copy, Fault, sampled
 from pipeline.libero.tasks import find_task
 from pipeline.rendering.jpeg import decode
@@ -147,6 +147,26 @@ def jpeg(case: Case) -> Iterator[Fault]:
                 yield case.finding(copy.dataset, what, "the stored JPEG")
 
 
+def geometry(case: Case) -> Iterator[Fault]:
+    """The matrices of the stored cameras, bit for bit, and of the extras the very files and numbers."""
+    for copy in case.whole:
+        for view, made in case.made.geometry.items():
+            for name in MATRICES:
+                found, expected = getattr(copy.geometry[view], name), getattr(made, name)
+                if found.dtype != expected.dtype or not np.array_equal(found, expected):
+                    yield case.finding(copy.dataset, f"{view}_{name} is {found.tolist()}", expected.tolist())
+            for name, files in made.maps.items():
+                if list(copy.geometry[view].maps[name]) != list(files):
+                    yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
+        found, expected = (
+            None if poses is None else poses.tobytes() for poses in (copy.object_poses, case.made.object_poses)
+        )
+        if found != expected:
+            yield case.finding(copy.dataset, "object_poses differ", "the stored ones")
+        if list(copy.instances) != list(case.made.instances):
+            yield case.finding(copy.dataset, f"instances {list(copy.instances)}", list(case.made.instances))
+
+
 def video(case: Case) -> Iterator[Fault]:
     """Frames within ``VIDEO_PSNR_DB`` of the stored ones, where a dataset has others than those image files."""
     for copy, view, step, shown in _shown(case):
@@ -243,6 +263,7 @@ CHECKS: Mapping[str, Check] = {
         provenance,
         place,
         jpeg,
+        geometry,
         video,
         cameras,
         alive,

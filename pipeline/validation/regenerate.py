@@ -141,7 +141,7 @@ def _rebuild(
     if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)
-    rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1))
+    rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)
     episode_id = row["episode_id"]
     export(rebuilt, Episodes([episode_id], load, {episode_id: row["suite"]}, {episode_id: "regenerated"}), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")
@@ -171,6 +171,8 @@ def _differences(stored: Mapping[str, NDArray[Any]], rebuilt: Mapping[str, NDArr
         elif off := [step for step in range(len(here)) if not np.array_equal(there[step], here[step])]:
             found[name] = (
                 f"{there[0].decode()!r} in the dataset, {here[0].decode()!r} rebuilt"
+                if isinstance(there[0], bytes) and name.startswith(METADATA)
+                else "other numbers"
                 if name.startswith(METADATA)
                 else f"{len(off)} of {len(here)} steps, the first at step {off[0]}"
             )

@@ -68,7 +68,7 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
     total.note("counts", run_checks.counts(data, rows), len(rows))
     with scratch(data / ".work" / "validate") as cache:
         opened = []
-        for one in formats_of(data, config.export):
+        for one in formats_of(data, config.export, config.render.extras):
             try:
                 faults = list(one.check(kept, cache))
             except PipelineError as error:

@@ -1,0 +1,233 @@
+"""Cameras, depth, segmentation and poses: what the datasets have of them leads from a pixel to the thing it shows."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import mujoco
+import numpy as np
+import pytest
+from conftest import BOWL, REPOSITORY, STOVE, tiny_config
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+sys.path.append(str(REPOSITORY / "examples"))
+
+from back_project import back_project
+
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.light import LightPerturbation
+from pipeline.config import Config, RenderConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.formats.base import Episodes
+from pipeline.formats.export import export
+from pipeline.formats.registry import formats_of
+from pipeline.libero import bddl
+from pipeline.physics.replay import replay_plan
+from pipeline.rendering.instances import COMMON
+from pipeline.rendering.render import render, render_plan
+from pipeline.rendering.renderer import Renderer
+from pipeline.run import plan
+from pipeline.run.compute import loop
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.frame_store import Rendered
+from pipeline.run.streams import Stream
+from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Extra, Task, Trajectory
+from pipeline.validation.checks import CHECKS, Case
+
+EXTRAS: tuple[Extra, ...] = ("depth", "object_poses", "segmentation")
+MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
+DIM = LightPerturbation(component="diffuse", level=1, diffuse_scale_rgb=(0.9, 0.9, 0.9))
+STREAMS = {
+    "image": Stream("image", ()),
+    "wrist_image": Stream("wrist_image", ()),
+    "moved": Stream("image", (MOVED,)),
+    "dim": Stream("image", (MOVED, DIM)),
+}
+LEAST_PX = 40
+"""Pixels of a thing from which on its place is looked at."""
+
+
+@pytest.fixture(scope="module")
+def middle(whole: dict[Task, Trajectory]) -> Trajectory:
+    """Two steps in the middle of a demonstration, where the wrist sees the bowl and the stove."""
+    source = whole[STOVE]
+    at = slice(10, 13)
+    return replace(source, states=source.states[at], site_alpha=source.site_alpha[at], actions=source.actions[10:12])
+
+
+@pytest.fixture(scope="module")
+def rendered(middle: Trajectory) -> Rendered:
+    return render(middle, STOVE, list(STREAMS.values()), RenderConfig(extras=EXTRAS))
+
+
+def pixels(file: bytes) -> NDArray[Any]:
+    return np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED))
+
+
+def outside_m(points_m: NDArray[Any], pose: NDArray[Any], model: mujoco.MjModel, body: int) -> NDArray[Any]:
+    """How far points (N, 3) in the world are outside of the boxes about the seen geoms of a body with a pose (7,)."""
+    local = (points_m - pose[:3]) @ Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
+    off = []
+    for geom in np.flatnonzero((model.geom_bodyid == body) & (model.geom_group == 1)):
+        turned = Rotation.from_quat(model.geom_quat[geom][[1, 2, 3, 0]]).as_matrix()
+        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        beyond = np.abs((local - model.geom_pos[geom]) @ turned - centre) - half
+        off.append(np.linalg.norm(beyond.clip(0), axis=1))
+    return np.asarray(np.min(off, axis=0))
+
+
+@pytest.mark.parametrize("name", ["image", "wrist_image", "moved"])
+def test_depth_leads_to_the_things_that_the_pixels_are_of(name: str, rendered: Rendered, middle: Trajectory) -> None:
+    """By the example that the documentation shows, from the stored files alone."""
+    stream, model = STREAMS[name], mujoco.MjModel.from_xml_string(middle.model_xml)
+    geometry = rendered.geometry[stream.geometry.stream_id]
+    depth, ids = (pixels(geometry.maps[extra][1]) for extra in ("depth", "segmentation"))
+    assert (str(depth.dtype), str(ids.dtype)) == ("uint16", "uint8")
+    view = stream.view
+    seen = {f"{view}_depth": depth[..., None], "state": rendered.state[1]}
+    matrices = {f"{view}_intrinsics": geometry.intrinsics, f"{view}_extrinsics": geometry.extrinsics}
+    points_m = back_project(view, seen, matrices)
+    assert rendered.object_poses is not None
+    looked_at = set()
+    for thing in bddl.read(STOVE.bddl_file).objects:
+        place = rendered.instances.index(thing)
+        shown, pose = ids == place, rendered.object_poses[1, place]
+        if shown.sum() < LEAST_PX:
+            continue
+        looked_at.add(thing)
+        off_m = outside_m(points_m[shown], pose, model, model.body(f"{thing}_main").id)
+        assert np.quantile(off_m, 0.99) < 0.003, thing
+        # A box about a plate would hold it mirrored too: it is where its body is.
+        if name != "wrist_image":
+            assert np.linalg.norm((points_m[shown].mean(axis=0) - pose[:3])[:2]) < 0.02, thing
+    assert {"akita_black_bowl_1", "cream_cheese_1", "plate_1"} <= looked_at
+
+
+def test_streams_that_differ_in_colours_share_their_geometry(rendered: Rendered) -> None:
+    ids = {name: stream.geometry.stream_id for name, stream in STREAMS.items()}
+    assert ids["dim"] == ids["moved"]
+    assert set(rendered.geometry) == set(ids.values())
+    assert ids["image"] == STREAMS["image"].stream_id
+
+
+def test_extras_change_no_frame_and_need_asking_for(rendered: Rendered, middle: Trajectory) -> None:
+    plain = render(middle, STOVE, list(STREAMS.values()), RenderConfig())
+    assert plain.streams == rendered.streams
+    assert (plain.object_poses, plain.instances) == (None, ())
+    for name, geometry in plain.geometry.items():
+        assert geometry.maps == {}
+        np.testing.assert_array_equal(geometry.extrinsics, rendered.geometry[name].extrinsics)
+
+
+def test_depth_is_mujocos_own(middle: Trajectory) -> None:
+    renderer = Renderer(middle.model_xml)
+    renderer.restore(middle.states[0], middle.site_alpha[0])
+    for view in SCHEMA.views.values():
+        mine = renderer.surfaces(view.camera).depth_m
+        theirs = renderer._renderer
+        theirs.enable_depth_rendering()
+        theirs.update_scene(renderer.data, view.camera, renderer._option)
+        assert np.abs(theirs.render()[::-1] - mine).max() < SCHEMA.depth.unit_m / 2
+        theirs.disable_depth_rendering()
+    renderer.close()
+
+
+@pytest.fixture(scope="module")
+def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data folder of a run with all extras: a clean episode, one with a moved camera, one with added objects."""
+    fields = tiny_config(short_demos)
+    fields["demos"] = {"source": "hdf5", "root": str(short_demos), "tasks": [f"{BOWL.suite}/{BOWL.name}"]}
+    fields["plan"] = {
+        "seed": 7,
+        "axes": {"camera": {}, "layout": {"levels": [2]}},
+        "episodes": {"camera": 1, "layout": 1},
+        "reserve": 3.0,
+    }
+    fields["render"] = {"extras": EXTRAS}
+    config, data = Config.model_validate(fields), tmp_path_factory.mktemp("run")
+    rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
+    plan.write(rows, data / "plan.parquet")
+    judged = replay_plan(rows, config.demos, config.replay, data / "trajectories", loop)
+    render_plan(rows, config, data / "trajectories", data / "frames", loop)
+    kept = [row.episode_id for row in rows if plan.select(rows, judged)[row.episode_id].kept]
+    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    for target in formats_of(data, config.export, config.render.extras):
+        export(target, Episodes(kept, load, dict.fromkeys(kept, BOWL.suite), dict.fromkeys(kept, "")), loop)
+    (data / "config.json").write_text(config.model_dump_json())
+    return data
+
+
+def cases(data: Path) -> list[Case]:
+    """Every episode, as the store and both datasets have it."""
+    config = Config.model_validate_json((data / "config.json").read_text())
+    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    rows = {row.episode_id: vars(row) for row in plan.read(data / "plan.parquet")}
+    formats = formats_of(data, config.export, config.render.extras)
+    places: dict[str, dict[str, Any]] = {}
+    for one in formats:
+        for episode_id, place in one.record().places.items():
+            places.setdefault(episode_id, dict(rows[episode_id])).update(place)
+    read = {episode_id: [one.read(row, data / "cache") for one in formats] for episode_id, row in places.items()}
+    return [
+        Case(
+            row=row,
+            made=load(episode_id),
+            trajectory=TrajectoryStore(data / "trajectories").load(row["trajectory_id"]),
+            copies=[copy for copy in read[episode_id] if copy is not None],
+            bank=None,
+        )
+        for episode_id, row in places.items()
+    ]
+
+
+def test_both_datasets_have_what_the_store_has(run: Path) -> None:
+    found = cases(run)
+    assert sorted(str(case.row["axis"]) for case in found) == ["camera", "clean", "layout"]
+    names = {str(case.row["axis"]): tuple(case.made.instances) for case in found}
+    assert names["clean"] == names["camera"] == (*COMMON, *bddl.read(BOWL.bddl_file).things)
+    assert names["layout"][: len(names["clean"])] == names["clean"], "an id means the same in all episodes of a task"
+    assert len(names["layout"]) == len(names["clean"]) + 2
+    for case in found:
+        assert [copy.dataset for copy in case.copies] == ["rlds", "lerobot"]
+        assert list(CHECKS["geometry"](case)) == []
+        last = pixels(case.made.geometry["image"].maps["segmentation"][-1])
+        shown = {case.made.instances[place] for place in np.unique(last).tolist()}
+        assert {"robot", "gripper", "table", "wall", "plate_1", "wooden_cabinet_1"} <= shown
+    moved, clean = (
+        next(case.made.geometry for case in found if case.row["axis"] == axis) for axis in ("camera", "clean")
+    )
+    assert not np.array_equal(moved["image"].extrinsics, clean["image"].extrinsics)
+    assert moved["wrist_image"].maps == clean["wrist_image"].maps
+
+
+def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:
+    case = cases(run)[0]
+    (copy, *_) = case.copies
+    seen = copy.geometry["image"]
+    assert copy.object_poses is not None
+    for spoilt, what in (
+        (replace(copy, geometry={**copy.geometry, "image": replace(seen, extrinsics=seen.extrinsics.T)}), "image_ext"),
+        (replace(copy, geometry={**copy.geometry, "image": copy.geometry["wrist_image"]}), "image_"),
+        (replace(copy, object_poses=copy.object_poses[::-1]), "object_poses"),
+        (replace(copy, instances=copy.instances[:-1]), "instances"),
+    ):
+        findings = list(CHECKS["geometry"](replace(case, copies=[spoilt])))
+        assert findings
+        assert {finding.what.startswith(what) for finding in findings} == {True}
+
+
+def test_the_example_runs_on_it(run: Path) -> None:
+    command = [sys.executable, str(REPOSITORY / "examples" / "back_project.py"), str(run)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    for view in ("image", "wrist_image"):
+        assert any(line.startswith(f"libero_tiny_goal {view}: akita_black_bowl_1 on ") for line in lines)
