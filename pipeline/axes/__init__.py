@@ -62,12 +62,12 @@ class Axes(Frozen):
     language: LanguageAxis | None = None
 
 
-# Of an axis that has several, the first.
-_FIRST = [
-    kind if isinstance(kind, type) else get_args(get_args(kind)[0])[0]
-    for kind in get_args(get_args(AnyPerturbation)[0])
-]
-_KINDS: dict[str, type[Perturbation]] = {kind.model_fields["axis"].default: kind for kind in _FIRST}
+# The union has a union of its own for an axis that has several kinds.
+_KINDS: dict[str, tuple[type[Perturbation], ...]] = {
+    kinds[0].model_fields["axis"].default: kinds
+    for member in get_args(get_args(AnyPerturbation)[0])
+    for kinds in [(member,) if isinstance(member, type) else get_args(get_args(member)[0])]
+}
 _PLACE = {axis: place for place, axis in enumerate(Axes.model_fields)}
 
 

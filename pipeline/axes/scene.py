@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -28,16 +29,21 @@ BASE_M = {"akita_black_bowl_1": (0.35, 0.05), "cream_cheese_1": (0.15, 0.10), "w
 ROBOT_X_M = {"tabletop": -0.66, "kitchen": -0.66, "study": -0.55, "living_room": -0.51, "floor": -0.6}
 """Where the robot's base stands, by arena, in the frame of the working surface."""
 
-REACH_M = 0.8
-"""How far from its base the hand can grasp what stands on a table; pointing down, it stops at 0.82 to 0.85 m."""
+REACH_M = 0.75
+"""How far from its base the hand can grasp and lift; pointing down, it stops at 0.77 m in the air, 0.82 m below."""
 
-APART = 0.75
-"""Share of the distance in LIBERO's file that two regions' centres keep at least, up to ``CLOSE_M``."""
+APART, CLOSE_M = 0.75, 0.15
+"""Share of the distance in LIBERO's file that the centres of two objects' regions keep at least, up to ``CLOSE_M``."""
 
-CLOSE_M = 0.15
+FIXTURE_APART, FIXTURE_CLOSE_M = 0.9, 0.25
+"""The same where one of the two is a fixture, which is larger."""
 
 DRAWS = 200
 """How often a scene is drawn to keep its relations, before it is left to be refused."""
+
+
+Shifts = dict[str, tuple[float, float]]
+"""Thing to its displacement (dx, dy) in m."""
 
 
 class Move(Frozen):
@@ -87,14 +93,17 @@ class ScenePerturbation(PhysicsPerturbation):
 
 
 @cache
-def _test_scenes(test: TestSet, task: Task) -> list[tuple[int, dict[str, tuple[float, float]]]]:
-    """Place of each test scene of ``task`` among the axis's test tasks, and how far it moves each thing, in m."""
-    scenes = []
-    for place, tested in zip(on_task(test, task, "pose"), test.on(task, "pose"), strict=True):
-        # Such as plate_1:0.01,-0.02;flat_stove_1:0,0.03.
-        listed = re.findall(r"([^;:]+):([^,]+),([^;]+)", str(tested.parameters.get("moves", "")))
-        scenes.append((int(place), {name: (float(dx_m), float(dy_m)) for name, dx_m, dy_m in listed}))
-    return scenes
+def _test_scenes(test: TestSet, task: Task) -> list[tuple[int, Shifts]]:
+    """Place of each test scene of ``task`` among the axis's test tasks, and how far it moves each thing."""
+    tested = zip(on_task(test, task, "pose").tolist(), test.on(task, "pose"), strict=True)
+    return [(place, displacements(scene.parameters)) for place, scene in tested]
+
+
+def displacements(parameters: Mapping[str, object]) -> Shifts:
+    """How far one of the axis's test tasks moves each object and fixture."""
+    # Such as plate_1:0.01,-0.02;flat_stove_1:0,0.03.
+    listed = re.findall(r"([^;:]+):([^,]+),([^;]+)", str(parameters.get("moves", "")))
+    return {name: (float(dx_m), float(dy_m)) for name, dx_m, dy_m in listed}
 
 
 def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePerturbation:
@@ -135,7 +144,9 @@ def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
     for index, one in enumerate(alone):
         for other in alone[:index]:
             apart_m = math.dist(known.regions[known.places[one]], known.regions[known.places[other]])
-            if math.dist(xy_m[one], xy_m[other]) < min(CLOSE_M, APART * apart_m):
+            objects = {one, other} <= known.objects.keys()
+            least_m = min(CLOSE_M, APART * apart_m) if objects else min(FIXTURE_CLOSE_M, FIXTURE_APART * apart_m)
+            if math.dist(xy_m[one], xy_m[other]) < least_m:
                 return False
     return all(_within_reach(task, thing, place_m) for thing, place_m in xy_m.items()) and all(
         relation_holds(task, target, xy_m.__getitem__) for target in known.targets
@@ -145,6 +156,9 @@ def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
 def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
     """Whether an object can be grasped there, if the task needs it."""
     known = bddl.read(task.bddl_file)
+    if thing not in known.objects or thing not in known.of_interest:
+        return True
     # Such as libero_kitchen_tabletop_manipulation; the plain tabletop is called libero_tabletop_manipulation.
-    robot_x_m = next(x_m for arena, x_m in ROBOT_X_M.items() if known.problem.startswith(f"libero_{arena}_"))
-    return thing not in known.objects or thing not in known.of_interest or math.dist(place_m, (robot_x_m, 0)) <= REACH_M
+    robot_m = next((x_m, 0.0) for arena, x_m in ROBOT_X_M.items() if known.problem.startswith(f"libero_{arena}_"))
+    was_m = known.regions[known.places[known.carriers[thing]]]
+    return math.dist(place_m, robot_m) <= max(REACH_M, math.dist(was_m, robot_m))
