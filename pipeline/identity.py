@@ -31,8 +31,9 @@ from pipeline.seeding import digest
 
 Layer = Literal["physics", "pixels", "encoding"]
 
-RECIPES: dict[Layer, int] = {"physics": 1, "pixels": 2, "encoding": 1}
-"""2 of ``pixels``: cameras that lose sight of the task are refused."""
+RECIPES: dict[Layer, int] = {"physics": 2, "pixels": 2, "encoding": 1}
+"""2 of ``physics``: tracking keeps to a place until what is put there is let go.
+2 of ``pixels``: cameras that lose sight of the task are refused."""
 
 PACKAGES: dict[Layer, tuple[str, ...]] = {
     "physics": (

@@ -34,6 +34,7 @@ class Reference:
         rotations: K+1 orientations of the grip site in the world's frame.
         actions: (K, 7).
         busy: (K+1,) whether the hand, or something in it, touches anything besides what is carried.
+        engaged: (K+1,) the same without the hand's own contacts with the working surface, which never moves.
         held: object to (K+1,) whether the robot touches it.
         carried: object to (K+1,).
         met: object, fixture or region to (K+1,).
@@ -45,6 +46,7 @@ class Reference:
     rotations: Rotation
     actions: Floats
     busy: Mask
+    engaged: Mask
     held: Mapping[str, Mask]
     carried: Mapping[str, Mask]
     met: Mapping[str, Mask]
@@ -79,7 +81,8 @@ class Reference:
             int(model.body(f"{name}_main").id): name for name in places if f"{name}_main" in _roots(model)
         }
         regions = [name for name in places if name not in things.values()]
-        positions, matrices, busy = np.empty((steps, 3)), np.empty((steps, 3, 3)), np.zeros(steps, bool)
+        positions, matrices = np.empty((steps, 3)), np.empty((steps, 3, 3))
+        busy, engaged = np.zeros(steps, bool), np.zeros(steps, bool)
         held, carried = ({name: np.zeros(steps, bool) for name, _ in free.values()} for _ in range(2))
         met = {name: np.zeros(steps, bool) for name in (*things.values(), *regions)}
         poses = {name: np.empty((steps, 7)) for name, _ in free.values()}
@@ -95,6 +98,7 @@ class Reference:
             for body in partners.get(robot, set()):
                 alone = body in free and partners[body] == {robot}
                 busy[step] |= not alone
+                engaged[step] |= not alone and body in things
                 if body in free:
                     (carried if alone else met)[things[body]][step] = True
                 elif body in things:
@@ -115,7 +119,7 @@ class Reference:
                     for region in regions:
                         if _within(model.site(region).size, places[region], poses[name][step]):
                             met[region][let_go[body]] = True
-        return cls(positions, Rotation.from_matrix(matrices), actions, busy, held, carried, met, poses, places)
+        return cls(positions, Rotation.from_matrix(matrices), actions, busy, engaged, held, carried, met, poses, places)
 
     def __len__(self) -> int:
         return len(self.actions)

@@ -194,7 +194,7 @@ def _followed(reference: Reference, name: str) -> Floats:
             ),
             default=first,
         )
-        later = np.flatnonzero(reference.busy[last + FLICKER + 1 :])
+        later = np.flatnonzero(reference.engaged[last + FLICKER + 1 :])
         until = last + FLICKER + 1 + int(later[0]) - MARGIN if len(later) else None
         weights = np.maximum(weights, _window(reference, first, last, until, since))
     return weights
@@ -211,10 +211,15 @@ def _moves(reference: Reference, name: str) -> bool:
 def _window(reference: Reference, first: int, last: int, until: int | None, since: int | None = None) -> Floats:
     """(K+1,) 1 from shortly before ``first`` to ``last``, 0 from ``until`` on.
 
-    It rises since ``since``, at the latest since the contact before ``first``.
+    It rises since ``since``, at the latest since the contact before ``first`` and since what the hand held then was
+    let go, unless it is what is in the hand at ``first``.
     """
     steps = np.arange(len(reference) + 1)
-    before = np.flatnonzero(reference.busy[: max(first - FLICKER, 0)])
+    engaged = reference.engaged.copy()
+    for held in reference.held.values():
+        if not held[max(first - FLICKER, 0) : first + 1].any():
+            engaged |= held
+    before = np.flatnonzero(engaged[: max(first - FLICKER, 0)])
     start = int(before[-1]) + 1 if len(before) else 0
     start = start if since is None else min(start, since)
     weights = _smooth((steps - start) / max(first - MARGIN - start, 1))
