@@ -35,11 +35,8 @@ DEEPER_M = 0.001
 CREEP_M, CREEP_DEG = 0.002, 2.0
 """How much farther than the recorded object a moved one may slide and tilt until it stops."""
 
-Component = Literal["target", "receptacle"]
-"""What the goal puts somewhere, and what it is put on or in, where that is an object that can be moved."""
-
-SCENE: Literal["scene"] = "scene"
-"""Every object and fixture."""
+Component = Literal["target", "receptacle", "scene"]
+"""What the goal puts somewhere, what it is put on or in, where that is an object that can be moved, or everything."""
 
 
 class PosePerturbation(PhysicsPerturbation):
@@ -52,7 +49,7 @@ class PosePerturbation(PhysicsPerturbation):
     """
 
     axis: Literal["pose"] = "pose"
-    component: Component
+    component: Literal["target", "receptacle"]
     moved: str
     dx_m: float
     dy_m: float
@@ -176,7 +173,7 @@ class PoseAxis(Axis):
         components: what to move.
     """
 
-    components: Annotated[tuple[Component | Literal["scene"], ...], Field(min_length=1)] = ("target",)
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("target",)
     step_m: PositiveFloat = 0.016
     step_deg: PositiveFloat = 4.0
 
@@ -184,9 +181,13 @@ class PoseAxis(Axis):
         """Whether there is something to move: some tasks only open, close or turn what stays where it is."""
         return bool(self._choices(task))
 
-    def _choices(self, task: Task) -> list[tuple[Component | Literal["scene"], str]]:
+    def _choices(self, task: Task) -> list[tuple[Component, str]]:
         known = bddl.read(task.bddl_file)
-        named = {"target": known.targets, "receptacle": known.receptacles, SCENE: (SCENE,)}
+        named: dict[Component, tuple[str, ...]] = {
+            "target": known.targets,
+            "receptacle": known.receptacles,
+            "scene": ("all",),
+        }
         return [(component, name) for component in self.components for name in named[component]]
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
@@ -205,7 +206,7 @@ class PoseAxis(Axis):
             )
         component, moved = choices[rng.integers(len(choices))]
         level = self.draw_level(rng)
-        if component == SCENE:
+        if component == "scene":
             return draw_scene(rng, level, task)
         reach_m = self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2))
         bearing_rad = rng.uniform(-math.pi, math.pi)
