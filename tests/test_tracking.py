@@ -109,7 +109,7 @@ def one_after_the_other() -> Reference:
     steps = np.arange(101)
 
     def during(*runs: tuple[int, int]) -> Mask:
-        return np.logical_or.reduce([(steps >= first) & (steps <= last) for first, last in runs])
+        return np.array([any(first <= step <= last for first, last in runs) for step in steps])
 
     def carried_over(first: int, last: int) -> Floats:
         poses = np.tile([0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0], (101, 1))
