@@ -1,6 +1,6 @@
 """How many replays reach their goal, open-loop and in ``auto``, by suite, axis and level; and how smooth they are.
 
-    nice -n 10 python benchmarks/replay_yield.py [--draws 1] [--axes robot pose layout] [--levels 1 3 5]
+    nice -n 10 python benchmarks/replay_yield.py [--draws 1] [--axes robot pose scene layout] [--levels 1 3 5]
 
 Draws come from the planner, over the starter demonstrations; ``--folder`` keeps the trajectories, so that a run that
 was stopped goes on where it was. The last line is the result as JSON.
@@ -32,7 +32,13 @@ from pipeline.run.compute import runner
 from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 
-AXES = ("robot", "pose", "layout")
+AXES: dict[str, tuple[str, dict[str, Any]]] = {
+    "robot": ("robot", {}),
+    "pose": ("pose", {}),
+    "scene": ("pose", {"components": ["scene"]}),
+    "layout": ("layout", {}),
+}
+"""What is measured to its axis and the options of that."""
 SATURATED = 0.93
 """The largest action that a demonstrator's input device gives is 0.9375."""
 
@@ -41,20 +47,26 @@ REPLAY = ReplayConfig(mode="auto")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--axes", nargs="+", choices=AXES, default=AXES)
+    parser.add_argument("--axes", nargs="+", choices=AXES, default=list(AXES))
     parser.add_argument("--levels", nargs="+", type=int, default=[1, 2, 3, 4, 5])
     parser.add_argument("--draws", type=int, default=1, help="of each demonstration at each level")
     parser.add_argument("--tasks", nargs="+", default=[f"{suite}/*" for suite in SUITES[:4]])
     parser.add_argument("--folder", type=Path)
+    parser.add_argument("--workers", type=int, help="one for each core when left out")
     arguments = parser.parse_args()
     demos = DemosConfig(tasks=tuple(arguments.tasks))
     entries, test = demos.index().entries, benchmark.load()
     rows: dict[str, plan.Row] = {}
-    for axis, level in product(arguments.axes, arguments.levels):
+    for measured, level in product(arguments.axes, arguments.levels):
+        axis, options = AXES[measured]
         episodes = {axis: len(entries) * arguments.draws}
-        drawn = PlanConfig.model_validate({"seed": 1, "axes": {axis: {"levels": [level]}}, "episodes": episodes})
+        axes = {axis: {"levels": [level], **options}}
+        drawn = PlanConfig.model_validate({"seed": 1, "axes": axes, "episodes": episodes})
         rows |= {row.episode_id: row for row in plan.make(entries, drawn, REPLAY, test)}
-    with tempfile.TemporaryDirectory() as temporary, runner(ComputeConfig(), Path("data")) as run:
+    with (
+        tempfile.TemporaryDirectory() as temporary,
+        runner(ComputeConfig(workers=arguments.workers), Path("data")) as run,
+    ):
         store = TrajectoryStore(arguments.folder or Path(temporary))
         replay_plan(list(rows.values()), demos, REPLAY, store.root, run)
         replayed = store.rows()
@@ -76,7 +88,8 @@ def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) 
         elif reason == "kept":
             # In `auto`, what is kept as tracked has failed open-loop before.
             reason = mode
-        reasons[row.axis, level][row.suite][reason] += 1
+        measured = row.component if row.component in AXES else row.axis
+        reasons[measured, level][row.suite][reason] += 1
     lines: list[dict[str, Any]] = []
     for (axis, level), by_suite in reasons.items():
         total = sum(by_suite.values(), Counter[str]())
@@ -84,10 +97,11 @@ def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) 
         line: dict[str, Any] = {"axis": axis, "level": level, "tried": tried}
         for mode, kept in (("open_loop", ("open_loop",)), ("auto", ("open_loop", "tracked"))):
             number = sum(total[reason] for reason in kept)
-            line[mode] = {"kept": number, "interval": _interval(number, tried)} | {
-                suite: f"{sum(of[reason] for reason in kept)}/{sum(n for r, n in of.items() if r[:7] != 'refused')}"
-                for suite, of in by_suite.items()
-            }
+            line[mode] = {"kept": number, "interval": _interval(number, tried)}
+            for suite, of in by_suite.items():
+                valid = sum(n for reason, n in of.items() if not reason.startswith("refused"))
+                own = sum(of[reason] for reason in kept)
+                line[mode] |= {suite: f"{own}/{valid}", f"{suite}_interval": _interval(own, valid)}
         line["dropped"] = {reason: n for reason, n in total.items() if reason not in ("open_loop", "tracked")}
         lines.append(line)
     return lines

@@ -31,9 +31,10 @@ from pipeline.seeding import digest
 
 Layer = Literal["physics", "pixels", "encoding"]
 
-RECIPES: dict[Layer, int] = {"physics": 1, "pixels": 3, "encoding": 1}
-"""2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their
-cameras."""
+RECIPES: dict[Layer, int] = {"physics": 2, "pixels": 3, "encoding": 1}
+"""2 of ``physics``: tracking keeps to a place until what is put there is let go; added objects show in the agent view.
+2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
+lamps are changed from where changes show, and added objects that do not show are refused."""
 
 PACKAGES: dict[Layer, tuple[str, ...]] = {
     "physics": (

@@ -10,6 +10,7 @@ import sys
 import zipfile
 from collections.abc import Callable, Iterable
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,11 +23,13 @@ from pipeline import seeding
 from pipeline.axes import AnyPerturbation, Axes, from_json, to_json
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.noise import NoiseAxis
+from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import HOME_RAD, benchmark_offsets_rad
+from pipeline.axes.scene import displacements
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.run import leakage, plan
-from pipeline.run.plan import Row
+from pipeline.run.plan import Row, draws_of
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Task
@@ -54,7 +57,7 @@ AS_DRAWN: dict[str, Callable[[TestTask], dict[str, Any]]] = {
 }
 """Axis to the fields of the perturbation that would repeat a test task. Light's values are in no file of the wheel."""
 
-AXES = [kind.model_fields["axis"].default for kind in get_args(get_args(AnyPerturbation)[0])]
+AXES = list(Axes.model_fields)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +109,36 @@ def test_every_test_task_is_found_when_it_is_drawn(axis: str, test: TestSet) -> 
     assert finding.test_tasks == len(test.of(axis))
     assert finding.verdict == "overlap"
     assert finding.smallest == pytest.approx(0, abs=1e-5)
+
+
+def test_every_test_scene_is_found_when_it_is_drawn(test: TestSet) -> None:
+    """With everything that it moves; and its other moves keep it apart from a scene that only the target's fits."""
+    rows = []
+    for number, tested in enumerate(test.of("pose")):
+        moves = [{"name": name, "dx_m": dx, "dy_m": dy} for name, (dx, dy) in displacements(tested.parameters).items()]
+        fields = {"axis": "pose", "component": "scene", "level": 1, "moves": moves}
+        rows.append(row(find_task(tested.suite, tested.base), from_json(json.dumps([fields])), f"{number}"))
+    finding = leakage.check(rows, test)["pose"]
+    assert finding.overlaps == finding.rows == 696
+    assert finding.smallest == pytest.approx(0, abs=1e-5)
+    assert finding.coverage["pose"].compared == 696
+
+
+def test_scenes_are_drawn_clear_of_every_test_scene_and_cover_them_all(test: TestSet) -> None:
+    axis, rows = PoseAxis(components=("scene",)), []
+    for suite in SUITES[:4]:
+        for task in tasks(suite):
+            draws = islice(draws_of("pose", (axis,), task.name, task, 5, test), 20)
+            rows += [row(task, drawn, f"{task.name}{number}") for number, drawn in enumerate(draws)]
+    finding = leakage.check(rows, test)["pose"]
+    assert (finding.rows, finding.overlaps, finding.verdict) == (800, 0, "disjoint")
+    assert finding.smallest is not None
+    assert finding.smallest >= finding.clearance == 0.01
+    covered = finding.coverage["pose"]
+    assert covered.compared == 696
+    # The bowl of the goal suite is out of the hand's reach where the benchmark puts it.
+    assert covered.median is not None
+    assert covered.median < 0.08
 
 
 @pytest.mark.parametrize("axis", AXES)

@@ -12,17 +12,22 @@ import pytest
 from conftest import MILK, PLATE, STOVE, starter_demo
 from scipy.spatial.transform import Rotation
 
+from pipeline.axes import from_json, to_json
+from pipeline.axes.base import Level
 from pipeline.axes.pose import PoseAxis, PosePerturbation
+from pipeline.axes.scene import BASE_M, Move, ScenePerturbation
 from pipeline.config import ReplayConfig
 from pipeline.errors import PipelineError, RefusedError
+from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.physics.environment import Environment
+from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
 from pipeline.physics.roll_out import roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
-from pipeline.types import Scene, Task
+from pipeline.types import Scene, Task, Trajectory
 
 COOKIES = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate")
 NEXT_TO = find_task("libero_spatial", "pick_up_the_black_bowl_next_to_the_plate_and_place_it_on_the_plate")
@@ -30,7 +35,9 @@ BETWEEN = find_task(
     "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
 )
 POTS = find_task("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove")
+ON_STOVE = find_task("libero_spatial", "pick_up_the_black_bowl_on_the_stove_and_place_it_on_the_plate")
 BOWL = "akita_black_bowl_1"
+SUITES = ("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*")
 
 Scenes = Callable[[Task], Scene]
 
@@ -55,7 +62,19 @@ def moved(target: str, dx_m: float = 0.0, dy_m: float = 0.0, dyaw_deg: float = 0
 
 
 def draws(axis: PoseAxis, task: Task, count: int) -> list[PosePerturbation]:
-    return [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
+    drawn = [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
+    return [one for one in drawn if isinstance(one, PosePerturbation)]
+
+
+def scene_draws(task: Task, count: int, level: Level) -> list[ScenePerturbation]:
+    axis = PoseAxis(levels=(level,), components=("scene",))
+    drawn = [axis.sample(rng(1, "pose", "demo", variant), task, variant) for variant in range(count)]
+    return [one for one in drawn if isinstance(one, ScenePerturbation)]
+
+
+def together(**moves: tuple[float, float]) -> ScenePerturbation:
+    listed = tuple(Move(name=name, dx_m=dx_m, dy_m=dy_m) for name, (dx_m, dy_m) in moves.items())
+    return ScenePerturbation(level=1, moves=listed)
 
 
 def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
@@ -72,7 +91,7 @@ def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
 
 def test_the_target_is_what_the_goal_moves() -> None:
     axis = PoseAxis()
-    suites = select_tasks(["libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*"])
+    suites = select_tasks(SUITES)
     still = [task for task in suites if not axis.applies(task)]
     assert [task.name for task in still] == ["open_the_middle_drawer_of_the_cabinet", "turn_on_the_stove"]
     targets = {task: {p.moved for p in draws(axis, task, 12)} for task in suites if task not in still}
@@ -187,3 +206,121 @@ def test_the_replay_starts_there(plate_environment: Environment) -> None:
     trajectory = replay(plate_environment, short, "t", ReplayConfig(), (change,))
     (position,) = np.flatnonzero(trajectory.states[0] == demo.init_state + 0.02)
     assert trajectory.states[-1, position] == pytest.approx(trajectory.states[0, position], abs=1e-3), "it slides"
+
+
+@pytest.mark.parametrize("task", select_tasks(SUITES), ids=lambda task: task.name[:60])
+def test_a_scene_moves_everything_within_the_benchmarks_disks(task: Task) -> None:
+    known = bddl.read(task.bddl_file)
+    step_m = {"libero_spatial": 0.01, "libero_object": 0.03, "libero_goal": 0.02, "libero_10": 0.01}[task.suite]
+    step_m = 0.02 if task.name.startswith("LIVING_ROOM_SCENE1") else step_m
+    surface = {"main_table", "kitchen_table", "living_room_table", "study_table", "floor"}
+    levels: tuple[Level, ...] = (1, 5)
+    for level in levels:
+        drawn = scene_draws(task, 8, level)
+        assert drawn == scene_draws(task, 8, level)
+        assert len(set(drawn)) == 8
+        for one in drawn:
+            (read,) = from_json(to_json([one]))
+            assert (read, one.axis, one.component, one.level) == (one, "pose", "scene", level)
+            shifts = {move.name: np.array([move.dx_m, move.dy_m]) for move in one.moves}
+            assert shifts.keys() == (known.objects.keys() | known.fixtures.keys()) - surface
+            for name, shift in shifts.items():
+                assert np.array_equal(shift, shifts[known.carriers[name]]), "it stays on what it stands on"
+                centres_m = [(0.0, 0.0), BASE_M.get(name, (0.0, 0.0)) if task.suite == "libero_goal" else (0.0, 0.0)]
+                off_m = min(math.dist(shift, centre_m) for centre_m in centres_m)
+                assert off_m <= step_m * level + 1e-4
+
+
+def test_the_goal_suites_bowl_goes_where_the_benchmark_has_it_unless_the_hand_needs_it() -> None:
+    def mean(task: Task, name: str) -> list[float]:
+        moves = [move for one in scene_draws(task, 100, 1) for move in one.moves if move.name == name]
+        return list(np.mean([[move.dx_m, move.dy_m] for move in moves], axis=0))
+
+    assert mean(STOVE, BOWL) == pytest.approx([0.35, 0.05], abs=0.01)
+    assert mean(STOVE, "cream_cheese_1") == pytest.approx([0.15, 0.10], abs=0.01)
+    on_plate = find_task("libero_goal", "put_the_bowl_on_the_plate")
+    assert mean(on_plate, BOWL) == pytest.approx([0, 0], abs=0.01), "the hand does not reach so far"
+    assert mean(on_plate, "wine_bottle_1") == pytest.approx([0, 0.05], abs=0.01)
+
+
+def test_a_fixture_takes_along_what_stands_on_it(scenes: Scenes) -> None:
+    """And everything else goes its own way; what nobody moves stays where it is, bit for bit."""
+    scene, demo = scenes(ON_STOVE), starter_demo(ON_STOVE)
+    moves = {BOWL: (-0.01, 0.02), "flat_stove_1": (-0.01, 0.02), "plate_1": (0.02, 0.0)}
+    after = together(**moves).apply(scene, demo, roll_out)
+    before, now = CompiledScene(scene), CompiledScene(after)
+    for body in range(before.model.nbody):
+        name = before.model.body(body).name
+        root = before.model.body(before.model.body_rootid[body]).name.removesuffix("_main")
+        expected = [*moves.get(root, (0.0, 0.0)), 0.0]
+        assert now.data.body(name).xpos - before.data.body(name).xpos == pytest.approx(expected, abs=1e-7), name
+        assert np.array_equal(now.data.body(name).xquat, before.data.body(name).xquat)
+    assert now.touching(now.part(f"{BOWL}_main")).keys() == before.touching(before.part(f"{BOWL}_main")).keys()
+    assert len(before.state) == len(after.state)
+    placed = after.resolved["pose"]["positions_m"]
+    assert placed.keys() == moves.keys()
+    assert placed["flat_stove_1"] == now.data.body("flat_stove_1_main").xpos.tolist()
+
+
+@pytest.mark.parametrize(
+    ("task", "moves", "reason"),
+    [
+        # The stove is drawn away under the bowl.
+        (ON_STOVE, {"flat_stove_1": (0.0, -0.15)}, "object_in_collision|relation_broken|object_unstable"),
+        (ON_STOVE, {"plate_1": (-0.26, 0.0)}, "object_in_collision"),
+        # Two fixtures, between which the simulator itself has no contacts.
+        (STOVE, {"wine_rack_1": (0.2, 0.0)}, "object_in_collision"),
+        (NEXT_TO, {"plate_1": (0.25, 0.0)}, "relation_broken"),
+        (PLATE, {"plate_1": (1.0, 0.0)}, "relation_broken"),
+    ],
+)
+def test_a_scene_that_cannot_be_is_refused(
+    task: Task, moves: dict[str, tuple[float, float]], reason: str, scenes: Scenes
+) -> None:
+    with pytest.raises(RefusedError, match=reason):
+        together(**moves).apply(scenes(task), starter_demo(task), roll_out)
+
+
+def test_the_goal_moves_with_what_names_it(plate_environment: Environment, scenes: Scenes) -> None:
+    """The front of the stove goes where the stove goes, and LIBERO's own check looks for the plate there."""
+    after = together(flat_stove_1=(0.03, -0.08)).apply(scenes(PLATE), starter_demo(PLATE), roll_out)
+    region = "main_table_stove_front_region"
+    plate_environment.restore(scenes(PLATE).model_xml, scenes(PLATE).state)
+    was = plate_environment.pose(region)
+    plate_environment.restore(after.model_xml, after.state)
+    now = plate_environment.pose(region)
+    assert now - was == pytest.approx([0.03, -0.08, 0, 0, 0, 0, 0], abs=1e-7)
+    address = 1 + CompiledScene(after).model.joint("plate_1_joint0").qposadr[0]
+    for at, there in ((now, True), (was, False)):
+        state = after.state.copy()
+        state[address : address + 2] = at[:2]
+        plate_environment.restore(after.model_xml, state)
+        assert plate_environment.succeeded() is there
+
+
+def test_scenes_are_as_far_apart_as_the_thing_that_differs_most() -> None:
+    def tested(moves: str) -> TestTask:
+        return TestTask(PLATE.suite, PLATE.name, "name", "pose", "pose", {"level": 1, "moves": moves})
+
+    test = TestSet((tested("plate_1:0.01,0.02;flat_stove_1:0,0.03"), tested("plate_1:0.05,0;flat_stove_1:0,0.03")))
+    here = together(plate_1=(0.01, 0.02), flat_stove_1=(0.004, 0.03))
+    distance, compared = here.nearest(test, PLATE)
+    assert distance == pytest.approx(0.004)
+    assert compared == 2
+    assert distance < ScenePerturbation.clearance, "the reset could have put the stove there"
+    assert together(plate_1=(0.01, 0.02), flat_stove_1=(0.0, 0.05)).nearest(test, PLATE).distance == pytest.approx(0.02)
+    assert together(plate_1=(0.01, 0.02)).nearest(test, MILK) == (math.inf, 0)
+
+
+def test_a_moved_fixture_is_followed(whole: dict[Task, Trajectory]) -> None:
+    """The knob is turned where the stove now stands, and LIBERO's own check sees the burner lit."""
+    environment, change = Environment(STOVE), together(flat_stove_1=(0.05, 0.03), plate_1=(0.02, 0.01))
+    twin = whole[STOVE]
+    reference = Reference.of(twin.model_xml, twin.states, twin.actions)
+    assert reference.met["flat_stove_1"].any()
+    tracked, demo = ReplayConfig(mode="tracked"), starter_demo(STOVE)
+    assert not replay(environment, demo, "t", ReplayConfig(), (change,)).verdict.kept
+    kept = replay(environment, demo, "t", tracked, (change,), lambda: reference)
+    assert (kept.mode, kept.verdict.reason) == ("tracked", "kept")
+    again = replay(environment, demo, "t", tracked, (change,), lambda: reference)
+    assert np.array_equal(again.states, kept.states)

@@ -17,7 +17,7 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.config import ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment
-from pipeline.physics.reference import Reference
+from pipeline.physics.reference import Mask, Reference
 from pipeline.physics.replay import replay
 from pipeline.physics.tracking import GAIN, PATIENCE, STRIDE, Hand, Route, follow
 from pipeline.seeding import rng
@@ -102,6 +102,64 @@ def test_a_moved_basket_is_where_the_milk_is_let_go(milk: Reference) -> None:
     grasp, release = np.flatnonzero(milk.carried["milk_1"])[0], np.flatnonzero(milk.held["milk_1"])[-1]
     assert np.allclose(route.positions_m[: grasp + 1], milk.positions_m[: grasp + 1], rtol=0, atol=1e-12)
     assert np.allclose(route.positions_m[release], milk.positions_m[release] + shift, rtol=0, atol=1e-9)
+
+
+def one_after_the_other() -> Reference:
+    """A hand that puts a mug on a plate, rests on the table, and then takes a cup to a region."""
+    steps = np.arange(101)
+
+    def during(*runs: tuple[int, int]) -> Mask:
+        return np.array([any(first <= step <= last for first, last in runs) for step in steps])
+
+    def carried_over(first: int, last: int) -> Floats:
+        poses = np.tile([0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0], (101, 1))
+        poses[:, 1] = 0.3 * np.clip((steps - first) / (last - first), 0, 1)
+        return poses
+
+    contacts, never = during((10, 11), (40, 41), (70, 71), (94, 95)), np.zeros(101, bool)
+    return Reference(
+        positions_m=np.zeros((101, 3)),
+        rotations=Rotation.from_rotvec(np.zeros((101, 3))),
+        actions=np.zeros((100, 7)),
+        busy=contacts | during((60, 64)),
+        engaged=contacts,
+        held={"mug_1": during((10, 45)), "cup_1": during((70, 95)), "plate_1": never},
+        carried={"mug_1": during((12, 39)), "cup_1": during((72, 93)), "plate_1": never},
+        met={"mug_1": never, "cup_1": never, "plate_1": during((40, 45)), "region": during((94, 95))},
+        poses={"mug_1": carried_over(12, 40), "cup_1": carried_over(72, 94), "plate_1": carried_over(0, 1) * 0 + 0.5},
+        places={"region": np.array([0.0, 0.3, 0.5, 1.0, 0.0, 0.0, 0.0])},
+    )
+
+
+def bend(**shifts: float) -> Floats:
+    """(K+1,) m by which the route is moved along x when things are."""
+    reference = one_after_the_other()
+    poses = {name: reference.poses[name][0].copy() for name in reference.poses} | {
+        name: pose.copy() for name, pose in reference.places.items()
+    }
+    for name, shift in shifts.items():
+        poses[name][0] += shift
+    moved: Floats = Route.through(reference, start_of(reference), poses).positions_m[:, 0]
+    return moved
+
+
+def test_each_thing_is_followed_while_it_is_the_one_that_counts() -> None:
+    assert bend(mug_1=0.04)[[0, 6, 12, 36]] == pytest.approx([0, 0.04, 0.04, 0], abs=1e-9)
+    assert bend(plate_1=0.04)[[11, 36, 45]] == pytest.approx([0, 0.04, 0.04], abs=1e-9)
+    # Not before the mug is let go; and that the hand rests on the table between them does not hold it up.
+    cup = bend(cup_1=0.04)
+    assert cup[[45, 66, 71, 91]] == pytest.approx([0, 0.04, 0.04, 0], abs=1e-9)
+    assert np.abs(np.diff(cup[46:66])).max() < 0.004
+    assert bend(region=0.04)[[69, 71, 95]] == pytest.approx([0, 0, 0.04], abs=1e-4)
+
+
+def test_what_moves_alike_is_followed_once() -> None:
+    """And where things move apart, one counts at a time."""
+    both = bend(mug_1=0.04, plate_1=0.04)
+    assert both[6:46] == pytest.approx(0.04, abs=0.012)
+    assert both.max() <= 0.04 + 1e-9
+    apart = bend(mug_1=0.04, plate_1=-0.02, cup_1=0.03, region=-0.04)
+    assert apart[[6, 12, 36, 45, 66, 71, 95]] == pytest.approx([0.04, 0.04, -0.02, -0.02, 0.03, 0.03, -0.04], abs=1e-4)
 
 
 def test_a_tilted_object_is_refused(milk: Reference) -> None:

@@ -24,6 +24,7 @@ from pipeline.axes.light import LightAxis, LightPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.axes.pose import PoseAxis, PosePerturbation
 from pipeline.axes.robot import RobotAxis, RobotPerturbation
+from pipeline.axes.scene import ScenePerturbation
 from pipeline.errors import PipelineError, RefusedError
 
 AnyPerturbation = Annotated[
@@ -33,7 +34,7 @@ AnyPerturbation = Annotated[
     | NoisePerturbation
     | LanguagePerturbation
     | LayoutPerturbation
-    | PosePerturbation
+    | Annotated[PosePerturbation | ScenePerturbation, Field(discriminator="component")]
     | RobotPerturbation,
     Field(discriminator="axis"),
 ]
@@ -61,8 +62,11 @@ class Axes(Frozen):
     language: LanguageAxis | None = None
 
 
-_KINDS: dict[str, type[Perturbation]] = {
-    kind.model_fields["axis"].default: kind for kind in get_args(get_args(AnyPerturbation)[0])
+# The union has a union of its own for an axis that has several kinds.
+_KINDS: dict[str, tuple[type[Perturbation], ...]] = {
+    kinds[0].model_fields["axis"].default: kinds
+    for member in get_args(get_args(AnyPerturbation)[0])
+    for kinds in [(member,) if isinstance(member, type) else get_args(get_args(member)[0])]
 }
 _PLACE = {axis: place for place, axis in enumerate(Axes.model_fields)}
 
@@ -85,12 +89,12 @@ def axes_of(name: str) -> tuple[str, ...]:
 
 def layer_of(axis: str) -> Layer:
     """The layer that an axis, by its name, changes."""
-    return _KINDS[axis].layer
+    return kind_of(axis).layer
 
 
 def kind_of(axis: str) -> type[Perturbation]:
-    """The perturbations of an axis, by its name."""
-    return _KINDS[axis]
+    """The perturbations of an axis, by its name; of several kinds the first."""
+    return _KINDS[axis][0]
 
 
 def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:

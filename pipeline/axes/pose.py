@@ -1,10 +1,13 @@
-"""Pose: where the object that a task moves, or what it is put on or in, stands at the start. Physics layer."""
+"""Pose: where things stand at the start: the object that a task moves, what it is put on or in, or the whole scene.
+
+Physics layer. The component ``scene`` is in ``pipeline.axes.scene``.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
@@ -13,8 +16,10 @@ import numpy as np
 from pydantic import Field, PositiveFloat
 
 from pipeline.axes.base import Axis, PhysicsPerturbation, on_task
+from pipeline.axes.scene import ScenePerturbation, draw_scene
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero import bddl
+from pipeline.libero.relations import relation_holds
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 if TYPE_CHECKING:
@@ -30,15 +35,8 @@ DEEPER_M = 0.001
 CREEP_M, CREEP_DEG = 0.002, 2.0
 """How much farther than the recorded object a moved one may slide and tilt until it stops."""
 
-NEXT_TO_M = 0.17
-"""Distance of centres up to which things stand next to each other; in LIBERO it is 0.12 to 0.13 m."""
-
-BETWEEN = 0.25
-"""Share of the way between two things that still counts as at one of them, and as beside the line between them."""
-
-
-Component = Literal["target", "receptacle"]
-"""What the goal puts somewhere, and what it is put on or in, where that is an object that can be moved."""
+Component = Literal["target", "receptacle", "scene"]
+"""What the goal puts somewhere, what it is put on or in, where that is an object that can be moved, or everything."""
 
 
 class PosePerturbation(PhysicsPerturbation):
@@ -51,7 +49,7 @@ class PosePerturbation(PhysicsPerturbation):
     """
 
     axis: Literal["pose"] = "pose"
-    component: Component
+    component: Literal["target", "receptacle"]
     moved: str
     dx_m: float
     dy_m: float
@@ -82,7 +80,7 @@ class PosePerturbation(PhysicsPerturbation):
         pose[:] = self._moved(pose)
         compiled.restore(state)
         targets = bddl.read(demo.task.bddl_file).targets
-        if not all(_relation_holds(demo.task, target, compiled.xy_m) for target in targets):
+        if not all(relation_holds(demo.task, target, compiled.xy_m) for target in targets):
             raise RefusedError("relation_broken")
         now = _settle(compiled, self.moved)
 
@@ -163,53 +161,13 @@ def _settle(compiled: CompiledScene, moved: str) -> _Settled:
     )
 
 
-@cache
-def _alike(task: Task, thing: str) -> tuple[str, ...]:
-    """The other objects of the category of ``thing``."""
-    objects = bddl.read(task.bddl_file).objects
-    return tuple(name for name, category in objects.items() if category == objects[thing] and name != thing)
-
-
-@cache
-def _anchors(task: Task, thing: str) -> tuple[str, ...]:
-    """The one thing that an object starts next to, or the two that it starts between; none where neither is said."""
-    places = bddl.read(task.bddl_file).places
-    # Such as main_table_between_plate_ramekin_region: the plate starts in main_table_plate_region.
-    found = re.fullmatch(r"(\w+?)_(?:next_to_([a-z]+)|between_([a-z]+)_([a-z]+))_region", places.get(thing, ""))
-    if found is None:
-        return ()
-    surface, *words = (word for word in found.groups() if word)
-    at = {region: name for name, region in places.items()}
-    return tuple(at[f"{surface}_{word}_region"] for word in words)
-
-
-def _relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:
-    """Whether the target still stands where the instruction's words place it.
-
-    Next to something: within ``NEXT_TO_M`` of it, and no like object nearer to it. Between two things: its foot on the
-    line between them in the middle half, and off that line by at most a quarter of its length.
-    """
-    own = xy_m(target)
-    match _anchors(task, target):
-        case (anchor,):
-            away = np.linalg.norm(own - xy_m(anchor))
-            nearest_alike = min(
-                (np.linalg.norm(xy_m(other) - xy_m(anchor)) for other in _alike(task, target)), default=math.inf
-            )
-            return bool(away <= min(NEXT_TO_M, nearest_alike))
-        case (first, second):
-            line = xy_m(second) - xy_m(first)
-            dx, dy = own - xy_m(first)
-            along, beside = np.array([dx * line[0] + dy * line[1], dx * line[1] - dy * line[0]]) / (line @ line)
-            return bool(BETWEEN <= along <= 1 - BETWEEN and abs(beside) <= BETWEEN)
-    return True
-
-
 class PoseAxis(Axis):
     """Displacements in all directions with equal chance, and turns to both sides.
 
     At level k the displacement is k - 1 to k times ``step_m``, uniform over the ring, and the turn k - 1 to k times
     ``step_deg``. Where there are several objects to choose from, one is drawn.
+
+    The component ``scene`` moves everything at once, by LIBERO-Plus's distances instead: see ``draw_scene``.
 
     Attributes:
         components: what to move.
@@ -225,10 +183,14 @@ class PoseAxis(Axis):
 
     def _choices(self, task: Task) -> list[tuple[Component, str]]:
         known = bddl.read(task.bddl_file)
-        named: dict[Component, tuple[str, ...]] = {"target": known.targets, "receptacle": known.receptacles}
+        named: dict[Component, tuple[str, ...]] = {
+            "target": known.targets,
+            "receptacle": known.receptacles,
+            "scene": ("all",),
+        }
         return [(component, name) for component in self.components for name in named[component]]
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation:
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
         """One draw for a task that the axis applies to.
 
         Raises:
@@ -244,6 +206,8 @@ class PoseAxis(Axis):
             )
         component, moved = choices[rng.integers(len(choices))]
         level = self.draw_level(rng)
+        if component == "scene":
+            return draw_scene(rng, level, task)
         reach_m = self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2))
         bearing_rad = rng.uniform(-math.pi, math.pi)
         dyaw_deg = self.step_deg * rng.uniform(level - 1, level) * rng.choice([-1, 1])

@@ -47,6 +47,29 @@ class Bddl:
         return {fact[1]: fact[2] for fact in self.start if fact[0] in ("on", "in")}
 
     @property
+    def carriers(self) -> dict[str, str]:
+        """Object or fixture to what it moves with: itself where it starts in a region of the working surface, else
+        what it stands on or in, such as wooden_cabinet_1 for a bowl that starts in wooden_cabinet_1_top_region."""
+        carriers: dict[str, str] = {}
+        for thing in self.places:
+            carrier = thing
+            while (place := self.places[carrier]) not in self.regions:
+                carrier = next(host for host in self.places if f"{place}_".startswith(f"{host}_"))
+            carriers[thing] = carrier
+        return carriers
+
+    @property
+    def goal_regions(self) -> dict[str, str]:
+        """Region of the working surface that the goal puts something in to the thing that names it: plate_1 for
+        living_room_table_plate_right_region, which is to the right of the plate."""
+        placed = {place: thing for thing, place in self.places.items()}
+        named = {}
+        for region in (fact[2] for fact in self.goal if len(fact) > 2 and fact[2] in self.regions):
+            words = region.removesuffix("_region").rsplit("_", 1)[0]
+            named[region] = next(thing for place, thing in placed.items() if place.startswith(words))
+        return named
+
+    @property
     def targets(self) -> tuple[str, ...]:
         """The movable objects that the goal puts somewhere, none twice."""
         put = (fact[1] for fact in self.goal if fact[0] in ("on", "in"))

@@ -20,6 +20,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.stepping import ControlStep
+from pipeline.scenes.compiled import fixed_pose
 from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Task
 
@@ -221,8 +222,11 @@ class Environment:
         return grip.xpos.copy(), Rotation.from_matrix(grip.xmat.reshape(3, 3))
 
     def pose(self, name: str) -> Floats:
-        """(7,) position in m and rotation wxyz of a movable object, by its name in the BDDL file."""
-        pose: Floats = self.sim.data._data.joint(f"{name}_joint0").qpos.copy()
+        """(7,) position in m and rotation wxyz of an object, a fixture or a region, by its name in the BDDL file."""
+        data = self.sim.data._data
+        if f"{name}_joint0" not in self.sim.model.joint_names:
+            return fixed_pose(data, name)
+        pose: Floats = data.joint(f"{name}_joint0").qpos.copy()
         return pose
 
     @property

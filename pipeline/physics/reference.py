@@ -10,10 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline.scenes.compiled import CompiledScene
+from pipeline.scenes.compiled import CompiledScene, fixed_pose
+from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Scene
 
 Mask = NDArray[np.bool_]
+
+FALL = 10
+"""Control steps (0.5 s) within which an object that was let go comes down on what it is meant for."""
 
 
 @dataclass(frozen=True)
@@ -21,27 +25,33 @@ class Reference:
     """What has to be known of a rollout to repeat it.
 
     K actions lie between K+1 states. An object is *carried* while it touches the robot and nothing else, and *met*
-    while the hand touches it without carrying it, or while something in the hand newly touches it.
+    while the hand touches it without carrying it, or while something in the hand newly touches it, and also when it
+    catches what the hand has let go. Fixtures, such as a stove, are met in the same way. A region of the working
+    surface is met while something in the hand stands in it.
 
     Attributes:
         positions_m: (K+1, 3) of the grip site in the world's frame.
         rotations: K+1 orientations of the grip site in the world's frame.
         actions: (K, 7).
         busy: (K+1,) whether the hand, or something in it, touches anything besides what is carried.
+        engaged: (K+1,) the same without the hand's own contacts with the working surface, which never moves.
         held: object to (K+1,) whether the robot touches it.
         carried: object to (K+1,).
-        met: object to (K+1,).
+        met: object, fixture or region to (K+1,).
         poses: object to (K+1, 7), position in m and rotation wxyz.
+        places: fixture or region, by its name in the BDDL file, to its pose (7,).
     """
 
     positions_m: Floats
     rotations: Rotation
     actions: Floats
     busy: Mask
+    engaged: Mask
     held: Mapping[str, Mask]
     carried: Mapping[str, Mask]
     met: Mapping[str, Mask]
     poses: Mapping[str, Floats]
+    places: Mapping[str, Floats]
 
     @classmethod
     def of(cls, model_xml: str, states: Floats, actions: Floats) -> Reference:
@@ -66,11 +76,19 @@ class Reference:
             )
             for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
         }
-        positions, matrices, busy = np.empty((steps, 3)), np.empty((steps, 3, 3)), np.zeros(steps, bool)
-        held, carried, met = ({name: np.zeros(steps, bool) for name, _ in free.values()} for _ in range(3))
+        places = _places(model, data)
+        things = {body: name for body, (name, _) in free.items()} | {
+            int(model.body(f"{name}_main").id): name for name in places if f"{name}_main" in _roots(model)
+        }
+        regions = [name for name in places if name not in things.values()]
+        positions, matrices = np.empty((steps, 3)), np.empty((steps, 3, 3))
+        busy, engaged = np.zeros(steps, bool), np.zeros(steps, bool)
+        held, carried = ({name: np.zeros(steps, bool) for name, _ in free.values()} for _ in range(2))
+        met = {name: np.zeros(steps, bool) for name in (*things.values(), *regions)}
         poses = {name: np.empty((steps, 7)) for name, _ in free.values()}
-        compiled.restore(states[0])
-        touched_at_start = _partners(compiled)
+        # What an object stood on until the hand took it: it is not met when that happens.
+        stood_on: dict[int, set[int]] = {body: set() for body in free}
+        let_go: dict[int, int] = {}
         for step, state in enumerate(states):
             compiled.restore(state)
             positions[step], matrices[step] = data.site_xpos[grip], data.site_xmat[grip].reshape(3, 3)
@@ -80,15 +98,28 @@ class Reference:
             for body in partners.get(robot, set()):
                 alone = body in free and partners[body] == {robot}
                 busy[step] |= not alone
-                if body not in free:
+                engaged[step] |= not alone and body in things
+                if body in free:
+                    (carried if alone else met)[things[body]][step] = True
+                elif body in things:
+                    met[things[body]][step] = True
+            for body, (name, _) in free.items():
+                touched = partners.get(body, set())
+                if robot in touched:
+                    held[name][step], let_go[body] = True, step
+                elif not held[name].any():
+                    stood_on[body] |= touched
                     continue
-                name = free[body][0]
-                held[name][step] = True
-                (carried if alone else met)[name][step] = True
-                # What an object stood on from the start is not met when the hand takes the object.
-                for other in (partners[body] & free.keys()) - touched_at_start.get(body, set()):
-                    met[free[other][0]][step] = True
-        return cls(positions, Rotation.from_matrix(matrices), actions, busy, held, carried, met, poses)
+                elif step > let_go[body] + FALL:
+                    continue
+                # The last step in the hand stands for where it came down.
+                for other in (touched & things.keys()) - stood_on[body]:
+                    met[things[other]][let_go[body]] = True
+                if touched - {robot}:
+                    for region in regions:
+                        if _within(model.site(region).size, places[region], poses[name][step]):
+                            met[region][let_go[body]] = True
+        return cls(positions, Rotation.from_matrix(matrices), actions, busy, engaged, held, carried, met, poses, places)
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -102,6 +133,27 @@ class Reference:
             "path_m": float(np.linalg.norm(travelled, axis=1).sum()),
             "jerk": float(np.sqrt((jerks**2).sum(axis=1).mean())),
         }
+
+
+def _roots(model: mujoco.MjModel) -> set[str]:
+    """Names of the bodies that stand in the world itself."""
+    return {model.body(body).name for body in np.flatnonzero(model.body_parentid == 0)}
+
+
+def _places(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, Floats]:
+    """Fixture, or region of the working surface, to its pose (7,)."""
+    jointed = {int(model.jnt_bodyid[joint]) for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)}
+    names = [name for name in _roots(model) if name.endswith("_main") and model.body(name).id not in jointed]
+    places = {name.removesuffix("_main"): fixed_pose(data, name.removesuffix("_main")) for name in sorted(names)}
+    for site in range(model.nsite):
+        if model.body(model.site_bodyid[site]).name in SURFACES:
+            places[model.site(site).name] = fixed_pose(data, model.site(site).name)
+    return places
+
+
+def _within(half_m: Floats, region: Floats, pose: Floats) -> bool:
+    """Whether an object's origin is over a region, or under it."""
+    return bool((np.abs(pose[:2] - region[:2]) < half_m[:2]).all())
 
 
 def _partners(compiled: CompiledScene) -> dict[int, set[int]]:

@@ -94,7 +94,7 @@ def replay(
 
 def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
     """The actions that follow a reference from where the restored environment stands."""
-    poses = {name: environment.pose(name) for name in reference.poses}
+    poses = {name: environment.pose(name) for name in (*reference.poses, *reference.places)}
     return follow(Route.through(reference, environment.hand, poses), lambda: environment.hand, environment.pose)
 
 

@@ -78,19 +78,21 @@ class Route:
 
         An object's displacement (about the vertical and along it and across it) is followed from before the hand
         meets it until it is carried off; then the route returns to the reference on the way to the goal. What objects
-        are put on or in is followed from before the hand meets it until its last contact.
+        are put on or in, and what is opened, closed or turned, is followed from before the hand meets it until its
+        last contact. Where several are met at once, what the hand moves comes first, then what it meets for longest.
 
         Args:
             reference: a rollout that reached the goal.
             hand: where the hand starts.
-            poses: object to its pose (7,) in the scene, for every movable object that the reference knows.
+            poses: object, fixture or region to its pose (7,) in the scene; those that are left out have not moved.
 
         Raises:
             RefusedError: ``object_not_upright`` when an object was tilted, which no bend about the vertical follows.
         """
         positions, rotations = reference.positions_m, reference.rotations
-        for name, pose in poses.items():
-            then = reference.poses[name][0]
+        free: Floats = np.ones(len(reference) + 1)
+        for name in sorted(poses, key=lambda name: (not _moves(reference, name), -int(reference.met[name].sum()))):
+            pose, then = poses[name], reference.poses[name][0] if name in reference.poses else reference.places[name]
             shift = pose[:3] - then[:3]
             turn = (_rotation(pose) * _rotation(then).inv()).as_rotvec()
             if np.abs(shift).max() < 1e-4 and np.abs(turn).max() < 1e-3:
@@ -98,7 +100,8 @@ class Route:
             if np.abs(turn[:2]).max() > 0.05:
                 raise RefusedError("object_not_upright")
             upright = np.array([0.0, 0.0, turn[2]])
-            weights = _followed(reference, name)[:, None]
+            share = _followed(reference, name) * free
+            free, weights = free - share, share[:, None]
             displaced = then[:3] + shift + Rotation.from_rotvec(upright).apply(positions - then[:3])
             positions = positions + weights * (displaced - positions)
             rotations = Rotation.from_rotvec(weights * upright) * rotations
@@ -171,27 +174,54 @@ def _grasp_offset(reference: Reference, step: int, hand: Hand, pose: Callable[[s
 
 def _followed(reference: Reference, name: str) -> Floats:
     """(K+1,) share of a moved object's displacement that the hand has to take over at each state."""
-    held, met, carried = reference.held[name], reference.met[name], _runs(reference.carried[name])
-    carried = [(first, last) for first, last in carried if last - first >= MARGIN]
-    travelled = np.linalg.norm(reference.poses[name][:, :3] - reference.poses[name][0, :3], axis=1)
     weights: Floats = np.zeros(len(reference) + 1)
-    if held.any() and travelled.max() > MOVED_M:
+    if _moves(reference, name):
+        held, carried = reference.held[name], _runs(reference.carried[name])
+        carried = [(first, last) for first, last in carried if last - first >= MARGIN]
         first = int(np.flatnonzero(held)[0])
         # Carried off, or pushed all the way: the displacement is given back until it is put down.
         taken, put_down = carried[0] if carried else (first, int(np.flatnonzero(held)[-1]))
         return np.maximum(weights, _window(reference, first, max(taken, first), put_down - MARGIN))
-    for first, last in _runs(met):
-        later = np.flatnonzero(reference.busy[last + FLICKER + 1 :])
+    for first, last in _runs(reference.met[name]):
+        # Something may have been in the hand for long, pushed along the table, before it meets a place.
+        since = min(
+            (
+                run[0]
+                for other in reference.held
+                if name in reference.places and _moves(reference, other)
+                for run in _runs(reference.held[other])
+                if run[0] <= first <= run[1]
+            ),
+            default=first,
+        )
+        later = np.flatnonzero(reference.engaged[last + FLICKER + 1 :])
         until = last + FLICKER + 1 + int(later[0]) - MARGIN if len(later) else None
-        weights = np.maximum(weights, _window(reference, first, last, until))
+        weights = np.maximum(weights, _window(reference, first, last, until, since))
     return weights
 
 
-def _window(reference: Reference, first: int, last: int, until: int | None) -> Floats:
-    """(K+1,) rising since the contact before ``first``, 1 from shortly before it to ``last``, 0 from ``until`` on."""
+def _moves(reference: Reference, name: str) -> bool:
+    """Whether the hand carries or pushes something elsewhere."""
+    if name not in reference.poses or not reference.held[name].any():
+        return False
+    travelled = np.linalg.norm(reference.poses[name][:, :3] - reference.poses[name][0, :3], axis=1)
+    return bool(travelled.max() > MOVED_M)
+
+
+def _window(reference: Reference, first: int, last: int, until: int | None, since: int | None = None) -> Floats:
+    """(K+1,) 1 from shortly before ``first`` to ``last``, 0 from ``until`` on.
+
+    It rises since ``since``, at the latest since the contact before ``first`` and since what the hand held then was
+    let go, unless it is what is in the hand at ``first``.
+    """
     steps = np.arange(len(reference) + 1)
-    before = np.flatnonzero(reference.busy[: max(first - FLICKER, 0)])
+    engaged = reference.engaged.copy()
+    for held in reference.held.values():
+        if not held[max(first - FLICKER, 0) : first + 1].any():
+            engaged |= held
+    before = np.flatnonzero(engaged[: max(first - FLICKER, 0)])
     start = int(before[-1]) + 1 if len(before) else 0
+    start = start if since is None else min(start, since)
     weights = _smooth((steps - start) / max(first - MARGIN - start, 1))
     if until is not None:
         weights = np.minimum(weights, 1 - _smooth((steps - last) / max(until - last, 1)))

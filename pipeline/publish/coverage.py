@@ -18,6 +18,7 @@ from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
+from pipeline.axes.scene import ScenePerturbation, displacements
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.publish.figures import Panel, bars, histogram, scatter, strips
@@ -87,7 +88,7 @@ def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
         case "layout":
             return _layout(draws, test)
         case "pose":
-            return _pose([p for p in made if isinstance(p, PosePerturbation)], test)
+            return _pose([p for p in made if isinstance(p, PosePerturbation | ScenePerturbation)], test)
         case "robot":
             return _robot([p for p in made if isinstance(p, RobotPerturbation)], test)
     return _numbers(axis, made, test)
@@ -223,19 +224,28 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     )
 
 
-def _pose(draws: Sequence[PosePerturbation], test: TestSet) -> AxisPlots:
-    tested = [task.parameters for task in test.of("pose") if "dx_m" in task.parameters]
-    moves = np.array([[float(known["dx_m"]), float(known["dy_m"])] for known in tested]).reshape(-1, 2)
-    own = np.array([[p.dx_m, p.dy_m] for p in draws]).reshape(-1, 2)
+def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) -> AxisPlots:
+    tested = [task.parameters for task in test.of("pose")]
+    targets = np.array([[float(p["dx_m"]), float(p["dy_m"])] for p in tested if "dx_m" in p]).reshape(-1, 2)
+    alone = [p for p in draws if isinstance(p, PosePerturbation)]
+    scenes = [p for p in draws if isinstance(p, ScenePerturbation)]
+    panels = []
+    if alone:
+        own = np.array([[p.dx_m, p.dy_m] for p in alone])
+        groups = {"benchmark": 100 * targets, "pose": 100 * own}
+        panels += [
+            scatter("where the moved object goes", groups, "dx (cm)", "dy (cm)", True),
+            strips("how far it turns", {"yaw": {"pose": np.array([p.dyaw_deg for p in alone])}}, "degrees"),
+        ]
+    if scenes:
+        moved = [shift for p in tested for shift in displacements(p).values()]
+        own = np.array([[move.dx_m, move.dy_m] for p in scenes for move in p.moves])
+        groups = {"benchmark": 100 * np.array(moved).reshape(-1, 2), "pose": 100 * own}
+        panels.append(scatter("where each thing of a scene goes", groups, "dx (cm)", "dy (cm)", True))
     return AxisPlots(
-        f"{len(test.of('pose')):,} test tasks, of which {len(tested):,} move the target, and all of which move "
-        "everything else as well. The turn is this project's own.",
-        [
-            scatter(
-                "where the moved object goes", {"benchmark": 100 * moves, "pose": 100 * own}, "dx (cm)", "dy (cm)", True
-            ),
-            strips("how far it turns", {"yaw": {"pose": np.array([p.dyaw_deg for p in draws])}}, "degrees"),
-        ],
+        f"{len(tested):,} test tasks, of which {len(targets):,} move the target, and all of which move everything "
+        f"else as well. {len(scenes)} of {len(draws)} draws move the whole scene. Turns are this project's own.",
+        panels,
     )
 
 

@@ -60,8 +60,8 @@ class AxisDistance:
         comparisons: pairs of an episode and a test task that were compared.
         smallest: the least distance of all; None when there was nothing to compare with, or nothing similar.
         closest: the episode it belongs to.
-        clearance: the least distance that is allowed.
-        measure: what the distance is and its unit.
+        clearance: the least distance that is allowed, of this episode's kind where the axis has several.
+        measure: what the distance is and its unit; of each kind.
         overlaps: episodes that are closer than that.
         verdict: ``disjoint``, ``overlap``, or ``unknown`` when what the test tasks change cannot be read offline.
         coverage: component of the test tasks to how far these are from the wanted episodes, reserves left out.
@@ -81,21 +81,19 @@ class AxisDistance:
 
 def check(rows: Sequence[Row], test: TestSet) -> dict[str, AxisDistance]:
     """Axis to finding, in the order of the plan."""
-    found: dict[str, list[tuple[Nearest, str]]] = defaultdict(list)
-    kinds: dict[str, AnyPerturbation] = {}
+    found: dict[str, list[tuple[Nearest, str, AnyPerturbation]]] = defaultdict(list)
     wanted: dict[str, list[tuple[AnyPerturbation, Task]]] = defaultdict(list)
     known = {(row.suite, row.task) for row in rows}
     tasks = {key: find_task(*key) for key in known}
     for row in rows:
         task = tasks[row.suite, row.task]
         for perturbation in from_json(row.perturbations):
-            kinds[perturbation.axis] = perturbation
-            found[perturbation.axis].append((perturbation.nearest(test, task), row.episode_id))
+            found[perturbation.axis].append((perturbation.nearest(test, task), row.episode_id, perturbation))
             if row.wanted:
                 wanted[perturbation.axis].append((perturbation, task))
     return {
-        axis: _finding(found[axis], kind, len(test.of(axis)), coverage(axis, distances(axis, wanted[axis], test), test))
-        for axis, kind in kinds.items()
+        axis: _finding(of_axis, len(test.of(axis)), coverage(axis, distances(axis, wanted[axis], test), test))
+        for axis, of_axis in found.items()
     }
 
 
@@ -122,11 +120,11 @@ def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
 
 
 def _finding(
-    found: Sequence[tuple[Nearest, str]], kind: AnyPerturbation, test_tasks: int, coverage: dict[str, Coverage]
+    found: Sequence[tuple[Nearest, str, AnyPerturbation]], test_tasks: int, coverage: dict[str, Coverage]
 ) -> AxisDistance:
-    nearest, closest = min(found, key=lambda pair: pair[0].distance)
-    comparisons = sum(one.compared for one, _ in found)
-    overlaps = sum(one.distance < kind.clearance for one, _ in found)
+    nearest, closest, kind = min(found, key=lambda one: one[0].distance)
+    comparisons = sum(one.compared for one, _, _ in found)
+    overlaps = sum(one.distance < kind.clearance for one, _, kind in found)
     alike = math.isfinite(nearest.distance)
     return AxisDistance(
         rows=len(found),
@@ -135,7 +133,7 @@ def _finding(
         smallest=nearest.distance if alike else None,
         closest=closest if alike else None,
         clearance=kind.clearance,
-        measure=kind.measure,
+        measure="; ".join(dict.fromkeys(kind.measure for _, _, kind in found)),
         overlaps=overlaps,
         verdict="overlap" if overlaps else "unknown" if test_tasks and not comparisons else "disjoint",
         coverage=coverage,

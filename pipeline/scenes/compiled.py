@@ -57,6 +57,16 @@ class CompiledScene:
         return gaps
 
 
+def fixed_pose(data: mujoco.MjData, name: str) -> Floats:
+    """(7,) position in m and rotation wxyz of a fixture or a region, by its name in the BDDL file."""
+    if mujoco.mj_name2id(data.model, mujoco.mjtObj.mjOBJ_BODY, f"{name}_main") >= 0:
+        body = data.body(f"{name}_main")
+        return np.concatenate([body.xpos, body.xquat])
+    site, quaternion = data.site(name), np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, site.xmat)
+    return np.concatenate([site.xpos, quaternion])
+
+
 def proprioception(data: mujoco.MjData) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """State (8,) and joint state (7,) of a restored scene; names and units in ``schemas/episode.json``."""
     position = data.site("gripper0_grip_site").xpos

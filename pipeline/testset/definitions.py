@@ -183,20 +183,29 @@ def _added(scene: Bddl) -> dict[str, Value]:
 
 
 def _displacement(scene: Bddl, original: Bddl) -> dict[str, Value]:
-    """How far the objects that are to be moved start off their original places; empty without any.
+    """How far things start off their original places.
 
-    The first is the ``target``; ``others`` lists the rest as ``name:dx,dy`` in metres.
+    ``moves`` lists every object and fixture as ``name:dx,dy`` in metres. Where the task moves objects, the first of
+    them is the ``target``, and ``others`` lists the rest.
     """
-    moved = []
-    for name in scene.targets:
+    moves = {}
+    for name in scene.places:
         new_m, old_m = _centre(name, scene), _centre(name, original)
         if new_m and old_m:
-            moved.append((name, round(new_m[0] - old_m[0], 6), round(new_m[1] - old_m[1], 6)))
+            moves[name] = (round(new_m[0] - old_m[0], 6), round(new_m[1] - old_m[1], 6))
+    listed: dict[str, Value] = {"moves": _listed(moves)}
+    moved = [name for name in scene.targets if name in moves]
     if not moved:
-        return {}
-    (target, dx_m, dy_m), *rest = moved
-    others = ";".join(f"{name}:{dx:.6g},{dy:.6g}" for name, dx, dy in rest)
-    return {"target": target, "dx_m": dx_m, "dy_m": dy_m, **({"others": others} if others else {})}
+        return listed
+    target, *rest = moved
+    others = _listed({name: moves[name] for name in rest})
+    dx_m, dy_m = moves[target]
+    return {"target": target, "dx_m": dx_m, "dy_m": dy_m, **({"others": others} if others else {}), **listed}
+
+
+def _listed(moves: dict[str, tuple[float, float]]) -> str:
+    """Such as moka_pot_2:0.01,-0.02;plate_1:0,0.03."""
+    return ";".join(f"{name}:{dx:.6g},{dy:.6g}" for name, (dx, dy) in moves.items())
 
 
 def _centre(thing: str, scene: Bddl) -> tuple[float, float] | None:

@@ -1,0 +1,165 @@
+"""The pose axis's component ``scene``: every object and fixture moves, each its own way, as LIBERO-Plus moves them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from pipeline.axes.base import Frozen, Level, PhysicsPerturbation, on_task
+from pipeline.libero import bddl
+from pipeline.libero.relations import relation_holds
+from pipeline.types import Demo, Floats, RollOut, Scene, Task
+
+if TYPE_CHECKING:
+    from pipeline.testset.benchmark import TestSet
+
+STEP_M = {"libero_spatial": 0.01, "libero_object": 0.03, "libero_goal": 0.02, "libero_10": 0.01}
+WIDER_M = {"LIVING_ROOM_SCENE1": 0.02}
+"""Radius of LIBERO-Plus's disks at level 1, by suite, and by the scene that differs; at level k it is k times that."""
+
+BASE_M = {"akita_black_bowl_1": (0.35, 0.05), "cream_cheese_1": (0.15, 0.10), "wine_bottle_1": (0.0, 0.05)}
+"""How far LIBERO-Plus puts things of the goal suite from LIBERO's own places before its disks apply."""
+
+ROBOT_X_M = {"tabletop": -0.66, "kitchen": -0.66, "study": -0.55, "living_room": -0.51, "floor": -0.6}
+"""Where the robot's base stands, by arena, in the frame of the working surface."""
+
+REACH_M = 0.75
+"""How far from its base the hand can grasp and lift; pointing down, it stops at 0.77 m in the air, 0.82 m below."""
+
+APART, CLOSE_M = 0.75, 0.15
+"""Share of the distance in LIBERO's file that the centres of two objects' regions keep at least, up to ``CLOSE_M``."""
+
+FIXTURE_APART, FIXTURE_CLOSE_M = 0.9, 0.25
+"""The same where one of the two is a fixture, which is larger."""
+
+DRAWS = 200
+"""How often a scene is drawn to keep its relations, before it is left to be refused."""
+
+
+Shifts = dict[str, tuple[float, float]]
+"""Thing to its displacement (dx, dy) in m."""
+
+
+class Move(Frozen):
+    """Displacement of one thing along the world's axes from where the demonstration has it."""
+
+    name: str
+    dx_m: float
+    dy_m: float
+
+
+class ScenePerturbation(PhysicsPerturbation):
+    """Every object and fixture moved in the horizontal plane.
+
+    Attributes:
+        moves: of each thing by its name in the BDDL file. What stands on or in another thing has that one's move.
+    """
+
+    axis: Literal["pose"] = "pose"
+    component: Literal["scene"] = "scene"
+    moves: Annotated[tuple[Move, ...], Field(min_length=1)]
+
+    # A test scene is one stored state. LIBERO's reset made it by putting each thing anywhere in a square around the
+    # middle of its moved region. The side is 2 cm in the spatial and goal suites and 5 cm in most of the others. From
+    # 1 cm on, at least one thing is outside of the 2 cm around its place there: the reset's own scatter of all things
+    # does not make the two scenes one. 5 cm cannot be asked for: at level 1 of the long suite the disks are smaller.
+    clearance: ClassVar[float] = 0.01
+    measure: ClassVar[str] = "m: the largest difference along an axis between the displacements of the same thing"
+
+    def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
+        """The scene with everything moved; heights, rotations, velocities and joints stay as they are.
+
+        Raises:
+            RefusedError: see ``pipeline.scenes.moving.move``.
+        """
+        from pipeline.scenes.moving import move
+
+        return move(scene, demo.task, {one.name: (one.dx_m, one.dy_m) for one in self.moves})
+
+    def distances(self, test: TestSet, task: Task) -> Floats:
+        """Compared with the test scenes of the same task, in all things that both move."""
+        own = {one.name: (one.dx_m, one.dy_m) for one in self.moves}
+        distances_m = np.full(len(test.of("pose")), np.nan)
+        for place, tested in _test_scenes(test, task):
+            both = own.keys() & tested.keys()
+            if both:
+                distances_m[place] = max(float(np.abs(np.subtract(own[name], tested[name])).max()) for name in both)
+        return distances_m
+
+
+@cache
+def _test_scenes(test: TestSet, task: Task) -> list[tuple[int, Shifts]]:
+    """Place of each test scene of ``task`` among the axis's test tasks, and how far it moves each thing."""
+    tested = zip(on_task(test, task, "pose").tolist(), test.on(task, "pose"), strict=True)
+    return [(place, displacements(scene.parameters)) for place, scene in tested]
+
+
+def displacements(parameters: Mapping[str, object]) -> Shifts:
+    """How far one of the axis's test tasks moves each object and fixture."""
+    # Such as plate_1:0.01,-0.02;flat_stove_1:0,0.03.
+    listed = re.findall(r"([^;:]+):([^,]+),([^;]+)", str(parameters.get("moves", "")))
+    return {name: (float(dx_m), float(dy_m)) for name, dx_m, dy_m in listed}
+
+
+def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePerturbation:
+    """Moves uniform over the disks of a level, drawn anew where the task's file says that they break the scene.
+
+    The file gives the middle of each thing's region: there the relation that the instruction names must still hold,
+    what the hand has to grasp must be within its reach, and no two things may come much closer than they were. In the
+    goal suite, things are first put where LIBERO-Plus puts them, but for what the hand could not grasp there: the bowl.
+    """
+    known = bddl.read(task.bddl_file)
+    carriers = known.carriers
+    radius_m = level * next((m for name, m in WIDER_M.items() if task.name.startswith(name)), STEP_M[task.suite])
+    base_m = {
+        name: shift
+        for name, shift in BASE_M.items()
+        if task.suite == "libero_goal" and _within_reach(task, name, np.add(known.regions[known.places[name]], shift))
+    }
+    for _ in range(DRAWS):
+        own = {}
+        for carrier in dict.fromkeys(carriers.values()):
+            reach_m, bearing_rad = radius_m * math.sqrt(rng.uniform()), rng.uniform(-math.pi, math.pi)
+            offset_m = [reach_m * math.cos(bearing_rad), reach_m * math.sin(bearing_rad)]
+            own[carrier] = np.round(np.add(base_m.get(carrier, (0.0, 0.0)), offset_m), 4)
+        xy_m = {thing: known.regions[known.places[carriers[thing]]] + own[carriers[thing]] for thing in carriers}
+        if _fits(task, xy_m):
+            break
+    moves = tuple(
+        Move(name=thing, dx_m=float(own[carrier][0]), dy_m=float(own[carrier][1]))
+        for thing, carrier in carriers.items()
+    )
+    return ScenePerturbation(level=level, moves=moves)
+
+
+def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
+    """Whether things at ``xy_m`` (2,), in the frame of their surface, keep the task's relations and their distance."""
+    known = bddl.read(task.bddl_file)
+    alone = [thing for thing, carrier in known.carriers.items() if thing == carrier]
+    for index, one in enumerate(alone):
+        for other in alone[:index]:
+            apart_m = math.dist(known.regions[known.places[one]], known.regions[known.places[other]])
+            objects = {one, other} <= known.objects.keys()
+            least_m = min(CLOSE_M, APART * apart_m) if objects else min(FIXTURE_CLOSE_M, FIXTURE_APART * apart_m)
+            if math.dist(xy_m[one], xy_m[other]) < least_m:
+                return False
+    return all(_within_reach(task, thing, place_m) for thing, place_m in xy_m.items()) and all(
+        relation_holds(task, target, xy_m.__getitem__) for target in known.targets
+    )
+
+
+def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
+    """Whether an object can be grasped there, if the task needs it."""
+    known = bddl.read(task.bddl_file)
+    if thing not in known.objects or thing not in known.of_interest:
+        return True
+    # Such as libero_kitchen_tabletop_manipulation; the plain tabletop is called libero_tabletop_manipulation.
+    robot_m = next((x_m, 0.0) for arena, x_m in ROBOT_X_M.items() if known.problem.startswith(f"libero_{arena}_"))
+    was_m = known.regions[known.places[known.carriers[thing]]]
+    return math.dist(place_m, robot_m) <= max(REACH_M, math.dist(was_m, robot_m))
