@@ -120,7 +120,7 @@ def tiny_config(demos: Path) -> dict[str, object]:
         "replay": {"mode": "open_loop"},
         "render": {"jpeg_quality": 95},
         "export": {"rlds": {"name": "libero_tiny", "shards": 2}, "lerobot": {"name": "tiny", "parts": 2}},
-        "compute": {"cluster": "local", "workers": 2},
+        "compute": {"cluster": "loop"},
     }
 
 

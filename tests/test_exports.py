@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_writers import IDS, episode, episodes, files, loop
+from synthetic import IDS, episode, episodes, files, loop
 
 from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.base import Format

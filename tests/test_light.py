@@ -14,14 +14,23 @@ from pipeline.axes.base import Level
 from pipeline.axes.light import Component, LightAxis, LightPerturbation, exposure
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
+from pipeline.types import Frame, Task
 
 COMPONENTS: tuple[Component, ...] = get_args(Component)
 NEUTRAL = LightPerturbation(component="combined", level=1)
 
 
-def drawn(component: Component, level: Level, key: str | int) -> LightPerturbation:
+NOTICED_LEVELS, NOTICED_SHARE = 8, 0.05
+"""A change is noticed where this share of the pixels differs by so many grey levels in a channel."""
+
+
+def drawn(component: Component, level: Level, key: str | int, task: Task = MILK) -> LightPerturbation:
     axis = LightAxis(components=(component,), levels=(level,))
-    return axis.sample(rng("light", component, level, key), MILK, 0)
+    return axis.sample(rng("light", component, level, key), task, 0)
+
+
+def share_changed(before: Frame, after: Frame) -> float:
+    return float((np.abs(before.astype(int) - after).max(axis=2) >= NOTICED_LEVELS).mean())
 
 
 def test_draws_are_keyed_recorded_and_touch_their_property_alone() -> None:
@@ -67,6 +76,11 @@ def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
         assert changed(before, checksums(shown)) == set()
         restored = frames(shown)
         assert all(np.array_equal(clean[view], restored[view]) for view in clean)
+
+        for component in COMPONENTS:
+            with shown.perturbed([drawn(component, 1, arena, TASKS[arena])]):
+                weakest = frames(shown, ["agentview"])["agentview"]
+            assert share_changed(clean["agentview"], weakest) >= NOTICED_SHARE, component
 
         # The corners of the ranges: as little light as there can be, and as much.
         assert [exposure(frame) for frame in clean.values()] == [None, None]

@@ -20,7 +20,7 @@ import pytest
 from conftest import REPOSITORY as REPOSITORY_FOLDER
 from conftest import served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
-from test_writers import SET, write_lerobot, write_rlds
+from synthetic import SET, write_lerobot, write_rlds
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig

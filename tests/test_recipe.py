@@ -20,7 +20,7 @@ import pytest
 import torch
 import yaml
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from test_writers import REPO, write_lerobot
+from synthetic import REPO, write_lerobot
 
 from pipeline.errors import PipelineError
 from pipeline.publish.recipe import build, check, write

@@ -12,7 +12,7 @@ import pytest
 import tensorflow_datasets as tfds
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from test_writers import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
+from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, RldsConfig

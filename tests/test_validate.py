@@ -218,7 +218,7 @@ def test_planted_faults_stop_the_run_and_nothing_else_is_found(
     killed = data / ".work" / "validate" / "of a killed run"
     killed.mkdir(parents=True)
     with pytest.raises(AssertionError, match=r"(?s)findings in all: counts 1, .*try: read data/tiny/validation\.json"):
-        run_stages(tmp_path, tiny_config(short_demos) | {"compute": {"cluster": "loop"}}, ["validate"])
+        run_stages(tmp_path, tiny_config(short_demos), ["validate"])
     report = json.loads((data / "validation.json").read_text())
     found = {
         (check, finding["dataset"], names.get(finding["episode"]))

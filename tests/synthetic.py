@@ -1,0 +1,139 @@
+"""Six small episodes that no simulator made, and both formats written from them.
+
+Nothing heavy is imported here: a process that is killed on purpose must start soon.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import google_crc32c
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline import seeding
+from pipeline.episode_schema import SCHEMA
+from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.formats.base import Episodes
+from pipeline.formats.export import export
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.rlds import Rlds
+from pipeline.types import Episode, Extra, Geometry
+
+IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]
+NAME = "synthetic"
+SET = f"{NAME}_spatial"
+REPO = NAME
+
+MATRICES = {"intrinsics": (3, 3), "extrinsics": (4, 4)}
+EXTRAS: tuple[Extra, ...] = ("depth", "segmentation", "object_poses")
+
+Tree = dict[str, bytes]
+
+
+@cache
+def episode(episode_id: str) -> Episode:
+    """12 to 20 steps of a disc crossing a soft background."""
+    rng = seeding.rng("test_writers", episode_id)
+    steps = int(rng.integers(12, 21))
+    noise = rng.integers(0, 256, (256, 256, 3), np.uint8)
+    background = cv2.convertScaleAbs(cv2.GaussianBlur(noise, (0, 0), 12), alpha=6, beta=-640)
+
+    def frame(t: int, gray: int) -> bytes:
+        canvas = background.copy()
+        cv2.circle(canvas, (40 + 8 * t, 120 + 3 * t), 24, (gray, 120, 90), -1, cv2.LINE_AA)
+        return cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+    def matrix(size: int) -> NDArray[np.float32]:
+        return rng.normal(size=(size, size)).astype(np.float32)
+
+    action = rng.uniform(-1, 1, (steps, 7)).astype(np.float32)
+    action[:, 6] = np.where(np.arange(steps) < 6, -1, 1)
+    return Episode(
+        episode_id=episode_id,
+        frames={
+            "image": [frame(t, 60) for t in range(steps)],
+            "wrist_image": [frame(t, 170) for t in range(steps)],
+        },
+        state=rng.normal(size=(steps, 8)).astype(np.float32),
+        joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
+        action=action,
+        instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
+        provenance={column: f"{column} of {episode_id}" for column in SCHEMA.provenance} | {"episode_id": episode_id},
+        geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
+    )
+
+
+@cache
+def with_extras(episode_id: str) -> Episode:
+    """The same episode with depth, segmentation and poses."""
+    source, rng = episode(episode_id), seeding.rng("test_writers", "extras", episode_id)
+    steps = len(source)
+
+    def maps() -> dict[Extra, list[bytes]]:
+        ramp = np.add.outer(np.arange(256), np.arange(256)) + rng.integers(65000, size=(steps, 1, 1))
+        small = (ramp // 64 % 24).astype(np.uint8)
+        return {
+            "depth": [cv2.imencode(".png", each.astype(np.uint16))[1].tobytes() for each in ramp],
+            "segmentation": [cv2.imencode(".png", each)[1].tobytes() for each in small],
+        }
+
+    return replace(
+        source,
+        geometry={view: replace(seen, maps=maps()) for view, seen in source.geometry.items()},
+        object_poses=rng.normal(size=(steps, 24, 7)).astype(np.float32),
+        instances=("nothing", "robot", episode_id),
+    )
+
+
+def loop(fn: Callable[[Any], Any], items: Sequence[Any], description: str) -> list[Any]:
+    return [fn(item) for item in items]
+
+
+def files(folder: Path) -> Tree:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -> Episodes:
+    return Episodes(IDS, load, dict.fromkeys(IDS, "libero_spatial"), dict.fromkeys(IDS, content))
+
+
+def write_rlds(
+    out: Path, load: Callable[[str], Episode] = episode, run: Any = loop, extras: Sequence[Extra] = ()
+) -> Rlds:
+    target = Rlds(out, RldsConfig(name=NAME, shards=3), extras)
+    export(target, episodes(load), run)
+    return target
+
+
+def write_lerobot(
+    out: Path,
+    load: Callable[[str], Episode] = episode,
+    run: Any = loop,
+    frames: Any = "video",
+    name: str = NAME,
+    extras: Sequence[Extra] = (),
+) -> LeRobot:
+    target = LeRobot(out, LeRobotConfig(name=name, parts=3, frames=frames), extras)
+    export(target, episodes(load), run)
+    return target
+
+
+def records(shard: Path) -> Iterator[bytes]:
+    """The records of a TFRecord file, checksums verified independently of the writer."""
+    data, start = shard.read_bytes(), 0
+    while start < len(data):
+        (length,) = struct.unpack_from("<Q", data, start)
+        end = start + 12 + length
+        for begin, stop in ((start, start + 8), (start + 12, end)):
+            crc = google_crc32c.value(data[begin:stop])
+            rotated = ((crc >> 15) | (crc << 17 & 0xFFFFFFFF)) + 0xA282EAD8
+            assert struct.unpack_from("<I", data, stop)[0] == rotated % 2**32
+        yield data[start + 12 : end]
+        start = end + 4
