@@ -64,7 +64,8 @@ install_venv() {
     index=${PIP_INDEX_URL:-$(.venv/bin/pip config get global.index-url 2>/dev/null || true)}
     if [[ -n $index ]]; then export UV_DEFAULT_INDEX=${UV_DEFAULT_INDEX:-$index}; fi
     export VIRTUAL_ENV=$PWD/.venv
-    .venv/bin/uv pip sync --require-hashes requirements.lock
+    # Compiled once: where PYTHONDONTWRITEBYTECODE is set, each process would compile torch and the others again.
+    .venv/bin/uv pip sync --compile-bytecode --require-hashes requirements.lock
     # The lock holds the build back end, so the package itself needs no network.
     .venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable .
 }
@@ -95,6 +96,8 @@ quick | test)
     ruff check
     ruff format --check
     mypy
-    if [[ $VERB == quick ]]; then pytest -m "not slow"; else pytest; fi
+    # Two processes, a module at a time; the longest first, as tests/conftest.py orders them.
+    together=(-n 2 --dist loadfile --no-loadscope-reorder)
+    if [[ $VERB == quick ]]; then pytest "${together[@]}" -m "not slow"; else pytest "${together[@]}"; fi
     ;;
 esac

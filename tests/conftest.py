@@ -9,14 +9,16 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 import yaml
+from filelock import FileLock
 
 from pipeline.config import ReplayConfig
 from pipeline.libero import hdf5
@@ -24,6 +26,7 @@ from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import fetch_testset
 from pipeline.types import Demo, Task, Trajectory
@@ -47,10 +50,15 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 """Whoever asks for one of these, or for what is made from it, is no quick test: see ``-m "not slow"``."""
 
 
+LONG = ("test_dependencies", "test_run", "test_exports", "test_cluster", "test_writers", "test_validate", "test_render")
+"""Modules that take longest: they come first, so that of several processes none is left alone with one at the end."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if isinstance(item, pytest.Function) and SLOW_FIXTURES.intersection(item.fixturenames):
             item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -67,22 +75,50 @@ def starter_demo(task: Task) -> Demo:
     return source.load(source.index([task]).entries[0].demo_id)
 
 
+Once = Callable[[str, Callable[[Path], None]], Path]
+"""``once(name, make)``: a folder that ``make`` fills; of all processes of a test run the first makes it."""
+
+
 @pytest.fixture(scope="session")
-def whole() -> dict[Task, Trajectory]:
+def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
+    own = tmp_path_factory.getbasetemp()
+    shared_by_all = own if worker_id == "master" else own.parent
+
+    def made_once(name: str, make: Callable[[Path], None]) -> Path:
+        folder, complete = shared_by_all / name, shared_by_all / f"{name}.complete"
+        with FileLock(shared_by_all / f"{name}.lock"):
+            if not complete.exists():
+                folder.mkdir()
+                make(folder)
+                complete.touch()
+        return folder
+
+    return made_once
+
+
+@pytest.fixture(scope="session")
+def whole(once: Once) -> dict[Task, Trajectory]:
     """The three demonstrations replayed from start to end."""
-    replayed = {}
+    store = TrajectoryStore(once("whole", _replay_whole))
+    return {task: store.load(task.name) for task in SHORT}
+
+
+def _replay_whole(folder: Path) -> None:
     for task in SHORT:
         environment = Environment(task)
-        replayed[task] = replay(environment, starter_demo(task), "whole", ReplayConfig())
-        assert replayed[task].verdict.kept, f"{task.name}: {replayed[task].verdict.reason}"
+        trajectory = replay(environment, starter_demo(task), task.name, ReplayConfig())
+        assert trajectory.verdict.kept, f"{task.name}: {trajectory.verdict.reason}"
+        TrajectoryStore(folder).save(trajectory)
         environment.close()
-    return replayed
 
 
 @pytest.fixture(scope="session")
-def short_demos(whole: dict[Task, Trajectory], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def short_demos(whole: dict[Task, Trajectory], once: Once) -> Path:
     """A root of HDF5 demonstrations: one of each task that succeeds, and one of the milk that only waits."""
-    root = tmp_path_factory.mktemp("demos")
+    return once("demos", partial(_write_short_demos, whole))
+
+
+def _write_short_demos(whole: dict[Task, Trajectory], root: Path) -> None:
     for task, steps in SHORT.items():
         trajectory = whole[task]
         states = trajectory.states[-steps - 1 : -1]
@@ -99,7 +135,6 @@ def short_demos(whole: dict[Task, Trajectory], tmp_path_factory: pytest.TempPath
             waiting[:, :6], waiting[:, 6] = 0.05, 1.0
             recordings.append(replace(good, actions=waiting))
         hdf5.write(root / task.suite / f"{task.name}_demo.hdf5", task, recordings)
-    return root
 
 
 def tiny_config(demos: Path) -> dict[str, object]:
@@ -168,9 +203,15 @@ def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = 
 
 
 @pytest.fixture(scope="session")
-def finished(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The data folder of a finished ``dvc repro`` in a copy of the repository, on a configuration of its own."""
-    clone = tmp_path_factory.mktemp("clone")
+def finished(short_demos: Path, once: Once) -> Path:
+    """The data folder of a finished ``dvc repro`` in a copy of the repository, on a configuration of its own.
+
+    Tests share it and leave it as it is.
+    """
+    return once("clone", partial(_run_in_clone, short_demos)) / "data" / "tiny"
+
+
+def _run_in_clone(short_demos: Path, clone: Path) -> None:
     for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml", "requirements.lock", ".dvcignore"):
         source = REPOSITORY / name
         (shutil.copytree if source.is_dir() else shutil.copy)(source, clone / name)
@@ -182,7 +223,6 @@ def finished(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
     subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
     done = dvc(clone, "repro")
     assert done.returncode == 0, done.stdout + done.stderr
-    return clone / "data" / "tiny"
 
 
 def dvc(clone: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
