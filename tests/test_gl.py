@@ -82,7 +82,7 @@ def test_egl_and_osmesa_draw_the_same_scene(tmp_path: Path, record_property: Cal
         software.append(done.stdout.strip() == "True")
     egl, osmesa = frames
     difference = np.abs(egl - osmesa)
-    record_property("mean_grey_levels", difference.mean())
+    record_property("mean_grey_levels", float(difference.mean()))
     assert egl.shape == osmesa.shape == (256, 256, 3)
     assert egl.std() > 10
     # The same rasteriser behind both leaves no room for a difference; a GPU rounds in its own way.
