@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.roll_out import roll_out
 from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.renderer import Renderer
+from pipeline.testset.benchmark import TestTask
 from pipeline.types import Demo, Floats, Frame, Scene, Task
 
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
@@ -53,6 +54,21 @@ class Settings(Frozen):
     seed: int = 0
     fixture_seed: int = 0
     initial_states: Literal["libero", "demonstration"] = "libero"
+
+
+class Wanted(NamedTuple):
+    """What a policy asks to see.
+
+    Attributes:
+        wrist: the wrist's view beside the agent view.
+        state: position, axis-angle and fingers.
+        shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
+            robosuite and OpenVLA's data have it.
+    """
+
+    wrist: bool = True
+    state: bool = True
+    shortest_rotation: bool = False
 
 
 @dataclass(frozen=True)
@@ -164,14 +180,19 @@ class EpisodeEnvironment:
             self._seen[view] = self._render(view)
         return self._seen[view]
 
-    def observation(self, wrist: bool = True, state: bool = True) -> dict[str, Any]:
+    def observation(self, wanted: Wanted) -> dict[str, Any]:
         """What a policy sees, as vla-eval names it: ``images``, ``states`` (8,) and ``task_description``."""
-        views = VIEWS if wrist else ("agentview",)
+        views = VIEWS if wanted.wrist else ("agentview",)
         seen: dict[str, Any] = {
             "images": {view: self.image(view) for view in views},
             "task_description": self.instruction,
         }
-        return {**seen, "states": self.observed.state} if state else seen
+        if wanted.state:
+            seen["states"] = self.observed.state.copy()
+            angle_rad = float(np.linalg.norm(seen["states"][3:6]))
+            if wanted.shortest_rotation and angle_rad > np.pi:
+                seen["states"][3:6] *= (angle_rad - 2 * np.pi) / angle_rad
+        return seen
 
     def close(self) -> None:
         self._close_renderer()
@@ -240,7 +261,7 @@ class EpisodeEnvironment:
             return None
 
     @property
-    def _test(self) -> libero_plus.TestTask:
+    def _test(self) -> TestTask:
         tests = libero_plus.by_name()
         key = (self.task.suite, self.task.name)
         if key not in tests:
@@ -280,9 +301,7 @@ class EpisodeEnvironment:
             self._changes.enter_context(self._renderer.perturbed(looks))
             self._looks_changed = True
         observed, model = self.observed, self._renderer.model
-        self._renderer.restore(
-            np.concatenate([[0.0], observed.qpos, np.zeros(model.nv)]), observed.site_alpha
-        )
+        self._renderer.restore(np.concatenate([[0.0], observed.qpos, np.zeros(model.nv)]), observed.site_alpha)
         frame = self._renderer.frame(VIEWS[view])
         for noise in of_layer(self._perturbations, PixelPerturbation):
             if view == "agentview":

@@ -66,7 +66,7 @@ def pickled_array(packed: bytes, where: str) -> Floats:
         place = operations.index(("GLOBAL", "numpy dtype"))
         closing = max(index for index in range(place) if operations[index][0].startswith("TUPLE"))
         length = int(operations[closing][0].removeprefix("TUPLE"))
-        shape = [int(value) for _, value in operations[closing - length : closing]]
+        shape = [int(str(value)) for _, value in operations[closing - length : closing]]
         return np.array(numbers.reshape(shape), np.float64)
     except (zipfile.BadZipFile, ValueError, KeyError) as error:
         raise PipelineError(f"not a pickled array of float64 ({error})", where=where) from error

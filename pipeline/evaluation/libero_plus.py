@@ -56,11 +56,11 @@ class TestCamera(CameraPerturbation):
     def apply(self, model: mujoco.MjModel) -> None:
         """Move the model's agent view; nothing else in the model changes."""
         camera = model.camera("agentview")
-        pose = camera.pos.copy(), camera.quat.copy()
+        pos_m, quat_wxyz = camera.pos.copy(), camera.quat.copy()
         # In the benchmark's order; each step leaves the other parameters neutral.
         for changed in self._steps():
-            pose = tuple(_rounded(part) for part in changed.pose(*pose))
-        camera.pos[:], camera.quat[:] = pose[0], pose[1] / np.linalg.norm(pose[1])
+            pos_m, quat_wxyz = map(_rounded, changed.pose(pos_m, quat_wxyz))
+        camera.pos[:], camera.quat[:] = pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)
 
     def _steps(self) -> list[CameraPerturbation]:
         def step(**parameters: float) -> CameraPerturbation:

@@ -6,12 +6,14 @@ import fnmatch
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from functools import cache
+from itertools import zip_longest
 from typing import Literal
 
 from pydantic import Field
 
 from pipeline import seeding
-from pipeline.axes import AnyPerturbation, Axes
+from pipeline.axes import AnyAxis, AnyPerturbation, Axes
 from pipeline.axes.base import Frozen, Level
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
@@ -91,20 +93,24 @@ def select(selection: Selection) -> list[EvaluationTask]:
 
 
 def balanced(wanted: Iterable[EvaluationTask], count: int, seed: int) -> list[EvaluationTask]:
-    """At most ``count`` tasks, one of each suite, axis, component and level in turn.
+    """At most ``count`` tasks: axes in turn, of each axis its components in turn, then levels, then suites.
 
     A larger subset under the same seed holds the smaller one.
     """
-    groups: dict[tuple[object, ...], list[EvaluationTask]] = defaultdict(list)
+    return sorted(_in_turn(list(wanted), ("axis", "component", "level", "suite"), seed)[:count])
+
+
+def _in_turn(wanted: list[EvaluationTask], columns: tuple[str, ...], seed: int) -> list[EvaluationTask]:
+    """All tasks, one of each value of the first column after the other, of each value by the columns that follow."""
+    if not columns:
+        return sorted(wanted, key=lambda task: seeding.digest("subset", seed, str(task)))
+    column, *rest = columns
+    groups: dict[object, list[EvaluationTask]] = defaultdict(list)
     for task in wanted:
-        groups[task.axis, task.component, task.level, task.suite].append(task)
-
-    def shuffled(task: EvaluationTask) -> str:
-        return seeding.digest("subset", seed, str(task))
-
-    rows = [sorted(group, key=shuffled) for group in groups.values()]
-    turns = [(turn, seeding.digest("turn", seed, turn, str(task)), task) for row in rows for turn, task in enumerate(row)]
-    return sorted(task for _, _, task in sorted(turns)[:count])
+        groups[getattr(task, column)].append(task)
+    names = sorted(groups, key=lambda name: seeding.digest("turn", seed, column, name, str(min(groups[name]))))
+    rows = [_in_turn(groups[name], tuple(rest), seed) for name in names]
+    return [task for turn in zip_longest(*rows) for task in turn if task is not None]
 
 
 def draw(task: EvaluationTask, seed: int, attempt: int = 0) -> AnyPerturbation:
@@ -115,21 +121,24 @@ def draw(task: EvaluationTask, seed: int, attempt: int = 0) -> AnyPerturbation:
     Args:
         attempt: counts the draws that a scene refused.
     """
-    kind = Axes.model_fields[task.axis].annotation
-    (axis_type,) = (member for member in kind.__args__ if member is not type(None))  # type: ignore[union-attr]
-    axis = axis_type(levels=(task.level,))
+    axis = _axis(task.axis).model_copy(update={"levels": (task.level,)})
     key = seeding.rng("evaluation", seed, task.axis, task.suite, task.base, task.level, task.number, attempt)
     drawn: AnyPerturbation = axis.sample(key, find_task(task.suite, task.base), task.number)
     return drawn
+
+
+@cache
+def _axis(name: str) -> AnyAxis:
+    """An axis with its default ranges."""
+    axis: AnyAxis = getattr(Axes.model_validate({name: {}}), name)
+    return axis
 
 
 def _listed(selection: Selection) -> Iterator[EvaluationTask]:
     if selection.source == "libero_plus":
         for test in benchmark.load().tasks:
             level = libero_plus.level_of(test)
-            yield EvaluationTask(
-                "libero_plus", test.suite, test.base, test.name, test.axis, test.component, level, 0
-            )
+            yield EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, level, 0)
         return
     for suite in selection.suites:
         for task in tasks(suite):
@@ -142,9 +151,7 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
                     for level in selection.levels or LEVELS:
                         name = f"{task.name}_{axis}_level{level}_draw{number}"
                         undrawn = EvaluationTask("own", suite, task.name, name, axis, "", level, number)
-                        kind = Axes.model_fields[axis].annotation
-                        (axis_type,) = (member for member in kind.__args__ if member is not type(None))  # type: ignore[union-attr]
-                        if axis_type().applies(task):
+                        if _axis(axis).applies(task):
                             component = draw(undrawn, selection.seed).component
                             yield EvaluationTask("own", suite, task.name, name, axis, component, level, number)
 
@@ -183,7 +190,7 @@ def _without_archive(wanted: list[EvaluationTask], selection: Selection) -> list
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
     if missing and (selection.axes or selection.tasks):
         raise PipelineError(
-            f"needs the asset archive of LIBERO-Plus, which this project cannot fetch ({counts} of {len(wanted)} tasks)",
+            f"{counts} of {len(wanted)} tasks need the asset archive of LIBERO-Plus, which this project cannot fetch",
             where="axes",
             expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}",
             remedy=f"--axis {' '.join(libero_plus.RUNNABLE)}, or held-out draws of the same axes with --source own",

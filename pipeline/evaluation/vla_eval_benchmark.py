@@ -20,11 +20,11 @@ from vla_eval.specs import (
 )
 
 from pipeline import gl
-from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment, Settings
+from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment, Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 
 
-class PerturbedLibero(StepBenchmark):
+class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     """LIBERO's tasks, LIBERO-Plus's test tasks, or held-out draws, as a ``Selection`` chooses them.
 
     ``episodes_per_task`` of the harness stays 1: each initial state and each draw is a task of its own here, and
@@ -67,7 +67,7 @@ class PerturbedLibero(StepBenchmark):
         fixtures = {} if env_seed is None else {"fixture_seed": env_seed}
         self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}))
         self._look_every = max(1, look_every)
-        self._wrist, self._state, self._robosuite_rotation = send_wrist_image, send_state, quat_no_antipodal
+        self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
@@ -113,9 +113,9 @@ class PerturbedLibero(StepBenchmark):
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         spec = {"agentview": IMAGE_RGB, "language": LANGUAGE}
-        if self._wrist:
+        if self._wanted.wrist:
             spec["wrist"] = IMAGE_RGB
-        if self._state:
+        if self._wanted.state:
             spec["state"] = STATE_EEF_POS_AA_GRIP
         return spec
 
@@ -123,12 +123,5 @@ class PerturbedLibero(StepBenchmark):
         self._environment.close()
 
     def _look(self) -> dict[str, Any]:
-        self._last = self._environment.observation(self._wrist, self._state)
-        if self._state and not self._robosuite_rotation:
-            # vla-eval's own rotation has the angle in [0, pi]; robosuite's, which OpenVLA's data has, in [0, 2 pi].
-            state = self._last["states"].copy()
-            angle_rad = float(np.linalg.norm(state[3:6]))
-            if angle_rad > np.pi:
-                state[3:6] *= (angle_rad - 2 * np.pi) / angle_rad
-            self._last["states"] = state
+        self._last = self._environment.observation(self._wanted)
         return self._last
