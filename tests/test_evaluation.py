@@ -117,7 +117,7 @@ def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: E
     task = some_test_task("robot", "initial_joints")
     evaluated.reset(task)
     drift_rad = np.linalg.norm(evaluated.observed.joint_state - clean)
-    # LIBERO_PLUS's postures are 0.1 to 0.5 rad away; ten settling steps reach some of it.
+    # The benchmark's postures are 0.1 to 0.5 rad away; ten settling steps reach some of it.
     assert 0.01 < drift_rad < 0.6
     # By LIBERO's own code, with the posture in place of its own.
     env = OffScreenRenderEnv(bddl_file_name=str(STOVE.bddl_file), camera_heights=16, camera_widths=16)
@@ -194,12 +194,12 @@ def replay_server(chunk: int) -> Iterator[str]:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    arguments = ["--address", f"127.0.0.1:{port}", "--chunk", str(chunk)]
+    arguments = ["--address", f"127.0.0.1:{port}", "--args.chunk", str(chunk)]
     server = subprocess.Popen(
         [sys.executable, "-m", "pipeline.evaluation.replay_server", *arguments], cwd=REPOSITORY, env=os.environ
     )
     try:
-        for _ in range(600):
+        while server.poll() is None:
             try:
                 socket.create_connection(("127.0.0.1", port)).close()
                 break
@@ -213,7 +213,6 @@ def replay_server(chunk: int) -> Iterator[str]:
 
 @pytest.mark.slow
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
-    pytest.importorskip("vla_eval")
     with replay_server(chunk=8) as address:
         ours = tmp_path / "ours"
         subprocess.run(command(ours, "--server", address, "--workers", "1"), cwd=REPOSITORY, check=True)

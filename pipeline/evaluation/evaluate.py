@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 from collections import defaultdict
 from collections.abc import Sequence
@@ -55,8 +56,10 @@ class PolicyConfig(Frozen):
 
 @lru_cache(maxsize=1)
 def _environment(settings: Settings) -> EpisodeEnvironment:
-    """This process's environment."""
-    return EpisodeEnvironment(settings)
+    """This process's environment, closed when the process ends, while OpenGL is still there."""
+    environment = EpisodeEnvironment(settings)
+    atexit.register(environment.close)
+    return environment
 
 
 @lru_cache(maxsize=1)

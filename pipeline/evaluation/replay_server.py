@@ -1,6 +1,6 @@
 """A model server of vla-eval that replays LIBERO's demonstrations with its eyes closed: what evaluation must score.
 
-``python -m pipeline.evaluation.replay_server --address localhost:8000``
+``python -m pipeline.evaluation.replay_server --address localhost:8000 --args.chunk 8``
 """
 
 from __future__ import annotations
