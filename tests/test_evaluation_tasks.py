@@ -29,7 +29,7 @@ def test_libero_has_an_episode_for_each_task_and_initial_state() -> None:
 def test_test_tasks_that_need_no_archive_are_all_there(capsys: pytest.CaptureFixture[str]) -> None:
     tasks = select(Selection(source="libero_plus"))
     counts = Counter(task.axis for task in tasks)
-    assert counts == {"camera": 1599, "robot": 1550, "noise": 1601, "language": 1537, "pose": 696}
+    assert counts == {"camera": 1599, "robot": 1550, "noise": 1601, "language": 1537, "pose": 696, "background": 62}
     assert "light 1142" in capsys.readouterr().out
     with pytest.raises(PipelineError, match="asset archive"):
         select(Selection(source="libero_plus", axes=("light", "camera")))
@@ -58,8 +58,8 @@ def test_tasks_are_chosen_by_axis_component_level_suite_and_name() -> None:
 def test_a_subset_is_balanced_and_holds_the_smaller_ones() -> None:
     tasks = select(Selection(source="libero_plus"))
     chosen = balanced(tasks, 50, seed=0)
-    assert set(Counter(task.axis for task in chosen).values()) == {10}
-    assert set(Counter(task.component for task in chosen if task.axis == "noise").values()) == {2}
+    assert set(Counter(task.axis for task in chosen).values()) == {8, 9}
+    assert set(Counter(task.component for task in chosen if task.axis == "noise").values()) <= {1, 2}
     assert set(balanced(tasks, 20, seed=0)) < set(chosen)
     assert balanced(reversed(tasks), 50, seed=0) == chosen != balanced(tasks, 50, seed=1)
 

@@ -210,7 +210,10 @@ class EpisodeEnvironment:
     def _start_test_task(self) -> None:
         test = self._test
         posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
-        if test.axis == "pose":
+        if test.axis == "background":
+            self._build(self._base, test.name, libero_plus.images(test))
+            state = libero_states(self._base)[0]
+        elif test.axis == "pose":
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / f"{self._base.name}.bddl"
                 file.write_text(libero_plus.bddl_text(test))
@@ -266,7 +269,7 @@ class EpisodeEnvironment:
         key = (self.task.suite, self.task.name)
         if key not in tests:
             raise PipelineError(f"LIBERO-Plus has no test task {self.task.name!r}", where=self.task.suite)
-        if tests[key].axis not in libero_plus.RUNNABLE:
+        if not libero_plus.runnable(tests[key]):
             raise PipelineError(
                 f"changes the {tests[key].axis}, for which the asset archive of LIBERO-Plus is needed",
                 where=str(self.task),
@@ -274,12 +277,12 @@ class EpisodeEnvironment:
             )
         return tests[key]
 
-    def _build(self, task: Task, scene: str = "") -> None:
-        """Have the simulator of a task, or of a moved scene of it."""
+    def _build(self, task: Task, scene: str = "", images: Mapping[str, str] | None = None) -> None:
+        """Have the simulator of a task, or of another scene of it."""
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()
-            self._simulator, self._key = Simulator(task), key
+            self._simulator, self._key = Simulator(task, images), key
 
     def _show(self, model_xml: str | None = None) -> None:
         """Render from here on what the simulator has now.

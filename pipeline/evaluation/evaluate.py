@@ -181,7 +181,7 @@ def _jobs(missing: Sequence[EvaluationTask]) -> list[tuple[EvaluationTask, ...]]
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
-        moved = task.name if task.source == "libero_plus" and task.axis == "pose" else ""
+        moved = task.name if task.source == "libero_plus" and task.axis in ("pose", "background") else ""
         scenes[task.suite, task.base, moved].append(task)
     jobs = []
     for scene in scenes.values():

@@ -11,10 +11,12 @@ import math
 import re
 import zipfile
 from functools import cache
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import mujoco
 import numpy as np
+from libero.libero import get_libero_path
 
 from pipeline import seeding
 from pipeline.axes.base import Level
@@ -31,7 +33,10 @@ Prompt = Literal["clean", "benchmark"]
 task's file for its instruction ("turn on the stove view 0 0 100 2 352 initstate 0")."""
 
 RUNNABLE = ("camera", "robot", "noise", "language", "pose")
-"""The axes whose test tasks can be rebuilt without the benchmark's asset archive: 6,983 tasks."""
+"""The axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
+
+NOMINAL_WALL = "light-gray-plaster.png"
+"""The wall of the floor arena."""
 
 DECIMALS = 4
 """To which the benchmark rounds its camera after each turn."""
@@ -109,6 +114,26 @@ def level_of(test: TestTask) -> int:
         case _:
             return 0
     return min(max(math.ceil(round(strength, 6)), 1), 5)
+
+
+def runnable(test: TestTask) -> bool:
+    """Whether a test task can be rebuilt without the benchmark's asset archive."""
+    return test.axis in RUNNABLE or (test.axis == "background" and images(test) is not None)
+
+
+def images(test: TestTask) -> dict[str, str] | None:
+    """The floor's and the wall's image for a background task; None when one of them is not among LIBERO's.
+
+    Only in the floor arena, the object suite's, are floor and wall all that the benchmark changes.
+    """
+    chosen = {
+        "floor": str(test.parameters["surface"]),
+        "wall": str(test.parameters.get("wall", NOMINAL_WALL)),
+    }
+    textures = Path(get_libero_path("assets")) / "textures"
+    if test.parameters["arena"] != "floor" or not all((textures / image).is_file() for image in chosen.values()):
+        return None
+    return chosen
 
 
 def camera(test: TestTask) -> TestCamera:

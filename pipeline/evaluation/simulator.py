@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import mujoco
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RefusedError
-from pipeline.physics.environment import Environment, seeded
+from pipeline.physics.environment import Environment, control_env, seeded
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Floats, Scene, Task
@@ -80,10 +81,14 @@ class Simulator(Environment):
 
     The model is the one that LIBERO's own reset compiles, not one read back from MJCF, so that states and frames are
     those of an evaluation bit for bit. A reset takes 1.3 s; episodes with the same seed and posture share one.
+
+    Args:
+        task: the task to build.
+        images: of ``floor`` and ``wall``, by their names among LIBERO's textures; the arena's own by default.
     """
 
-    def __init__(self, task: Task):
-        super().__init__(task)
+    def __init__(self, task: Task, images: Mapping[str, str] | None = None):
+        super().__init__(task, None if images is None else _styles(images))
         self._rewind: _Rewind | None = None
 
     @property
@@ -178,6 +183,16 @@ class Simulator(Environment):
     def _observe(self, qpos: Floats) -> Observed:
         """Args: qpos: (nq,) that the data's geometry was computed from, one substep before the data's own."""
         return Observed(qpos, self.site_alpha, *proprioception(self._env.sim.data._data))
+
+
+def _styles(images: Mapping[str, str]) -> dict[str, str]:
+    """``scene_properties`` for images. LIBERO finds them by its own names for them, and has no name for some."""
+    control_env()  # which takes care of how it is imported
+    from libero.libero.envs.arenas.style import STYLE_MAPPING
+
+    for part, image in images.items():
+        STYLE_MAPPING[part][image] = image
+    return {f"{part}_style": image for part, image in images.items()}
 
 
 def _copied(attributes: dict[str, Any]) -> dict[str, Any]:

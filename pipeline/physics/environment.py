@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -91,9 +92,10 @@ class Environment:
 
     Args:
         task: the task to build.
+        scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
     """
 
-    def __init__(self, task: Task):
+    def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None):
         self.task = task
         with seeded(0):
             self._env = control_env()(
@@ -102,6 +104,7 @@ class Environment:
                 has_offscreen_renderer=False,
                 use_camera_obs=False,
                 ignore_done=True,
+                scene_properties=scene_properties,
             )
         self._control_step = ControlStep(self._env.env)
         self._openings = len(self._env.env.object_property_initializers)
