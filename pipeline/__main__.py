@@ -88,6 +88,37 @@ def _expand(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _evaluate(arguments: argparse.Namespace) -> int:
+    # The simulator takes seconds to import, which the other commands can do without.
+    from pipeline.evaluation.episode import Settings
+    from pipeline.evaluation.evaluate import PolicyConfig, evaluate
+    from pipeline.evaluation.tasks import Selection
+
+    selection = Selection(
+        source=arguments.source,
+        suites=tuple(arguments.suite),
+        axes=tuple(arguments.axis),
+        components=tuple(arguments.component),
+        levels=tuple(arguments.level),
+        tasks=tuple(arguments.task),
+        episodes=arguments.episodes,
+        subset=arguments.subset,
+        seed=arguments.seed,
+    )
+    settings = Settings(prompt=arguments.prompt, seed=arguments.seed, initial_states=arguments.initial_states)
+    policy = PolicyConfig(
+        kind="replay" if arguments.replay else "checkpoint" if arguments.checkpoint else "server",
+        address=str(arguments.checkpoint or arguments.server or ""),
+        label=arguments.label,
+        look_every=arguments.look_every,
+    )
+    compute = ComputeConfig(cluster="loop" if arguments.workers == 1 else "local", workers=arguments.workers)
+    with runner(compute, arguments.out) as run:
+        found = evaluate(selection, settings, policy, arguments.out, run)
+    print(json.dumps({"all": found["all"], "by_axis": found["by_axis"]}))
+    return 0
+
+
 def _check_oft(arguments: argparse.Namespace) -> int:
     # TFDS takes seconds to import, which the other commands can do without.
     from pipeline.validation import oft_check
@@ -242,6 +273,52 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
     command.set_defaults(run=_expand)
+
+    command = commands.add_parser(
+        "evaluate",
+        help="run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes",
+        description="Writes one file for each episode, and summary.json with success rates and their 95 % intervals. "
+        "Run again after a kill, it goes on. The policy is a model server of vla-eval (started by you), or a "
+        "checkpoint of lerobot on disk.",
+    )
+    command.add_argument("out", type=Path, metavar="DIR", help="folder of the results")
+    acting = command.add_mutually_exclusive_group(required=True)
+    acting.add_argument("--server", metavar="URL", help="address of a model server, such as ws://localhost:8000")
+    acting.add_argument("--checkpoint", type=Path, metavar="DIR", help="a policy that lerobot saved")
+    acting.add_argument("--replay", action="store_true", help="the demonstrations' own actions, as a check")
+    command.add_argument(
+        "--source", choices=("libero", "libero_plus", "own"), default="libero", help="of the tasks (default: libero)"
+    )
+    command.add_argument("--suite", nargs="+", default=benchmark.SUITES, metavar="SUITE", help="of these suites only")
+    command.add_argument("--axis", nargs="+", default=(), metavar="AXIS", help="of these axes only")
+    command.add_argument("--component", nargs="+", default=(), metavar="NAME", help="of these components only")
+    command.add_argument("--level", nargs="+", type=int, default=(), metavar="N", help="of these levels only")
+    command.add_argument(
+        "--task", nargs="+", default=(), metavar="PATTERN", help="named so, or perturbing one so named"
+    )
+    command.add_argument("--subset", type=_positive, metavar="N", help="so many, spread evenly over all of these")
+    command.add_argument(
+        "--episodes", type=_positive, default=1, metavar="N", help="initial states or draws of each task (default: 1)"
+    )
+    command.add_argument(
+        "--prompt",
+        choices=("clean", "benchmark"),
+        default="clean",
+        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name",
+    )
+    command.add_argument(
+        "--initial-states",
+        choices=("libero", "demonstration"),
+        default="libero",
+        help="LIBERO's own (default), or the first state of the starter set's demonstration",
+    )
+    command.add_argument("--seed", type=int, default=0, help="of the subset and of every draw (default: 0)")
+    command.add_argument("--label", default="", help="name of the policy in the results (default: its address)")
+    command.add_argument(
+        "--look-every", type=_positive, default=1, metavar="N", help="the server uses one observation in N (default: 1)"
+    )
+    command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one for each core)")
+    command.set_defaults(run=_evaluate)
 
     command = commands.add_parser(
         "check-oft",

@@ -13,6 +13,7 @@ FLOORS = (
     "__main__",
     "publish",
     "validation",
+    "evaluation",
     "formats",
     "physics",
     "rendering",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -44,7 +45,7 @@ class UnusableSceneError(PipelineError):
         self.reason = reason
 
 
-def _control_env() -> Any:
+def control_env() -> Any:
     """LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner."""
     logging.disable(logging.WARNING)
     try:
@@ -91,17 +92,19 @@ class Environment:
 
     Args:
         task: the task to build.
+        scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
     """
 
-    def __init__(self, task: Task):
+    def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None):
         self.task = task
-        with _seeded(0):
-            self._env = _control_env()(
+        with seeded(0):
+            self._env = control_env()(
                 bddl_file_name=str(task.bddl_file),
                 has_renderer=False,
                 has_offscreen_renderer=False,
                 use_camera_obs=False,
                 ignore_done=True,
+                scene_properties=scene_properties,
             )
         self._control_step = ControlStep(self._env.env)
         self._openings = len(self._env.env.object_property_initializers)
@@ -119,7 +122,7 @@ class Environment:
             # every one of them: without this, the second placement under a seed differs from the first.
             del self._env.env.object_property_initializers[self._openings :]
             self._scene = None
-            with _seeded(seed):
+            with seeded(seed):
                 self._env.reset()
             self._control_step = ControlStep(self._env.env)
             scene = ET.fromstring(self._env.sim.model.get_xml())
@@ -253,7 +256,7 @@ def shared(task: Task) -> Environment:
     return Environment(task)
 
 
-class _seeded:  # noqa: N801 - reads as a verb where it is used
+class seeded:  # noqa: N801 - reads as a verb where it is used
     """LIBERO's samplers draw from numpy's global generator: seed it for a moment, then put it back."""
 
     def __init__(self, seed: int):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import mujoco
@@ -55,6 +56,15 @@ class ControlStep:
         Args:
             action: (7,) OSC_POSE deltas and gripper; the controller clips the deltas to [-1, 1].
         """
+        for _ in self.substeps(action):
+            pass
+
+    def substeps(self, action: Floats) -> Iterator[None]:
+        """Take the step and stop after each substep.
+
+        Positions and velocities are then those after the substep, and what follows from them, such as where sites are,
+        is still that before it, as when robosuite observes.
+        """
         model, data, controller = self._model, self._data, self._controller
         for substep in range(self._substeps):
             mujoco.mj_forward(model, data)
@@ -67,6 +77,7 @@ class ControlStep:
             data.ctrl[self._arm_torque] = np.clip(controller.run_controller(), self._low, self._high)
             data.ctrl[self._fingers] = self._middle + self._half * self._gripper.format_action(action[6:])
             mujoco.mj_step2(model, data)
+            yield
         self._env._post_process()
 
     def _update(self) -> None:

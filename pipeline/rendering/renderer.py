@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -33,16 +34,16 @@ class Renderer:
     """Renders one scene through one GL context; close it before the next is made.
 
     Args:
-        model_xml: MJCF of the scene.
+        scene: its MJCF, or a compiled model, of which a copy is taken.
 
     Raises:
         PipelineError: when nothing renders on this machine.
     """
 
-    def __init__(self, model_xml: str):
+    def __init__(self, scene: str | mujoco.MjModel):
         gl.prepare()
         height, width, _ = SCHEMA.frame.shape
-        self.model = mujoco.MjModel.from_xml_string(model_xml)
+        self.model = mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else copy.copy(scene)
         self.data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()

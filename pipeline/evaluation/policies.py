@@ -1,0 +1,195 @@
+"""What acts: a policy behind a model server's address, or a lerobot checkpoint on disk."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.evaluation.episode import Wanted
+from pipeline.evaluation.simulator import DUMMY_ACTION
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
+from pipeline.types import Floats
+
+_VIEWS = {"image": "agentview", "wrist_image": "wrist"}
+"""View of ``schemas/episode.json`` to the name that policies see it by."""
+
+Look = Callable[[Wanted], dict[str, Any]]
+"""Gives the observation; frames are rendered when it is called."""
+
+
+class Policy(Protocol):
+    """Asked for actions until the episode is over."""
+
+    name: str
+
+    def begin(self, task: EvaluationTask) -> None:
+        """An episode begins."""
+        ...
+
+    def act(self, look: Look) -> Floats:
+        """(n, 7) the actions to take next, or (7,) for one; looks only when it has to."""
+        ...
+
+    def end(self, success: bool) -> None:
+        """It is over."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Server:
+    """A model server of vla-eval. It is asked at every step, or, where it answers with a chunk, once in a chunk.
+
+    Args:
+        address: such as ``ws://localhost:8000``.
+        timeout_s: how long an answer may take.
+        look_every: see ``PerturbedLibero``.
+    """
+
+    def __init__(self, address: str, timeout_s: float = 120.0, look_every: int = 1):
+        try:
+            from vla_eval.connection import Connection
+        except ImportError as error:
+            raise PipelineError(
+                "the package vla-eval is not installed", remedy="pip install 'pipeline[evaluation]', or vla-eval==0.8.0"
+            ) from error
+        self.name, self._address, self._look_every = address, address, look_every
+        self._loop = asyncio.new_event_loop()
+        self._connection = Connection(address, timeout=timeout_s, max_retries=3)
+        self._run(self._connection.connect(benchmark="PerturbedLibero"))
+        wanted = self._connection.server_info.get("observation_params") or {}
+        self._wanted = Wanted(
+            bool(wanted.get("send_wrist_image")),
+            bool(wanted.get("send_state")),
+            not wanted.get("quat_no_antipodal"),
+        )
+        self._asked = 0
+        self._seen: dict[str, Any] = {}
+
+    def begin(self, task: EvaluationTask) -> None:
+        self._asked = 0
+        self._run(self._connection.start_episode({"task": {**asdict(task), "name": str(task), "task_name": task.name}}))
+
+    def act(self, look: Look) -> Floats:
+        if self._asked % self._look_every == 0:
+            self._seen = look(self._wanted)
+        self._asked += 1
+        answer = self._run(self._connection.act(self._seen))
+        actions: Floats = np.asarray(answer.get("actions", answer.get("action")))
+        return actions
+
+    def end(self, success: bool) -> None:
+        self._run(self._connection.end_episode({"metrics": {"success": success}}))
+
+    def close(self) -> None:
+        self._run(self._connection.close())
+        self._loop.close()
+
+    def _run(self, awaited: Any) -> Any:
+        try:
+            return self._loop.run_until_complete(awaited)
+        except (OSError, RuntimeError, TimeoutError) as error:
+            raise PipelineError(
+                f"the model server does not answer as it should ({error})",
+                where=self._address,
+                remedy="check the server's log; run the same command again to go on where this stopped",
+            ) from error
+
+
+class Replay:
+    """The actions of the starter set's demonstration, open-loop, then nothing: scores what evaluation itself loses.
+
+    Args:
+        chunk: how many actions at a time.
+    """
+
+    name = "replay"
+
+    def __init__(self, chunk: int = 8):
+        self._chunk = chunk
+
+    def begin(self, task: EvaluationTask) -> None:
+        source = StarterSource()
+        entry = source.index([find_task(task.suite, task.base)]).entries[0]
+        self._actions, self._taken = source.load(entry.demo_id).actions, 0
+
+    def act(self, look: Look) -> Floats:
+        actions = self._actions[self._taken : self._taken + self._chunk]
+        self._taken += self._chunk
+        return actions if len(actions) else DUMMY_ACTION[None]
+
+    def end(self, success: bool) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Checkpoint:
+    """A policy that lerobot saved, run in this process.
+
+    It is asked for a chunk where it makes chunks, so that it looks once in ``n_action_steps``.
+
+    Args:
+        folder: with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
+    """
+
+    def __init__(self, folder: Path):
+        # lerobot and its models take seconds to import.
+        import torch
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        if not (folder / "config.json").is_file():
+            raise PipelineError("no config.json", where=folder, expected="a folder that lerobot saved a policy in")
+        self.name, self._torch = str(folder), torch
+        config = PreTrainedConfig.from_pretrained(folder)
+        config.pretrained_path = folder
+        if config.device is None or (config.device.startswith("cuda") and not torch.cuda.is_available()):
+            config.device = "cpu"
+        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        self._policy.eval()
+        self._before, self._after = make_pre_post_processors(
+            config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
+        )
+        cameras = {SCHEMA.views[view].lerobot_key: name for view, name in _VIEWS.items()}
+        unknown = [key for key in config.image_features if key not in cameras]
+        if unknown:
+            raise PipelineError(
+                f"the policy wants the images {', '.join(unknown)}", where=folder, expected=", ".join(cameras)
+            )
+        self._cameras = {key: name for key, name in cameras.items() if key in config.image_features}
+        chunked = getattr(config, "n_obs_steps", 1) == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
+        self._chunk = int(getattr(config, "n_action_steps", 1)) if chunked else 1
+
+    def begin(self, task: EvaluationTask) -> None:
+        self._policy.reset()
+
+    def act(self, look: Look) -> Floats:
+        seen = look(Wanted())
+        batch: dict[str, Any] = {
+            key: self._torch.from_numpy(seen["images"][name]).permute(2, 0, 1)[None].float() / 255
+            for key, name in self._cameras.items()
+        }
+        batch["observation.state"] = self._torch.from_numpy(seen["states"])[None]
+        batch["task"] = [seen["task_description"]]
+        with self._torch.inference_mode():
+            batch = self._before(batch)
+            if self._chunk == 1:
+                actions = self._policy.select_action(batch)
+            else:
+                actions = self._policy.predict_action_chunk(batch)[0, : self._chunk]
+            actions = self._after(actions)
+        taken: Floats = np.asarray(actions.cpu().numpy(), np.float64)
+        return taken
+
+    def end(self, success: bool) -> None: ...
+
+    def close(self) -> None: ...

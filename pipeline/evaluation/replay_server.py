@@ -1,0 +1,47 @@
+"""A model server of vla-eval that replays LIBERO's demonstrations with its eyes closed: what evaluation must score.
+
+``python -m pipeline.evaluation.replay_server --address localhost:8000 --args.chunk 8``
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vla_eval.model_servers.base import ModelServer, SessionContext
+from vla_eval.model_servers.serve import run_server
+from vla_eval.specs import GRIPPER_CLOSE_POS, IMAGE_RGB, POSITION_DELTA, ROTATION_AA, DimSpec
+
+from pipeline.evaluation.policies import Replay
+from pipeline.evaluation.tasks import EvaluationTask
+
+
+class ReplayServer(ModelServer):  # type: ignore[misc]
+    """Answers with the actions of the starter set's demonstration of the task.
+
+    Args:
+        chunk: how many actions each answer has; all are taken before the next look.
+    """
+
+    def __init__(self, *, chunk: int = 1):
+        self._chunk = chunk
+        self._replays: dict[str, Replay] = {}
+
+    async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
+        task = config["task"]
+        fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
+        replay = self._replays[ctx.session_id] = Replay(self._chunk)
+        replay.begin(EvaluationTask(**{**fields, "name": task["task_name"]}))
+
+    async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
+        actions = self._replays[ctx.session_id].act(lambda _: obs)
+        await ctx.send_action({"actions": actions[0] if self._chunk == 1 else actions})
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        return {"image": IMAGE_RGB}
+
+
+if __name__ == "__main__":
+    run_server(ReplayServer)

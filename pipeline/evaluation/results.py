@@ -1,0 +1,77 @@
+"""The results of an evaluation: a file for each episode, and success rates with their intervals."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+
+Row = dict[str, Any]
+"""One episode's result, JSON-serialisable."""
+
+GROUPINGS = (("suite",), ("axis",), ("component",), ("level",), ("axis", "level"), ("suite", "axis"))
+"""What success rates are given by, beside the whole."""
+
+_Z = 1.959963984540054
+"""The 97.5th percentile of the normal distribution."""
+
+
+class EpisodeFiles:
+    """``<folder>/episodes/<episode>.json``: a file that exists is complete, so a run goes on where it was killed."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder / "episodes"
+
+    def path(self, episode: str) -> Path:
+        return self.folder / f"{episode}.json"
+
+    def save(self, row: Row) -> None:
+        with replaced(self.path(row["episode"])) as temporary:
+            temporary.write_text(json.dumps(row, sort_keys=True) + "\n")
+
+    def rows(self) -> Iterator[Row]:
+        """All episodes, in the order of their names.
+
+        Raises:
+            PipelineError: when a file is not one of an episode.
+        """
+        for path in sorted(self.folder.glob("*.json")):
+            try:
+                yield json.loads(path.read_text())
+            except (OSError, ValueError) as error:
+                raise PipelineError(f"not a result ({error})", where=path, remedy="delete it and run again") from error
+
+
+def wilson(successes: int, trials: int) -> tuple[float, float]:
+    """The 95 % interval of a success rate (Wilson, 1927); it holds for few trials and for rates near 0 and 1."""
+    if trials == 0:
+        return 0.0, 1.0
+    rate, z2 = successes / trials, _Z**2
+    middle = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
+    half = _Z * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials**2)) / (1 + z2 / trials)
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def summary(rows: Iterable[Row]) -> dict[str, Any]:
+    """Success as a whole and by each of ``GROUPINGS``; a group's key joins its values by ``/``."""
+    listed = list(rows)
+    grouped: dict[str, Any] = {"all": _rate(listed)}
+    for columns in GROUPINGS:
+        groups: dict[str, list[Row]] = defaultdict(list)
+        for row in listed:
+            groups["/".join(str(row[column]) for column in columns)].append(row)
+        grouped["by_" + "_and_".join(columns)] = {name: _rate(groups[name]) for name in sorted(groups)}
+    return grouped
+
+
+def _rate(rows: list[Row]) -> dict[str, Any]:
+    successes = sum(row["success"] for row in rows)
+    low, high = wilson(successes, len(rows))
+    rate = successes / len(rows) if rows else None
+    return {"episodes": len(rows), "successes": successes, "rate": rate, "low": round(low, 4), "high": round(high, 4)}

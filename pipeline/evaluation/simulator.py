@@ -1,0 +1,199 @@
+"""LIBERO's environment of one task, started and observed as policies are evaluated in it, and kept between episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.errors import RefusedError
+from pipeline.physics.environment import Environment, control_env, seeded
+from pipeline.physics.stepping import ControlStep
+from pipeline.scenes.compiled import proprioception
+from pipeline.types import Floats, Scene, Task
+
+SETTLING_STEPS = 10
+"""Control steps before the policy's first look, while objects fall into place (OpenVLA's and LIBERO-Plus's rule)."""
+
+DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+"""(7,) what is done in them: nothing, with the gripper open."""
+
+
+_PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+
+
+class Observed(NamedTuple):
+    """What LIBERO's observation of one control step was taken from.
+
+    Attributes:
+        qpos: (nq,) positions that frames show.
+        site_alpha: (nsite,) opacity of each site in them.
+        state: (8,) float32 position (m) and axis-angle (rad) of the end effector and two finger joints (m).
+        joint_state: (7,) float32 joint angles in rad.
+    """
+
+    qpos: Floats
+    site_alpha: NDArray[np.float32]
+    state: NDArray[np.float32]
+    joint_state: NDArray[np.float32]
+
+
+class ObservationClock:
+    """Which substep of a control step robosuite 1.4.0 observes.
+
+    An observable samples once in 50 ms, by a timer that counts every update. A reset and LIBERO's ``set_init_state``
+    force one update each, so the timer is two substeps ahead, and a control step of 25 substeps is observed in its
+    24th, not after its last: the policy sees the arm 2 to 4 ms earlier than where it is
+    (``Observable.update`` in ``robosuite/utils/observables.py``).
+    """
+
+    def __init__(self, substep_s: float, sampling_s: float):
+        self._substep_s, self._sampling_s = substep_s, sampling_s
+        self._since_s = substep_s + substep_s
+        self._sampled = True
+
+    def tick(self) -> bool:
+        """Count one substep; whether it is the one that is observed."""
+        self._since_s += self._substep_s
+        samples = not self._sampled and self._since_s <= self._sampling_s
+        self._sampled |= samples
+        if self._since_s >= self._sampling_s:
+            self._since_s %= self._sampling_s
+            self._sampled = False
+        return samples
+
+
+class _Rewind(NamedTuple):
+    """All that a reset leaves behind and an episode changes; ``physics`` has where the solver starts, too."""
+
+    seed: int
+    posture_rad: tuple[float, ...] | None
+    physics: Floats
+    site_rgba: NDArray[np.float32]
+    controller: dict[str, Any]
+
+
+class Simulator(Environment):
+    """An environment in which episodes start in one of two ways, then settle.
+
+    The model is the one that LIBERO's own reset compiles, not one read back from MJCF, so that states and frames are
+    those of an evaluation bit for bit. A reset takes 1.3 s; episodes with the same seed and posture share one.
+
+    Args:
+        task: the task to build.
+        images: of ``floor`` and ``wall``, by their names among LIBERO's textures; the arena's own by default.
+    """
+
+    def __init__(self, task: Task, images: Mapping[str, str] | None = None):
+        super().__init__(task, None if images is None else _styles(images))
+        self._rewind: _Rewind | None = None
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """The model that LIBERO's last reset compiled, textures included."""
+        return self._env.sim.model._model
+
+    def start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
+        """Reset, put in an initial state and settle, as the benchmarks' evaluations do.
+
+        Args:
+            seed: of numpy's global generator while LIBERO resets, which places what is not part of the state: the
+                fixtures.
+            state: (S,) flattened MuJoCo state: time, qpos, qvel.
+            posture_rad: (7,) where the reset puts the arm; LIBERO's own by default. The state puts the arm elsewhere
+                at once, but the controller keeps the goal orientation and the null-space posture of the reset, and
+                drives the arm to them.
+        """
+        env = self._env.env
+        if self._rewind is None or (seed, posture_rad) != (self._rewind.seed, self._rewind.posture_rad):
+            self._reset(seed, posture_rad)
+        else:
+            saved = self._rewind
+            mujoco.mj_resetData(self.model, env.sim.data._data)
+            mujoco.mj_setState(self.model, env.sim.data._data, saved.physics, _PHYSICS)
+            env.sim.model.site_rgba[:] = saved.site_rgba
+            vars(env.robots[0].controller).update(_copied(saved.controller))
+        env.robots[0].gripper.current_action = np.zeros(env.robots[0].gripper.dof)
+        self._check_state(state)
+        env.sim.set_state_from_flattened(state)
+        env.sim.forward()
+        env._post_process()
+        self._settle()
+
+    def start_scene(self, scene: Scene) -> None:
+        """Restore a scene that a perturbation changed, and settle."""
+        self._rewind = None
+        self.restore(scene.model_xml, scene.state)
+        self._settle()
+
+    def place_fixtures(self, seed: int) -> str:
+        """See ``Environment``; what ``start`` kept of its reset goes."""
+        self._rewind = None
+        return super().place_fixtures(seed)
+
+    def _reset(self, seed: int, posture_rad: tuple[float, ...] | None) -> None:
+        env = self._env.env
+        # As in ``place_fixtures``: every reset would draw from the samplers of all resets before.
+        del env.object_property_initializers[self._openings :]
+        self._scene = None
+        # Each reset makes the robot anew, from this.
+        env.robot_configs[0]["initial_qpos"] = None if posture_rad is None else np.array(posture_rad)
+        try:
+            with seeded(seed):
+                self._env.reset()
+        finally:
+            env.robot_configs[0]["initial_qpos"] = None
+        physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
+        mujoco.mj_getState(self.model, env.sim.data._data, physics, _PHYSICS)
+        self._rewind = _Rewind(
+            seed,
+            posture_rad,
+            physics,
+            env.sim.model.site_rgba.copy(),
+            _copied(vars(env.robots[0].controller)),
+        )
+
+    def _settle(self) -> None:
+        env = self._env.env
+        self._control_step = ControlStep(env)
+        self._clock = ObservationClock(env.model_timestep, 1 / env.control_freq)
+        self.observed = self._observe(env.sim.data.qpos.copy())
+        for _ in range(SETTLING_STEPS):
+            self.step(DUMMY_ACTION)
+
+    def step(self, action: Floats) -> None:
+        """Run one control step (50 ms), and keep what LIBERO observes of it in ``observed``.
+
+        Raises:
+            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
+        """
+        data = self._env.sim.data._data
+        qpos = data.qpos.copy()
+        try:
+            for _ in self._control_step.substeps(action):
+                if self._clock.tick():
+                    self.observed = self._observe(qpos)
+                qpos = data.qpos.copy()
+        except (np.linalg.LinAlgError, mujoco.FatalError) as error:
+            raise RefusedError("simulation_unstable") from error
+
+    def _observe(self, qpos: Floats) -> Observed:
+        """Args: qpos: (nq,) that the data's geometry was computed from, one substep before the data's own."""
+        return Observed(qpos, self.site_alpha, *proprioception(self._env.sim.data._data))
+
+
+def _styles(images: Mapping[str, str]) -> dict[str, str]:
+    """``scene_properties`` for images. LIBERO finds them by its own names for them, and has no name for some."""
+    control_env()  # which takes care of how it is imported
+    from libero.libero.envs.arenas.style import STYLE_MAPPING
+
+    for part, image in images.items():
+        STYLE_MAPPING[part][image] = image
+    return {f"{part}_style": image for part, image in images.items()}
+
+
+def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
+    return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in attributes.items()}

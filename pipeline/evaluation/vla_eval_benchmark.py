@@ -1,0 +1,127 @@
+"""The tasks as a benchmark of vla-eval, the field's harness: ``vla-eval run`` with a configuration that names
+``pipeline.evaluation.vla_eval_benchmark:PerturbedLibero`` evaluates any of its model servers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, ClassVar
+
+import numpy as np
+from vla_eval.benchmarks.base import StepBenchmark, StepResult
+from vla_eval.specs import (
+    GRIPPER_CLOSE_POS,
+    IMAGE_RGB,
+    LANGUAGE,
+    POSITION_DELTA,
+    ROTATION_AA,
+    STATE_EEF_POS_AA_GRIP,
+    DimSpec,
+)
+
+from pipeline import gl
+from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment, Settings, Wanted
+from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+
+
+class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
+    """LIBERO's tasks, LIBERO-Plus's test tasks, or held-out draws, as a ``Selection`` chooses them.
+
+    ``episodes_per_task`` of the harness stays 1: each initial state and each draw is a task of its own here, and
+    ``selection.episodes`` says how many.
+
+    Args:
+        selection: fields of ``Selection``, such as ``{"source": "libero_plus", "axes": ["camera"], "subset": 100}``.
+        settings: fields of ``Settings``, such as ``{"prompt": "benchmark"}``.
+        look_every: a server that answers from a chunk of actions uses one observation in so many; frames in between
+            are those of the last look and are not rendered anew. 1 renders every step.
+        send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
+            names it. Its model servers set these.
+        env_seed: as there, of LIBERO's reset.
+        seed: as there; without an effect, since nothing here uses a global generator.
+    """
+
+    render_backends: ClassVar[frozenset[str]] = frozenset({"gpu", "cpu"})
+
+    @classmethod
+    def configure_render(cls, mode: str) -> dict[str, str]:
+        """This project picks its OpenGL itself; ``MUJOCO_GL`` is respected where it is set."""
+        choice = gl.choose()
+        print(choice)
+        return {"MUJOCO_GL": choice.backend}
+
+    def __init__(
+        self,
+        selection: dict[str, Any] | None = None,
+        settings: dict[str, Any] | None = None,
+        look_every: int = 1,
+        send_wrist_image: bool = False,
+        send_state: bool = False,
+        quat_no_antipodal: bool = False,
+        env_seed: int | None = None,
+        seed: int | None = None,
+    ):
+        super().__init__()
+        del seed
+        self._selection = Selection.model_validate(selection or {})
+        fixtures = {} if env_seed is None else {"fixture_seed": env_seed}
+        self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}))
+        self._look_every = max(1, look_every)
+        self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
+
+    def get_tasks(self) -> list[dict[str, Any]]:
+        """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
+        return [{**asdict(task), "name": str(task), "task_name": task.name} for task in select(self._selection)]
+
+    def reset(self, task: dict[str, Any]) -> Any:
+        fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
+        self._environment.reset(EvaluationTask(**{**fields, "name": task["task_name"]}))
+        return self._look()
+
+    def step(self, action: dict[str, Any]) -> StepResult:
+        """Take one action (7,), or all of a chunk (n, 7) until the episode is over."""
+        given = action.get("actions", action.get("action"))
+        chunk = np.atleast_2d(np.asarray(given))
+        for one in chunk:
+            progress = self._environment.step(one)
+            if progress.over:
+                break
+        seen = self._last
+        if not progress.over and (len(chunk) > 1 or progress.steps % self._look_every == 0):
+            seen = self._look()
+        return StepResult(seen, float(progress.success), progress.over, {"success": progress.success})
+
+    def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
+        observation: dict[str, Any] = raw_obs
+        return observation
+
+    def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
+        progress = self._environment.progress
+        return {"success": progress.success, "reason": progress.reason}
+
+    def get_metadata(self) -> dict[str, Any]:
+        """``max_steps`` is the largest limit; each episode ends at that of its own suite."""
+        return {
+            "max_steps": max(STEP_LIMITS[suite] for suite in self._selection.suites),
+            "max_episodes_per_task": 1,
+            "selection": self._selection.model_dump(mode="json"),
+            "settings": self._environment.settings.model_dump(mode="json"),
+        }
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        spec = {"agentview": IMAGE_RGB, "language": LANGUAGE}
+        if self._wanted.wrist:
+            spec["wrist"] = IMAGE_RGB
+        if self._wanted.state:
+            spec["state"] = STATE_EEF_POS_AA_GRIP
+        return spec
+
+    def cleanup(self) -> None:
+        self._environment.close()
+
+    def _look(self) -> dict[str, Any]:
+        self._last = self._environment.observation(self._wanted)
+        return self._last

@@ -1,0 +1,236 @@
+"""Episodes are LIBERO's own: the same start, states and frames, whatever was run before and however it is spread."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY, STOVE
+
+from pipeline import gl
+
+# LIBERO's environment renders with what robosuite finds in MUJOCO_GL when it is imported.
+gl.choose()
+
+import robosuite.utils.transform_utils as transform  # noqa: E402
+from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
+
+from pipeline.axes.camera import CameraPerturbation  # noqa: E402
+from pipeline.errors import PipelineError  # noqa: E402
+from pipeline.evaluation import libero_plus  # noqa: E402
+from pipeline.evaluation.episode import EpisodeEnvironment, Wanted  # noqa: E402
+from pipeline.evaluation.initial_states import libero_states  # noqa: E402
+from pipeline.evaluation.tasks import EvaluationTask, Selection, select  # noqa: E402
+from pipeline.rendering.jpeg import to_policy  # noqa: E402
+from pipeline.seeding import rng  # noqa: E402
+
+ACTIONS = rng("test_evaluation").uniform(-1, 1, (4, 7))
+FIRST = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))[0]
+
+
+@pytest.fixture(scope="module")
+def libero() -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:  # type: ignore[type-arg]
+    """State and observation after settling and after each action, by LIBERO's own code as OpenVLA evaluates."""
+    env = OffScreenRenderEnv(bddl_file_name=str(STOVE.bddl_file), camera_heights=256, camera_widths=256)
+    env.seed(0)
+    env.reset()
+    env.set_init_state(libero_states(STOVE)[0])
+    for _ in range(10):
+        observation, *_ = env.step([0.0] * 6 + [-1.0])
+    seen = [(env.get_sim_state(), observation)]
+    for action in ACTIONS:
+        observation, *_ = env.step([*action[:6], -1.0 if action[6] < 0 else 1.0])
+        seen.append((env.get_sim_state(), observation))
+    env.close()
+    return seen
+
+
+@pytest.fixture(scope="module")
+def evaluated() -> Iterator[EpisodeEnvironment]:
+    environment = EpisodeEnvironment()
+    yield environment
+    environment.close()
+
+
+def some_test_task(axis: str, component: str) -> EvaluationTask:
+    selection = Selection(
+        source="libero_plus", suites=(STOVE.suite,), axes=(axis,), components=(component,), tasks=(STOVE.name,)
+    )
+    return select(selection)[0]
+
+
+@pytest.mark.slow
+def test_episodes_are_liberos_bit_for_bit(
+    libero: list[tuple[Any, dict[str, Any]]], evaluated: EpisodeEnvironment
+) -> None:
+    for _ in range(2):  # the second from what the first left behind
+        evaluated.reset(FIRST)
+        for step, (state, theirs) in enumerate(libero):
+            if step:
+                evaluated.step(ACTIONS[step - 1])
+            assert np.array_equal(evaluated._opened.state, state), f"state at step {step}"
+            ours = evaluated.observation(Wanted())
+            quat_xyzw = theirs["robot0_eef_quat"].copy()
+            expected = [theirs["robot0_eef_pos"], transform.quat2axisangle(quat_xyzw), theirs["robot0_gripper_qpos"]]
+            assert np.array_equal(ours["states"], np.concatenate(expected).astype(np.float32))
+            assert np.array_equal(ours["images"]["agentview"], to_policy(theirs["agentview_image"])), step
+            assert np.array_equal(ours["images"]["wrist"], to_policy(theirs["robot0_eye_in_hand_image"])), step
+        assert ours["task_description"] == STOVE.instruction
+
+
+@pytest.mark.slow
+def test_a_camera_task_is_seen_from_the_axis_camera(evaluated: EpisodeEnvironment) -> None:
+    task = some_test_task("camera", "spherical")
+    evaluated.reset(FIRST)
+    clean = evaluated.observation(Wanted())["images"]
+    evaluated.reset(task)
+    moved = evaluated.observation(Wanted())["images"]
+    assert evaluated._renderer is not None
+    camera = evaluated._renderer.model.camera("agentview")
+    test = libero_plus.by_name()[task.suite, task.name]
+    own = CameraPerturbation.model_validate({"component": test.component, "level": 1, **test.parameters})
+    nominal = evaluated._opened.model.camera("agentview")
+    pos_m, quat_wxyz = own.pose(nominal.pos, nominal.quat)
+    assert np.abs(camera.pos - pos_m).max() < 1.1e-4
+    assert np.abs(camera.quat - quat_wxyz).max() < 1.1e-4
+    assert np.array_equal(clean["wrist"], moved["wrist"])
+    assert not np.array_equal(clean["agentview"], moved["agentview"])
+    evaluated.reset(FIRST)
+    assert np.array_equal(evaluated.image("agentview"), clean["agentview"]), "the camera is put back"
+
+
+@pytest.mark.slow
+def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: EpisodeEnvironment) -> None:
+    evaluated.reset(FIRST)
+    clean = evaluated.observed.joint_state
+    task = some_test_task("robot", "initial_joints")
+    evaluated.reset(task)
+    drift_rad = np.linalg.norm(evaluated.observed.joint_state - clean)
+    # The benchmark's postures are 0.1 to 0.5 rad away; ten settling steps reach some of it.
+    assert 0.01 < drift_rad < 0.6
+    # By LIBERO's own code, with the posture in place of its own.
+    env = OffScreenRenderEnv(bddl_file_name=str(STOVE.bddl_file), camera_heights=16, camera_widths=16)
+    number = int(libero_plus.by_name()[task.suite, task.name].parameters["id"])
+    env.env.robot_configs[0]["initial_qpos"] = np.array(libero_plus.postures_rad()[number])
+    env.seed(0)
+    env.reset()
+    env.set_init_state(libero_states(STOVE)[0])
+    for _ in range(10):
+        env.step([0.0] * 6 + [-1.0])
+    assert np.array_equal(evaluated._opened.state, env.get_sim_state())
+    env.close()
+
+
+@pytest.mark.slow
+def test_moved_scenes_noise_and_held_out_draws_can_be_seen(evaluated: EpisodeEnvironment) -> None:
+    pictures = {}
+    for task in (FIRST, some_test_task("noise", "gaussian"), some_test_task("pose", "pose")):
+        evaluated.reset(task)
+        evaluated.step(np.zeros(7))
+        pictures[task.axis] = evaluated.image("agentview").copy()
+    chosen = Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot", "light"), levels=(4,))
+    for task in select(chosen):
+        evaluated.reset(task)
+        pictures[f"own {task.axis}"] = evaluated.image("agentview").copy()
+    listed = list(pictures.values())
+    assert len(pictures) == 5
+    assert all(not np.array_equal(one, other) for at, one in enumerate(listed) for other in listed[:at])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [(np.zeros(6), "shape"), (np.full(7, np.nan), "NaN"), (["left"] * 7, "not numbers"), (np.zeros((1, 7)), "shape")],
+)
+def test_bad_actions_are_refused(evaluated: EpisodeEnvironment, action: Any, message: str) -> None:
+    evaluated.reset(FIRST)
+    with pytest.raises(PipelineError, match=message):
+        evaluated.step(action)
+
+
+def command(out: Path, *arguments: str) -> list[str]:
+    shared = ["--suite", "libero_goal", "libero_object", "--task", "turn_on*", "pick_up_the_milk*"]
+    start = ["--initial-states", "demonstration"]
+    return [sys.executable, "-m", "pipeline", "evaluate", str(out), *shared, *start, *arguments]
+
+
+def rows(out: Path) -> dict[str, dict[str, Any]]:
+    return {path.stem: json.loads(path.read_text()) for path in sorted((out / "episodes").glob("*.json"))}
+
+
+@pytest.mark.slow
+def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -> None:
+    alone, spread = tmp_path / "alone", tmp_path / "spread"
+    killed = subprocess.Popen(command(alone, "--replay", "--workers", "1"), cwd=REPOSITORY)
+    while killed.poll() is None and not list(alone.glob("episodes/*.json")):
+        time.sleep(0.02)
+    killed.send_signal(signal.SIGKILL)
+    killed.wait()
+    first = {path: path.stat().st_mtime_ns for path in alone.glob("episodes/*.json")}
+    assert len(first) == 1
+    subprocess.run(command(alone, "--replay", "--workers", "1"), cwd=REPOSITORY, check=True)
+    assert all(path.stat().st_mtime_ns == when for path, when in first.items()), "a finished episode is kept"
+    subprocess.run(command(spread, "--replay", "--workers", "2"), cwd=REPOSITORY, check=True)
+    assert len(rows(alone)) == 2
+    assert rows(alone) == rows(spread)
+    found = json.loads((alone / "summary.json").read_text())
+    assert found["all"]["successes"] == found["all"]["episodes"] == 2
+
+
+@contextmanager
+def replay_server(chunk: int) -> Iterator[str]:
+    """A model server of vla-eval in a process of its own."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    arguments = ["--address", f"127.0.0.1:{port}", "--args.chunk", str(chunk)]
+    server = subprocess.Popen(
+        [sys.executable, "-m", "pipeline.evaluation.replay_server", *arguments], cwd=REPOSITORY, env=os.environ
+    )
+    try:
+        while server.poll() is None:
+            try:
+                socket.create_connection(("127.0.0.1", port)).close()
+                break
+            except OSError:
+                time.sleep(0.1)
+        yield f"ws://127.0.0.1:{port}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+@pytest.mark.slow
+def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
+    with replay_server(chunk=8) as address:
+        ours = tmp_path / "ours"
+        subprocess.run(command(ours, "--server", address, "--workers", "1"), cwd=REPOSITORY, check=True)
+        for row in rows(ours).values():
+            assert row["success"]
+            assert row["looks"] == -(-row["steps"] // 8), "a chunk of eight actions takes one look"
+        config = tmp_path / "harness.yaml"
+        params = {
+            "selection": {"suites": ["libero_goal"], "tasks": ["turn_on*"]},
+            "settings": {"initial_states": "demonstration"},
+        }
+        benchmark = {"benchmark": "pipeline.evaluation.vla_eval_benchmark:PerturbedLibero", "params": params}
+        # YAML holds JSON.
+        config.write_text(
+            json.dumps({"server": {"url": address}, "output_dir": str(tmp_path / "theirs"), "benchmarks": [benchmark]})
+        )
+        harness = [sys.executable, "-m", "vla_eval.cli.main", "run", "--no-docker", "--config", str(config)]
+        done = subprocess.run(harness, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        (result,) = (tmp_path / "theirs").rglob("*.json")
+        assert json.loads(result.read_text())["tasks"][0]["episodes"][0]["metrics"]["success"]

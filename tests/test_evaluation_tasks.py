@@ -1,0 +1,126 @@
+"""What can be evaluated is what LIBERO and LIBERO-Plus define, and choosing is fair and repeatable."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from collections import Counter
+
+import numpy as np
+import pytest
+from conftest import STOVE
+
+from pipeline import seeding
+from pipeline.axes.robot import HOME_RAD, benchmark_offsets_rad
+from pipeline.errors import PipelineError
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.initial_states import libero_states, moved_state, pickled_array
+from pipeline.evaluation.results import summary, wilson
+from pipeline.evaluation.tasks import Selection, balanced, draw, select
+
+
+def test_libero_has_an_episode_for_each_task_and_initial_state() -> None:
+    assert len(select(Selection())) == 40
+    assert len(select(Selection(suites=("libero_goal",), episodes=3))) == 30
+    assert libero_states(STOVE).shape[0] == 50
+
+
+def test_test_tasks_that_need_no_archive_are_all_there(capsys: pytest.CaptureFixture[str]) -> None:
+    tasks = select(Selection(source="libero_plus"))
+    counts = Counter(task.axis for task in tasks)
+    assert counts == {"camera": 1599, "robot": 1550, "noise": 1601, "language": 1537, "pose": 696, "background": 62}
+    assert "light 1142" in capsys.readouterr().out
+    with pytest.raises(PipelineError, match="asset archive"):
+        select(Selection(source="libero_plus", axes=("light", "camera")))
+    with pytest.raises(PipelineError, match="no 'colour'"):
+        select(Selection(source="libero_plus", axes=("colour",)))
+
+
+def test_tasks_are_chosen_by_axis_component_level_suite_and_name() -> None:
+    chosen = select(
+        Selection(
+            source="libero_plus",
+            suites=("libero_goal",),
+            axes=("noise",),
+            components=("glass",),
+            levels=(5,),
+            tasks=("turn_on*",),
+        )
+    )
+    assert chosen
+    kinds = {(task.suite, task.component, task.level, task.base) for task in chosen}
+    assert kinds == {("libero_goal", "glass", 5, "turn_on_the_stove")}
+    severities = {libero_plus.by_name()[task.suite, task.name].parameters["severity"] for task in chosen}
+    assert severities <= {9, 10}
+
+
+def test_a_subset_is_balanced_and_holds_the_smaller_ones() -> None:
+    tasks = select(Selection(source="libero_plus"))
+    chosen = balanced(tasks, 50, seed=0)
+    assert set(Counter(task.axis for task in chosen).values()) == {8, 9}
+    assert set(Counter(task.component for task in chosen if task.axis == "noise").values()) <= {1, 2}
+    assert set(balanced(tasks, 20, seed=0)) < set(chosen)
+    assert balanced(reversed(tasks), 50, seed=0) == chosen != balanced(tasks, 50, seed=1)
+
+
+def test_held_out_draws_are_none_of_a_plan() -> None:
+    (task, *_) = select(Selection(source="own", axes=("camera",), levels=(3,), suites=("libero_goal",)))
+    assert draw(task, 0) == draw(task, 0) != draw(task, 1)
+    assert draw(task, 0).level == task.level == 3
+    assert draw(task, 0, attempt=1) != draw(task, 0)
+    with pytest.raises(PipelineError, match="language"):
+        select(Selection(source="own", axes=("language",)))
+
+
+def test_instructions_are_clean_or_the_benchmarks() -> None:
+    def told(axis: str, suite: str, prompt: libero_plus.Prompt) -> str:
+        tests = [test for test in libero_plus.by_name().values() if (test.axis, test.suite) == (axis, suite)]
+        return libero_plus.instruction(tests[0], prompt)
+
+    clean = told("camera", "libero_10", "clean")
+    polluted = told("camera", "libero_10", "benchmark")
+    assert polluted.startswith(clean)
+    assert " view " in polluted
+    assert "SCENE" not in polluted
+    assert told("language", "libero_goal", "clean") == told("language", "libero_goal", "benchmark")
+
+
+def test_postures_are_the_benchmarks_tables() -> None:
+    postures = libero_plus.postures_rad()
+    listed = np.array([postures[number] for number in range(1, 501)])
+    assert np.abs(listed - HOME_RAD - benchmark_offsets_rad()).max() < 1e-8
+
+
+def test_states_of_moved_scenes_are_read_without_running_a_pickle() -> None:
+    pose = [test for test in libero_plus.by_name().values() if test.axis == "pose" and test.suite == "libero_goal"]
+    state = moved_state("libero_goal", pose[0].name)
+    assert np.isfinite(state).all()
+    assert state.ndim == 1
+
+    class Hostile:
+        def __reduce__(self) -> tuple[object, ...]:
+            return print, ("run",)
+
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("archive/data.pkl", pickle.dumps(Hostile(), protocol=2))
+    with pytest.raises(PipelineError, match="print"):
+        pickled_array(packed.getvalue(), "hostile")
+
+
+def test_intervals_are_wilsons() -> None:
+    # 8 of 10 by the formula's worked example: 0.490 to 0.943.
+    assert wilson(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
+    assert wilson(0, 10)[0] == 0
+    assert wilson(0, 0) == (0, 1)
+    rng = seeding.rng("test")
+    rows = [
+        {"suite": "a", "axis": axis, "component": "c", "level": level, "success": bool(rng.integers(2))}
+        for axis in ("camera", "noise")
+        for level in (1, 2)
+    ]
+    found = summary(rows)
+    assert found["all"]["episodes"] == 4
+    assert found["by_axis_and_level"].keys() == {"camera/1", "camera/2", "noise/1", "noise/2"}
+    assert sum(group["successes"] for group in found["by_axis"].values()) == found["all"]["successes"]
