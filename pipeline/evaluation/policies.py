@@ -127,7 +127,7 @@ class Replay:
     def act(self, look: Look) -> Floats:
         actions = self._actions[self._taken : self._taken + self._chunk]
         self._taken += self._chunk
-        return actions if len(actions) else DUMMY_ACTION[None]
+        return actions if len(actions) else np.tile(DUMMY_ACTION, (self._chunk, 1))
 
     def end(self, success: bool) -> None: ...
 
