@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -47,7 +46,8 @@ class Settings(Frozen):
         seed: of held-out draws and of noise that is random.
         fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
         initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
-            starter set's demonstration of the task begins in. Test tasks have a state of their own in both.
+            starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
+            Test tasks have a state of their own in both.
     """
 
     prompt: Prompt = "clean"
@@ -228,40 +228,47 @@ class EpisodeEnvironment:
         self._show()
 
     def _start_libero(self) -> None:
+        """Start LIBERO's own task, or a held-out draw on it."""
         self._build(self._base)
+        source = StarterSource()
+        demo = source.load(source.index([self._base]).entries[0].demo_id)
         seed = self.settings.fixture_seed
-        demo = StarterSource().load(StarterSource().index([self._base]).entries[0].demo_id)
         if self.settings.initial_states == "libero":
             states = libero_states(self._base)
             number = self.task.number % len(states)
             seed, demo = seed + number, replace(demo, init_state=states[number])
         if self.task.source == "libero":
             self._perturbations = ()
-            self._opened.start(seed, demo.init_state)
-            self._show()
+            self._start(demo, seed, None)
             return
         for attempt in range(_ATTEMPTS):
             drawn = draw(self.task, self.settings.seed, attempt)
             self._perturbations = (drawn,)
-            if not isinstance(drawn, PhysicsPerturbation):
-                self._opened.start(seed, demo.init_state)
-                self._show()
-                return
-            if (scene := self._changed(drawn, demo, seed)) is not None:
+            scene = None
+            if isinstance(drawn, PhysicsPerturbation):
+                try:
+                    nominal = Scene(self._opened.place_fixtures(seed), demo.init_state)
+                    scene = drawn.apply(nominal, demo, roll_out)
+                except RefusedError:
+                    continue
                 self.resolved = scene.resolved
-                self._opened.start_scene(scene)
-                self._show(scene.model_xml)
-                return
+            self._start(demo, seed, scene)
+            return
         raise PipelineError(
             f"none of {_ATTEMPTS} draws fits the scene", where=str(self.task), remedy="leave this task out"
         )
 
-    def _changed(self, drawn: PhysicsPerturbation, demo: Demo, seed: int) -> Scene | None:
-        """The scene that a draw makes of LIBERO's; None when the two do not go together."""
-        try:
-            return drawn.apply(Scene(self._opened.place_fixtures(seed), demo.init_state), demo, partial(roll_out))
-        except RefusedError:
-            return None
+    def _start(self, demo: Demo, seed: int, scene: Scene | None) -> None:
+        """Start from a demonstration's initial state, in LIBERO's scene or a changed one."""
+        settle = self.settings.initial_states == "libero"
+        if scene is None and settle:
+            self._opened.start(seed, demo.init_state)
+            self._show()
+            return
+        # A demonstration was recorded from its first state on, by an arm that holds the posture it starts in.
+        scene = scene or Scene(self._opened.place_fixtures(seed), demo.init_state)
+        self._opened.start_scene(scene, settle)
+        self._show(scene.model_xml)
 
     @property
     def _test(self) -> TestTask:

@@ -17,6 +17,7 @@ from pipeline.evaluation.simulator import DUMMY_ACTION
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
+from pipeline.scenes.noops import kept_actions
 from pipeline.types import Floats
 
 _VIEWS = {"image": "agentview", "wrist_image": "wrist"}
@@ -106,7 +107,7 @@ class Server:
 
 
 class Replay:
-    """The actions of the starter set's demonstration, open-loop, then nothing: scores what evaluation itself loses.
+    """The actions of the starter set's demonstration, open-loop and without no-ops, then nothing.
 
     Args:
         chunk: how many actions at a time.
@@ -120,12 +121,13 @@ class Replay:
     def begin(self, task: EvaluationTask) -> None:
         source = StarterSource()
         entry = source.index([find_task(task.suite, task.base)]).entries[0]
-        self._actions, self._taken = source.load(entry.demo_id).actions, 0
+        recorded = source.load(entry.demo_id).actions
+        self._actions, self._taken = recorded[kept_actions(recorded, "drop")], 0
 
     def act(self, look: Look) -> Floats:
         actions = self._actions[self._taken : self._taken + self._chunk]
         self._taken += self._chunk
-        return actions if len(actions) else DUMMY_ACTION[None]
+        return actions if len(actions) else np.tile(DUMMY_ACTION, (self._chunk, 1))
 
     def end(self, success: bool) -> None: ...
 

@@ -121,13 +121,13 @@ class Simulator(Environment):
         env.sim.set_state_from_flattened(state)
         env.sim.forward()
         env._post_process()
-        self._settle()
+        self._settle(SETTLING_STEPS)
 
-    def start_scene(self, scene: Scene) -> None:
-        """Restore a scene that a perturbation changed, and settle."""
+    def start_scene(self, scene: Scene, settle: bool) -> None:
+        """Restore a scene that does not come from LIBERO's reset, such as a perturbed one."""
         self._rewind = None
         self.restore(scene.model_xml, scene.state)
-        self._settle()
+        self._settle(SETTLING_STEPS if settle else 0)
 
     def place_fixtures(self, seed: int) -> str:
         """See ``Environment``; what ``start`` kept of its reset goes."""
@@ -156,12 +156,12 @@ class Simulator(Environment):
             _copied(vars(env.robots[0].controller)),
         )
 
-    def _settle(self) -> None:
+    def _settle(self, steps: int) -> None:
         env = self._env.env
         self._control_step = ControlStep(env)
         self._clock = ObservationClock(env.model_timestep, 1 / env.control_freq)
         self.observed = self._observe(env.sim.data.qpos.copy())
-        for _ in range(SETTLING_STEPS):
+        for _ in range(steps):
             self.step(DUMMY_ACTION)
 
     def step(self, action: Floats) -> None:
