@@ -88,7 +88,7 @@ def tree(tmp_path: Path) -> Tree:
 def test_installs_once_and_again_when_the_lock_changes(tree: Tree) -> None:
     done = tree.setup()
     assert done.returncode == 0, done.stderr
-    sync = "uv pip sync --require-hashes requirements.lock"
+    sync = "uv pip sync --compile-bytecode --require-hashes requirements.lock"
     assert sync in tree.calls()
 
     start = time.monotonic()
@@ -113,7 +113,7 @@ def test_an_installation_that_failed_is_tried_again(tree: Tree) -> None:
     uv.write_text(works)
     tree.calls()
     assert tree.setup().returncode == 0
-    assert "uv pip sync --require-hashes requirements.lock" in tree.calls()
+    assert "uv pip sync --compile-bytecode --require-hashes requirements.lock" in tree.calls()
 
 
 def test_without_root_it_names_what_is_missing_and_stops(tree: Tree) -> None:
@@ -145,7 +145,7 @@ def test_checks_style_and_types_before_behaviour(tree: Tree, verb: str, selectio
     assert done.returncode == 0, done.stderr
     *_, check, form, types, behaviour = tree.calls()
     assert (check, form, types) == ("ruff check", "ruff format --check", "mypy")
-    assert behaviour == f"pytest {selection}".rstrip()
+    assert behaviour == f"pytest -n 2 --dist loadfile --no-loadscope-reorder {selection}".rstrip()
 
 
 def test_no_python_of_the_right_version(tree: Tree) -> None:

@@ -230,8 +230,8 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
     alone = [p for p in draws if isinstance(p, PosePerturbation)]
     scenes = [p for p in draws if isinstance(p, ScenePerturbation)]
     panels = []
-    if alone:
-        own = np.array([[p.dx_m, p.dy_m] for p in alone])
+    if alone or not scenes:
+        own = np.array([[p.dx_m, p.dy_m] for p in alone]).reshape(-1, 2)
         groups = {"benchmark": 100 * targets, "pose": 100 * own}
         panels += [
             scatter("where the moved object goes", groups, "dx (cm)", "dy (cm)", True),
