@@ -239,8 +239,8 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
         ]
     if scenes:
         moved = [shift for p in tested for shift in displacements(p).values()]
-        own = np.array([[move.dx_m, move.dy_m] for p in scenes for move in p.moves])
-        groups = {"benchmark": 100 * np.array(moved).reshape(-1, 2), "pose": 100 * own}
+        shifts = np.array([[move.dx_m, move.dy_m] for p in scenes for move in p.moves])
+        groups = {"benchmark": 100 * np.array(moved).reshape(-1, 2), "pose": 100 * shifts}
         panels.append(scatter("where each thing of a scene goes", groups, "dx (cm)", "dy (cm)", True))
     return AxisPlots(
         f"{len(tested):,} test tasks, of which {len(targets):,} move the target, and all of which move everything "
