@@ -21,7 +21,7 @@ from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
 from pipeline.axes.scene import ScenePerturbation, displacements
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
-from pipeline.publish.figures import Panel, bars, histogram, scatter, strips
+from pipeline.publish.figures import Groups, Panel, bars, histogram, scatter, strips
 from pipeline.run import leakage
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
@@ -232,7 +232,7 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
     panels = []
     if alone or not scenes:
         own = np.array([[p.dx_m, p.dy_m] for p in alone]).reshape(-1, 2)
-        groups = {"benchmark": 100 * targets, "pose": 100 * own}
+        groups: Groups = {"benchmark": 100 * targets, "pose": 100 * own}
         panels += [
             scatter("where the moved object goes", groups, "dx (cm)", "dy (cm)", True),
             strips("how far it turns", {"yaw": {"pose": np.array([p.dyaw_deg for p in alone])}}, "degrees"),
