@@ -111,10 +111,11 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         address=str(arguments.checkpoint or arguments.server or ""),
         label=arguments.label,
         look_every=arguments.look_every,
+        timeout_s=arguments.timeout,
     )
     compute = ComputeConfig(cluster="loop" if arguments.workers == 1 else "local", workers=arguments.workers)
     with runner(compute, arguments.out) as run:
-        found = evaluate(selection, settings, policy, arguments.out, run)
+        found = evaluate(selection, settings, policy, arguments.out, run, arguments.assets)
     print(json.dumps({"all": found["all"], "by_axis": found["by_axis"]}))
     return 0
 
@@ -316,6 +317,19 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--label", default="", help="name of the policy in the results (default: its address)")
     command.add_argument(
         "--look-every", type=_positive, default=1, metavar="N", help="the server uses one observation in N (default: 1)"
+    )
+    command.add_argument(
+        "--assets",
+        type=Path,
+        metavar="DIR",
+        help="LIBERO-Plus's unpacked asset archive, which its light, layout and most of its background tasks need",
+    )
+    command.add_argument(
+        "--timeout",
+        type=_positive,
+        default=120,
+        metavar="S",
+        help="seconds that a server's answer may take (default: 120)",
     )
     command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one for each core)")
     command.set_defaults(run=_evaluate)

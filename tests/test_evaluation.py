@@ -189,14 +189,15 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -
 
 
 @contextmanager
-def replay_server(chunk: int) -> Iterator[str]:
+def model_server(module: str, *arguments: str) -> Iterator[str]:
     """A model server of vla-eval in a process of its own."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    arguments = ["--address", f"127.0.0.1:{port}", "--args.chunk", str(chunk)]
     server = subprocess.Popen(
-        [sys.executable, "-m", "pipeline.evaluation.replay_server", *arguments], cwd=REPOSITORY, env=os.environ
+        [sys.executable, "-m", module, "--address", f"127.0.0.1:{port}", *arguments],
+        cwd=REPOSITORY,
+        env={**os.environ, "PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"},
     )
     try:
         while server.poll() is None:
@@ -213,7 +214,7 @@ def replay_server(chunk: int) -> Iterator[str]:
 
 @pytest.mark.slow
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
-    with replay_server(chunk=8) as address:
+    with model_server("pipeline.evaluation.replay_server", "--args.chunk", "8") as address:
         ours = tmp_path / "ours"
         subprocess.run(command(ours, "--server", address, "--workers", "1"), cwd=REPOSITORY, check=True)
         for row in rows(ours).values():

