@@ -150,12 +150,14 @@ def compared(episodes: list[EvaluationTask], steps: int, address: str, both_view
         if task.suite not in harnesses:
             with times["harness"].of("reset"):
                 harnesses[task.suite] = Harness(task.suite, address, both_views, times["harness"])
-        for name, way in (("harness", harnesses[task.suite]), *ours.items()):
+        ways: dict[str, Harness | Ours] = {"harness": harnesses[task.suite], **ours}
+        for name, way in ways.items():
             with times[name].of("server"):
                 taken[name] += way.run(task, steps)
             print(f"{task} {name}: {taken[name]} steps, {sum(times[name].wall_s.values()):.1f} s", flush=True)
     MjSim.render = render
-    for way in (*harnesses.values(), *ours.values()):
+    opened: list[Harness | Ours] = [*harnesses.values(), *ours.values()]
+    for way in opened:
         way.close()
     figures: dict[str, Any] = {name: figures_of(times[name], taken[name], len(episodes)) for name in times}
     for name in ours:

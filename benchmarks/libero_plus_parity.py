@@ -57,7 +57,7 @@ class BenchmarkDraws:
 
     def integers(self, low: int, high: int, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
         """Where glass fetches each pixel from."""
-        offsets = np.zeros(shape, dtype)
+        offsets: NDArray[Any] = np.zeros(shape, dtype)
         passes, height, width, _ = shape
         for number in range(passes):
             for y in range(height - high, high, -1):
@@ -108,6 +108,7 @@ def benchmarks(python: Path, chosen: list[EvaluationTask], folder: Path) -> None
     listed = {"tasks": tasks, "actions": gripped(ACTIONS).tolist(), "noise_seed": NOISE_SEED}
     (folder / "tasks.json").write_text(json.dumps(listed))
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    environment["LIBERO_CONFIG_PATH"] = str(folder)  # or else it writes one into the user's home
     subprocess.run([python, REFERENCE, folder / "tasks.json", folder], env=environment, check=True)
 
 

@@ -13,6 +13,7 @@ import pickle
 import re
 import sys
 import zipfile
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ DUMMY_ACTION = [0.0] * 6 + [-1.0]
 
 def main() -> None:
     listed, folder = json.loads(Path(sys.argv[1]).read_text()), Path(sys.argv[2])
-    from liberoplus.liberoplus.envs import env_wrapper
+    # Only there where this runs, and it needs what its environment has.
+    env_wrapper: Any = import_module("liberoplus.liberoplus.envs.env_wrapper")
 
     # The package has the function of before 2025-11-07, which leaves out what lies beyond the first 224 pixels.
     source = inspect.getsource(env_wrapper.glass_blur).replace("224 - c[1]", "256 - c[1]")

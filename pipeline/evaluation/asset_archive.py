@@ -62,21 +62,21 @@ class Assets:
     def holds(self, test: TestTask) -> bool:
         """Whether the files that a light, background or layout task names are there."""
         if test.axis == "layout":
-            paths: Iterable[str] = _object_models(test).values()
+            paths: Iterable[str] = object_models(test).values()
         else:
-            paths = _scene_files(test)
+            paths = scene_files(test)
         return all((self.root / path).is_file() for path in paths)
 
     def scene(self, test: TestTask) -> SceneFiles:
         """The files of a light or background task; absolute paths."""
-        return SceneFiles(*(str(self.root / path) for path in _scene_files(test)))
+        return SceneFiles(*(str(self.root / path) for path in scene_files(test)))
 
     def register_objects(self, test: TestTask) -> None:
         """Let LIBERO build scenes with the objects that a layout task adds, by the categories of its BDDL file."""
         control_env()  # which takes care of how it is imported
         from libero.libero.envs.base_object import OBJECTS_DICT
 
-        for category, path in _object_models(test).items():
+        for category, path in object_models(test).items():
             OBJECTS_DICT[category] = _object_class(category, self.root / path)
 
 
@@ -90,12 +90,13 @@ def having(test: TestTask, archive: Path | None) -> Assets | None:
     return next((assets for assets in map(Assets, folders) if assets.holds(test)), None)
 
 
-def _scene_files(test: TestTask) -> SceneFiles:
+def scene_files(test: TestTask) -> SceneFiles:
+    """Of a light or background task, by their paths in the archive."""
     return _reader().scene_files(test.suite, test.name)
 
 
-def _object_models(test: TestTask) -> dict[str, str]:
-    """Category to model file, of the objects that a layout task adds."""
+def object_models(test: TestTask) -> dict[str, str]:
+    """Category to MJCF, by its path in the archive, of the objects that a layout task adds."""
     return {category: _models()[category] for category in str(test.parameters["category"]).split(",")}
 
 
