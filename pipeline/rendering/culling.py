@@ -59,8 +59,10 @@ class Culling:
         number = model.camera(camera).id
         seen = self._in_frustum(data, number, data.geom_xpos)
         mirrors = self._flat[model.mat_reflectance[model.geom_matid[self._flat]] > 0]
-        mirrors = mirrors[seen[mirrors]]
         geoms = seen.copy()
+        # MuJoCo has the first of them reflect: without it, that would be another.
+        geoms[mirrors] = True
+        mirrors = mirrors[seen[mirrors]]
         for mirror in mirrors:
             normal = data.geom_xmat[mirror].reshape(3, 3)[:, 2]
             is_box = model.geom_type[mirror] == mujoco.mjtGeom.mjGEOM_BOX
