@@ -136,7 +136,7 @@ def test_files_are_those_that_the_benchmarks_classes_name() -> None:
     kitchen = next(test for (_, name), test in by_name.items() if name.startswith("KITCHEN") and "_tb_" in name)
     files = asset_archive.scene_files(kitchen)
     assert files.scene_xml.startswith("scenes/kitchenxml/kitchen_table_")
-    assert (files.floor, files.wall) == ("textures/gray_ceramic_tile.png", "textures/yellow_linen.png")
+    assert (files.floor, files.wall) == ("textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png")
     light = next(test for test in by_name.values() if test.axis == "light" and test.suite == "libero_object")
     assert asset_archive.scene_files(light).scene_xml == (
         f"scenes/lights/floor_light_sync_modified_{light.parameters['number']}.xml"

@@ -86,7 +86,7 @@ def untrained_act(folder: Path, n_action_steps: int) -> Path:
     from lerobot.policies.factory import make_pre_post_processors
 
     shapes: dict[str, tuple[int, ...]]
-    shapes = {"observation.images.image": (3, 256, 256), "observation.images.wrist_image": (3, 256, 256)}
+    shapes = {"observation.images.image": (3, 256, 256), "observation.images.image2": (3, 256, 256)}
     inputs = {key: PolicyFeature(FeatureType.VISUAL, shape) for key, shape in shapes.items()}
     config = ACTConfig(
         input_features={**inputs, "observation.state": PolicyFeature(FeatureType.STATE, (8,))},

@@ -66,6 +66,8 @@ class PolicyConfig(Frozen):
 def _environment(settings: Settings, archive: Path | None) -> EpisodeEnvironment:
     """This process's environment, closed when the process ends, while OpenGL is still there."""
     environment = EpisodeEnvironment(settings, archive)
+    # What ends OpenGL is registered when it is loaded, and called in reverse order.
+    gl.prepare()
     atexit.register(environment.close)
     return environment
 
