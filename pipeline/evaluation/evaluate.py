@@ -13,6 +13,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
+import mujoco
+
 from pipeline import gl
 from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
@@ -66,8 +68,9 @@ class PolicyConfig(Frozen):
 def _environment(settings: Settings, archive: Path | None) -> EpisodeEnvironment:
     """This process's environment, closed when the process ends, while OpenGL is still there."""
     environment = EpisodeEnvironment(settings, archive)
-    # What ends OpenGL is registered when it is loaded, and called in reverse order.
+    # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
     gl.prepare()
+    mujoco.gl_context.GLContext(1, 1).free()
     atexit.register(environment.close)
     return environment
 
