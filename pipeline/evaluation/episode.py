@@ -48,7 +48,7 @@ class Settings(Frozen):
         fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
         initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
             starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
-            Test tasks have a state of their own in both.
+            Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
         plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
             it by the SHA-256 of its file.
     """
