@@ -116,7 +116,7 @@ def run_episode(environment: EpisodeEnvironment, policy: Policy, task: Evaluatio
     changes = environment.perturbations
     row = asdict(task)
     if task.source == "own" and changes:
-        row["component"] = changes[0].component
+        row["component"] = "+".join(change.component for change in changes)
     return {
         **row,
         "success": progress.success,
@@ -204,10 +204,10 @@ def evaluate(
 ) -> dict[str, Any]:
     """Run what ``folder`` does not hold yet, and write ``summary.json`` of what was selected.
 
+    An episode in which the policy gives no action has no result, and the others are run.
+
     Args:
         archive: folder of LIBERO-Plus's asset archive, where there is one.
-
-    An episode in which the policy gives no action has no result, and the others are run.
 
     Returns:
         The summary.
@@ -241,7 +241,8 @@ def _jobs(missing: Sequence[EvaluationTask]) -> list[tuple[EvaluationTask, ...]]
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
-        moved = task.name if task.source == "libero_plus" and task.axis in SCENE_AXES else ""
+        own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
+        moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
     jobs = []
     for scene in scenes.values():
