@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import json
+import threading
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -66,12 +68,17 @@ class PolicyConfig(Frozen):
 
 @lru_cache(maxsize=1)
 def _environment(settings: Settings, archive: Path | None) -> EpisodeEnvironment:
-    """This process's environment, closed when the process ends, while OpenGL is still there."""
+    """This process's environment."""
     environment = EpisodeEnvironment(settings, archive)
-    # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
-    gl.prepare()
-    mujoco.gl_context.GLContext(1, 1).free()
-    atexit.register(environment.close)
+    if threading.current_thread() is threading.main_thread():
+        # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
+        gl.prepare()
+        mujoco.gl_context.GLContext(1, 1).free()
+        atexit.register(environment.close)
+    else:
+        # Only the thread that rendered may close it, and that of a worker is gone when its process ends: one reference
+        # more keeps Python from trying.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(environment))
     return environment
 
 
