@@ -41,15 +41,15 @@ class PolicyConfig(Frozen):
     """What acts.
 
     Attributes:
-        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``replay`` for
-            the demonstrations' own actions, ``tracked_replay`` for their paths, followed by feedback.
-        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for replays.
+        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``open_loop`` for
+            the demonstrations' own actions, ``tracked`` for their paths, followed by feedback.
+        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations.
         label: what results are kept under; the address by default. Give one where the same address will serve another
             policy.
         look_every: a server that answers from a chunk of its own uses one observation in so many.
     """
 
-    kind: Literal["server", "checkpoint", "replay", "tracked_replay"]
+    kind: Literal["server", "checkpoint", "open_loop", "tracked"]
     address: str = ""
     label: str = ""
     look_every: int = 1
@@ -60,9 +60,9 @@ class PolicyConfig(Frozen):
                 return Server(self.address, look_every=self.look_every)
             case "checkpoint":
                 return Checkpoint(Path(self.address))
-            case "replay":
+            case "open_loop":
                 return Replay()
-            case "tracked_replay":
+            case "tracked":
                 return TrackedReplay()
 
 

@@ -18,20 +18,7 @@ SOURCES = ("libero_plus", "own", "libero")
 FAILURES = 3
 """So many are shown of each policy, source and axis."""
 
-_SHOWN = (
-    "episode",
-    "source",
-    "suite",
-    "base",
-    "name",
-    "axis",
-    "component",
-    "level",
-    "prompt",
-    "reason",
-    "steps",
-    "looks",
-)
+_FACTS = ("episode", "source", "suite", "name", "axis", "component", "level", "prompt", "reason", "steps", "looks")
 
 
 def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
@@ -65,7 +52,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
             if (pairs := paired(one.of(source), other.of(source)))
         ],
         "failures": [
-            {"policy": policy.name, "video": row["episode"] in policy.videos, **{name: row[name] for name in _SHOWN}}
+            {"policy": policy.name, "video": row["episode"] in policy.videos, **{name: row[name] for name in _FACTS}}
             for policy in policies
             for row in _shown_failures(policy)
         ],

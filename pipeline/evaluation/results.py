@@ -15,7 +15,7 @@ from pipeline.files import replaced
 Row = dict[str, Any]
 """One episode's result, JSON-serialisable."""
 
-GROUPINGS = (("suite",), ("axis",), ("component",), ("level",), ("axis", "level"), ("suite", "axis"))
+GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
 """What success rates are given by, beside the whole."""
 
 _Z = 1.959963984540054

@@ -23,7 +23,12 @@ TITLES = {
 }
 """Of the sources of tasks; another one has its own name as title."""
 
-GROUPINGS = {"by_axis": "by axis", "by_component": "by component", "by_level": "by level", "by_suite": "by suite"}
+GROUPINGS = {
+    "by_axis": "by axis",
+    "by_axis_and_component": "by component",
+    "by_level": "by level",
+    "by_suite": "by suite",
+}
 CLOSER = {"by_axis_and_level": "by axis and level", "by_suite_and_axis": "by suite and axis"}
 """Groupings of ``summary`` to their titles; those of ``CLOSER`` are folded away and not plotted."""
 
