@@ -191,14 +191,16 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -
 
 
 @contextmanager
-def replay_server(chunk: int) -> Iterator[str]:
+def replay_server(*arguments: str) -> Iterator[str]:
     """A model server of vla-eval in a process of its own."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    arguments = ["--address", f"127.0.0.1:{port}", "--args.chunk", str(chunk)]
+    address = ["--address", f"127.0.0.1:{port}"]
     server = subprocess.Popen(
-        [sys.executable, "-m", "pipeline.evaluation.replay_server", *arguments], cwd=REPOSITORY, env=os.environ
+        [sys.executable, "-m", "pipeline.evaluation.replay_server", *address, *arguments],
+        cwd=REPOSITORY,
+        env=os.environ,
     )
     try:
         while server.poll() is None:
@@ -215,7 +217,7 @@ def replay_server(chunk: int) -> Iterator[str]:
 
 @pytest.mark.slow
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
-    with replay_server(chunk=8) as address:
+    with replay_server("--args.chunk", "8") as address:
         ours = tmp_path / "ours"
         arguments = ["--server", address, "--workers", "1", "--videos", "all"]
         subprocess.run(command(ours, *arguments), cwd=REPOSITORY, check=True)
@@ -240,3 +242,13 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
         assert done.returncode == 0, done.stdout + done.stderr
         (result,) = (tmp_path / "theirs").rglob("*.json")
         assert json.loads(result.read_text())["tasks"][0]["episodes"][0]["metrics"]["success"]
+
+
+@pytest.mark.slow
+def test_a_path_is_followed_by_what_an_observation_has(tmp_path: Path) -> None:
+    with replay_server("--args.tracked", "true") as address:
+        arguments = ["--suite", "libero_goal", "--server", address, "--workers", "1"]
+        subprocess.run(command(tmp_path, *arguments), cwd=REPOSITORY, check=True)
+    (row,) = rows(tmp_path).values()
+    assert row["success"]
+    assert row["looks"] == row["steps"], "feedback at every step"

@@ -109,8 +109,9 @@ def write(folder: Path, rows: list[Row]) -> Path:
 def test_folders_of_several_machines_are_one_result(subset: list[EvaluationTask], tmp_path: Path) -> None:
     one = write(tmp_path / "one", [result(task, "mine", True) for task in subset[:30]])
     other = write(tmp_path / "other", [result(task, "mine", True) for task in subset[20:]])
+    write(other, [{**result(subset[0], "mine", False, steps=0), "episode": "0", "reason": "refused"}])
     (merged,) = read([one, other])
-    assert (merged.name, len(merged.rows)) == ("mine", 60)
+    assert (merged.name, len(merged.rows), merged.refused) == ("mine", 60, 1)
     polluted = write(tmp_path / "polluted", [result(subset[0], "mine", False, prompt="benchmark")])
     assert [policy.name for policy in read([one, polluted])] == ["mine, prompt clean", "mine, prompt benchmark"]
     different = write(tmp_path / "different", [result(subset[0], "mine", False)])

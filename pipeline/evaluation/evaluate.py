@@ -177,7 +177,7 @@ class EvaluationJob:
             episode = episode_id(task, self.settings, self.policy)
             seen: dict[int, Frame] | None = None if self.videos == "none" else {}
             row = run_episode(environment, policy, task, seen)
-            if seen is not None and (self.videos == "all" or not row["success"]):
+            if seen is not None and row["steps"] and (self.videos == "all" or not row["success"]):
                 # The policy did not look at how it ended, which is what one wants to see of a failure.
                 seen[row["steps"]] = environment.image("agentview")
                 # Before the episode's own file: where that exists, nothing is missing.

@@ -25,7 +25,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     """The findings, JSON-serialisable.
 
     Returns:
-        ``policies``: name to settings, versions and ``results``, which has the rates of ``summary`` by source.
+        ``policies``: name to settings, versions, number of refused episodes, and ``results``: ``summary`` by source.
         ``paper_table``: see ``PaperTable``; None where no test task was run.
         ``comparisons``: each two policies on the episodes of a source that both ran, see ``compare``.
         ``common``: source to the number of episodes that all policies ran which ran any of it.
@@ -39,6 +39,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
             policy.name: {
                 "settings": policy.settings,
                 "versions": _versions(policy.rows),
+                "refused": policy.refused,
                 "results": {source: summary(rows) for source in sources if (rows := policy.of(source))},
             }
             for policy in policies

@@ -15,6 +15,9 @@ from pipeline.seeding import digest
 OUTCOME = ("success", "reason", "steps")
 """What two results of one episode must have in common."""
 
+REFUSED = "refused"
+"""Why an episode ended that could not begin."""
+
 
 @dataclass(frozen=True)
 class Evaluated:
@@ -23,14 +26,16 @@ class Evaluated:
     Attributes:
         name: the policy's, with the settings in which it differs from another of the same name.
         settings: what held for all its episodes.
-        rows: its episodes.
+        rows: its episodes, without those that no policy acted in.
         videos: those that there are, by the name of the episode.
+        refused: how many episodes could not begin, as their scene did not take what was drawn.
     """
 
     name: str
     settings: Mapping[str, Any]
     rows: tuple[Row, ...]
     videos: Mapping[str, Path]
+    refused: int
 
     def of(self, source: str) -> tuple[Row, ...]:
         """Its episodes on the tasks of one source."""
@@ -80,8 +85,9 @@ def _by_policy(results: Sequence[tuple[Row, EpisodeFiles]]) -> list[Evaluated]:
             Evaluated(
                 ", ".join([policy, *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
                 settings,
-                tuple(row for row, _ in group),
+                tuple(row for row, _ in group if row["reason"] != REFUSED),
                 {episode: path for episode, path in videos.items() if path.is_file()},
+                sum(row["reason"] == REFUSED for row, _ in group),
             )
         )
     return policies

@@ -21,7 +21,7 @@ TITLES = {
     "own": "Held-out draws of this project's axes",
     "libero": "LIBERO's tasks, unperturbed",
 }
-"""Of the sources of tasks; another one has its own name as title."""
+"""Of sources of tasks; others have their own names as titles."""
 
 GROUPINGS = {
     "by_axis": "by axis",
@@ -85,6 +85,7 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
             "episodes": sum(total["episodes"] for total in totals),
             "successes": sum(total["successes"] for total in totals),
         },
+        refused=sum(policy["refused"] for policy in policies.values()),
         paper=found["paper_table"],
         sections=[_section(source, found, colours) for source in found["common"]],
         failures=[
