@@ -13,6 +13,7 @@ from html_page import Page, needs_nothing_beside_itself, screenshot
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.comparison import compare, mcnemar, paired
+from pipeline.evaluation.findings import FAILURES
 from pipeline.evaluation.merging import read
 from pipeline.evaluation.paper_table import paper_table
 from pipeline.evaluation.results import EpisodeFiles, Row
@@ -153,7 +154,7 @@ def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) ->
     assert "better (first) and worse (second)" in words
     failures = found["failures"]
     axes = {(failure["policy"], failure["source"], failure["axis"]) for failure in failures}
-    assert len(failures) <= evaluation_report.FAILURES * len(axes)
+    assert len(failures) <= FAILURES * len(axes)
     assert len(page.of("video")) == sum(failure["policy"] == "worse" for failure in failures) > 5
     assert all(failure["episode"] in words for failure in failures)
 

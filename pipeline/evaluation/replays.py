@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from functools import lru_cache
 
@@ -11,15 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.evaluation.episode import Wanted
 from pipeline.evaluation.policies import Look
-from pipeline.evaluation.simulator import DUMMY_ACTION
+from pipeline.evaluation.simulator import DUMMY_ACTION, Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.physics.environment import shared
 from pipeline.physics.reference import Reference
-from pipeline.physics.roll_out import roll_out
 from pipeline.physics.tracking import Hand, Route, follow
-from pipeline.scenes.compiled import CompiledScene, proprioception
 from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene
 
@@ -86,20 +84,22 @@ def _demonstration(suite: str, base: str) -> Demo:
 
 @lru_cache(maxsize=8)
 def _reference(suite: str, base: str) -> Reference:
-    """What an observation would tell of the demonstration as it is replayed open-loop; takes 4 s."""
+    """What observations tell of the demonstration, replayed open-loop from its own first state."""
     demo = _demonstration(suite, base)
-    scene = Scene(shared(demo.task).place_fixtures(0), demo.init_state)
-    states = roll_out(scene, demo)
-    compiled = CompiledScene(scene)
-    observed = np.empty((len(states), 8))
-    for step, state in enumerate(states):
-        compiled.restore(state)
-        observed[step], _ = proprioception(compiled.data)
-    reference = Reference.of(scene.model_xml, states, demo.actions[kept_actions(demo.actions, "drop")])
+    actions = demo.actions[kept_actions(demo.actions, "drop")]
+    with closing(Simulator(demo.task)) as simulator:
+        scene = Scene(simulator.place_fixtures(0), demo.init_state)
+        simulator.start_scene(scene, settle=False)
+        states, observed = [simulator.state], [simulator.observed.state]
+        for action in actions:
+            simulator.step(action)
+            states.append(simulator.state)
+            observed.append(simulator.observed.state)
+    position_m, axis_angle, _ = np.split(np.stack(observed).astype(np.float64), (3, 6), axis=1)
     return replace(
-        reference,
-        positions_m=observed[:, :3],
-        rotations=Rotation.from_rotvec(observed[:, 3:6]),
+        Reference.of(scene.model_xml, np.stack(states), actions),
+        positions_m=position_m,
+        rotations=Rotation.from_rotvec(axis_angle),
         held={},
         carried={},
     )
