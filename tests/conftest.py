@@ -50,8 +50,14 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 """Whoever asks for one of these, or for what is made from it, is no quick test: see ``-m "not slow"``."""
 
 
-LONG = ("test_dependencies", "test_run", "test_exports", "test_cluster", "test_writers", "test_validate", "test_render")
-"""Modules that take longest: they come first, so that of several processes none is left alone with one at the end."""
+LONG = (
+    *("test_dependencies", "test_evaluation", "test_run", "test_exports", "test_cluster", "test_writers"),
+    *("test_validate", "test_render", "test_pose", "test_tracking"),
+)
+"""Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
+
+The second is one that does without the run of ``finished``, which the first makes for all.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
