@@ -126,7 +126,7 @@ def run_episode(
     changes = environment.perturbations
     row = asdict(task)
     if task.source == "own" and changes:
-        row["component"] = changes[0].component
+        row["component"] = "+".join(change.component for change in changes)
     return {
         **row,
         "success": progress.success,
@@ -223,7 +223,8 @@ def _jobs(missing: Sequence[EvaluationTask]) -> list[tuple[EvaluationTask, ...]]
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
-        moved = task.name if task.source == "libero_plus" and task.axis in ("pose", "background") else ""
+        own_scene = task.source == "libero_plus" and task.axis in ("pose", "background")
+        moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
     jobs = []
     for scene in scenes.values():

@@ -20,6 +20,7 @@ from vla_eval.specs import (
 )
 
 from pipeline import gl
+from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment, Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 
@@ -75,7 +76,9 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def reset(self, task: dict[str, Any]) -> Any:
         fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
-        self._environment.reset(EvaluationTask(**{**fields, "name": task["task_name"]}))
+        progress = self._environment.reset(EvaluationTask(**{**fields, "name": task["task_name"]}))
+        if progress.over:
+            raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
         return self._look()
 
     def step(self, action: dict[str, Any]) -> StepResult:
