@@ -115,7 +115,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         plan=arguments.plan,
     )
     policy = PolicyConfig(
-        kind="replay" if arguments.replay else "checkpoint" if arguments.checkpoint else "server",
+        kind=arguments.replay or ("checkpoint" if arguments.checkpoint else "server"),
         address=str(arguments.checkpoint or arguments.server or ""),
         label=arguments.label,
         look_every=arguments.look_every,
@@ -123,8 +123,17 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     )
     compute = ComputeConfig(cluster="loop" if arguments.workers == 1 else "local", workers=arguments.workers)
     with runner(compute, arguments.out) as run:
-        found = evaluate(selection, settings, policy, arguments.out, run, arguments.assets)
+        found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
+    return 0
+
+
+def _evaluation_report(arguments: argparse.Namespace) -> int:
+    # The benchmark's code takes seconds to import, which the other commands can do without.
+    from pipeline.evaluation.merging import read
+    from pipeline.publish import evaluation_report
+
+    print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
     return 0
 
 
@@ -294,7 +303,14 @@ def parser() -> argparse.ArgumentParser:
     acting = command.add_mutually_exclusive_group(required=True)
     acting.add_argument("--server", metavar="URL", help="address of a model server, such as ws://localhost:8000")
     acting.add_argument("--checkpoint", type=Path, metavar="DIR", help="a policy that lerobot saved")
-    acting.add_argument("--replay", action="store_true", help="the demonstrations' own actions, as a check")
+    acting.add_argument(
+        "--replay",
+        nargs="?",
+        choices=("open_loop", "tracked"),
+        const="open_loop",
+        help="the demonstrations, as a check: their own actions (open_loop, as without a value), or their paths, "
+        "followed by feedback (tracked)",
+    )
     command.add_argument(
         "--source",
         choices=("libero", "libero_plus", "own", "pairs", "goals"),
@@ -356,9 +372,31 @@ def parser() -> argparse.ArgumentParser:
         help="seconds that a server's answer may take (default: 120)",
     )
     command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one for each core)")
+    command.add_argument(
+        "--videos",
+        choices=("none", "failures", "all"),
+        default="none",
+        help="of which episodes to keep a video, of the frames that the policy looked at and the last (default: none)",
+    )
     command.set_defaults(run=_evaluate)
 
     analyses.add_commands(commands)
+
+    command = commands.add_parser(
+        "evaluation-report",
+        help="write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures",
+        description="Reads the folders that `evaluate` wrote, on one machine or on several, and sets different "
+        "policies side by side. Two different results of one episode are an error. The last line is JSON.",
+    )
+    command.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="folder of results")
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("report.html"),
+        metavar="FILE",
+        help="page to write, with a JSON file of the same name beside it (default: report.html)",
+    )
+    command.set_defaults(run=_evaluation_report)
 
     command = commands.add_parser(
         "check-oft",

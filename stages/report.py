@@ -1,14 +1,14 @@
 """Stage report: one HTML page about the run, with its counts, plots, pictures and videos in it."""
 
 from pipeline.config import Config
-from pipeline.publish import report
+from pipeline.publish import pages, report
 from pipeline.run.stage import main
 from pipeline.testset import benchmark
 
 
 def run(config: Config) -> None:
     file = config.data / report.FILE
-    report.write(report.page(config, benchmark.load()), file)
+    pages.write(report.page(config, benchmark.load()), file)
     print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB), which opens in any browser")
 
 

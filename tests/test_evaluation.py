@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from conftest import REPOSITORY, STOVE
@@ -181,7 +182,8 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -
     assert len(first) == 1
     subprocess.run(command(alone, "--replay", "--workers", "1"), cwd=REPOSITORY, check=True)
     assert all(path.stat().st_mtime_ns == when for path, when in first.items()), "a finished episode is kept"
-    subprocess.run(command(spread, "--replay", "--workers", "2"), cwd=REPOSITORY, check=True)
+    subprocess.run(command(spread, "--replay", "--workers", "2", "--videos", "failures"), cwd=REPOSITORY, check=True)
+    assert not (spread / "videos").exists(), "nothing failed"
     assert len(rows(alone)) == 2
     assert rows(alone) == rows(spread)
     found = json.loads((alone / "summary.json").read_text())
@@ -216,10 +218,14 @@ def model_server(module: str, *arguments: str) -> Iterator[str]:
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
     with model_server("pipeline.evaluation.replay_server", "--args.chunk", "8") as address:
         ours = tmp_path / "ours"
-        subprocess.run(command(ours, "--server", address, "--workers", "1"), cwd=REPOSITORY, check=True)
-        for row in rows(ours).values():
+        arguments = ["--server", address, "--workers", "1", "--videos", "all"]
+        subprocess.run(command(ours, *arguments), cwd=REPOSITORY, check=True)
+        for episode, row in rows(ours).items():
             assert row["success"]
             assert row["looks"] == -(-row["steps"] // 8), "a chunk of eight actions takes one look"
+            with av.open(str(ours / "videos" / f"{episode}.mp4")) as video:
+                steps = [round(frame.time * 20) for frame in video.decode(video=0)]
+            assert steps == [*range(0, row["steps"], 8), row["steps"]], "what it looked at, and the end"
         config = tmp_path / "harness.yaml"
         params = {
             "selection": {"suites": ["libero_goal"], "tasks": ["turn_on*"]},
@@ -235,3 +241,13 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
         assert done.returncode == 0, done.stdout + done.stderr
         (result,) = (tmp_path / "theirs").rglob("*.json")
         assert json.loads(result.read_text())["tasks"][0]["episodes"][0]["metrics"]["success"]
+
+
+@pytest.mark.slow
+def test_a_path_is_followed_by_what_an_observation_has(tmp_path: Path) -> None:
+    with model_server("pipeline.evaluation.replay_server", "--args.tracked", "true") as address:
+        arguments = ["--suite", "libero_goal", "--server", address, "--workers", "1"]
+        subprocess.run(command(tmp_path, *arguments), cwd=REPOSITORY, check=True)
+    (row,) = rows(tmp_path).values()
+    assert row["success"]
+    assert row["looks"] == row["steps"], "feedback at every step"

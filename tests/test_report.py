@@ -5,11 +5,8 @@ from __future__ import annotations
 import base64
 import io
 import json
-import re
 import shutil
-import subprocess
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import get_args
 
@@ -19,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from conftest import REPOSITORY, tiny_config
+from html_page import Page, needs_nothing_beside_itself, screenshot
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -26,48 +24,15 @@ from pipeline.axes import AnyPerturbation, Axes, to_json
 from pipeline.config import Config, RenderConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
-from pipeline.publish import clips, coverage, figures, report, yields
+from pipeline.publish import clips, coverage, figures, pages, report, yields
 from pipeline.publish.coverage import Draw
 from pipeline.rendering.jpeg import encode
+from pipeline.rendering.mp4 import VIDEO_BYTES
 from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
 
-LOADED = {"src", "poster", "srcset", "xlink:href", "data"}
-"""Attributes that a browser follows by itself."""
-
 LIMIT_BYTES = 15_000_000
-
-BROWSER = "chromium-headless-shell"
-"""Chromium without a desktop: a third of the packages, and all that a screenshot needs."""
-
-
-class Page(HTMLParser):
-    """What a page consists of."""
-
-    def __init__(self, html: str):
-        super().__init__()
-        self.tags: list[tuple[str, dict[str, str]]] = []
-        self.unclosed: list[str] = []
-        self.text = ""
-        self.feed(html)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, {name: value or "" for name, value in attrs}))
-        if tag not in ("meta", "link", "img", "br", "input"):
-            self.unclosed.append(tag)
-
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append((tag, {name: value or "" for name, value in attrs}))
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.unclosed.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += f"{data} "
-
-    def of(self, tag: str) -> list[dict[str, str]]:
-        return [attributes for name, attributes in self.tags if name == tag]
 
 
 @pytest.fixture(scope="module")
@@ -88,14 +53,8 @@ def page(html: str) -> Page:
     return Page(html)
 
 
-def test_needs_nothing_beside_itself(html: str, page: Page) -> None:
-    assert not page.unclosed
-    assert not page.of("script")
-    assert not page.of("link")
-    loaded = [value for _, attributes in page.tags for name, value in attributes.items() if name in LOADED]
-    assert {value.split(":")[0] for value in loaded if not value.startswith("#")} == {"data"}
-    assert "http" not in re.sub(r"data:[a-z0-9/]+;base64,[A-Za-z0-9+/=\s]+", "", html)
-    assert not re.search(r"@import|url\((?!#)", html)
+def test_needs_nothing_beside_itself(html: str) -> None:
+    needs_nothing_beside_itself(html)
     assert len(html) < LIMIT_BYTES
 
 
@@ -137,7 +96,7 @@ def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Pa
         assert np.std(np.asarray(Image.open(io.BytesIO(_content(picture["src"]))))) > 20
     videos = [_content(video["src"]) for video in page.of("video")]
     assert len(videos) == 2  # camera and noise; a rewritten instruction shows in no frame
-    assert max(map(len, videos)) <= clips.VIDEO_BYTES
+    assert max(map(len, videos)) <= VIDEO_BYTES
 
 
 def test_a_combination_counts_with_each_of_its_axes() -> None:
@@ -163,7 +122,7 @@ def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
 
 def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
     noise = [_still(rng(1, frame).integers(0, 256, (256, 256, 3)).astype(np.uint8)) for frame in range(60)]
-    assert len(_content(clips.beside(noise, noise).video)) <= clips.VIDEO_BYTES
+    assert len(_content(clips.beside(noise, noise).video)) <= VIDEO_BYTES
 
 
 @pytest.mark.parametrize("name", sorted(Axes.model_fields))
@@ -226,16 +185,8 @@ def test_a_run_that_kept_nothing_is_refused(
 
 @pytest.mark.parametrize("width_px", [360, 1200])
 def test_a_browser_shows_it(html: str, width_px: int, tmp_path: Path) -> None:
-    assert shutil.which(BROWSER), f"{BROWSER} is not installed; bash setup.sh test installs it"
-    report.write(html, tmp_path / "report.html")
-    picture = tmp_path / "shown.png"
-    options = ("--no-sandbox", "--disable-gpu", "--no-first-run", "--hide-scrollbars")
-    quiet = ("--disable-background-networking", "--disable-component-update", "--disable-sync")
-    target = (f"--screenshot={picture}", f"--window-size={width_px},3000", f"--user-data-dir={tmp_path / 'profile'}")
-    command = [BROWSER, *options, *quiet, *target, (tmp_path / "report.html").as_uri()]
-    subprocess.run(command, check=True, capture_output=True, timeout=120)
-    shown = np.asarray(Image.open(picture).convert("L"), float)
-    assert shown.shape == (3000, width_px)
+    pages.write(html, tmp_path / "report.html")
+    shown = screenshot(tmp_path / "report.html", width_px, 3000)
     # Something on every screenful, and a margin that nothing runs into.
     assert all(screenful.std() > 5 for screenful in np.split(shown, 5))
     assert shown[400:, -6:].std() < 25

@@ -76,11 +76,13 @@ class Wanted(NamedTuple):
         state: position, axis-angle and fingers.
         shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
             robosuite and OpenVLA's data have it.
+        images: any view at all; without them nothing is rendered.
     """
 
     wrist: bool = True
     state: bool = True
     shortest_rotation: bool = False
+    images: bool = True
 
 
 @dataclass(frozen=True)
@@ -207,7 +209,7 @@ class EpisodeEnvironment:
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
         """What a policy sees, as vla-eval names it: ``images``, ``states`` (8,) and ``task_description``."""
-        views = VIEWS if wanted.wrist else ("agentview",)
+        views = () if not wanted.images else VIEWS if wanted.wrist else ("agentview",)
         seen: dict[str, Any] = {
             "images": {view: self.image(view) for view in views},
             "task_description": self.instruction,

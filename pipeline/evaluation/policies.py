@@ -14,11 +14,7 @@ import numpy as np
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import Wanted
-from pipeline.evaluation.simulator import DUMMY_ACTION
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.libero.demonstrations import StarterSource
-from pipeline.libero.tasks import find_task
-from pipeline.scenes.noops import kept_actions
 from pipeline.types import Floats
 
 _VIEWS = {"image": "agentview", "wrist_image": "wrist"}
@@ -165,34 +161,6 @@ class Server:
     def _fault(self, what: str) -> PolicyError:
         self._loop.run_until_complete(self._connection.close())
         return PolicyError(what, where=self.name, remedy="see the server's log")
-
-
-class Replay:
-    """The actions of the starter set's demonstration, open-loop and without no-ops, then nothing.
-
-    Args:
-        chunk: how many actions at a time.
-    """
-
-    name = "replay"
-
-    def __init__(self, chunk: int = 8):
-        self._chunk = chunk
-
-    def begin(self, task: EvaluationTask) -> None:
-        source = StarterSource()
-        entry = source.index([find_task(task.suite, task.base)]).entries[0]
-        recorded = source.load(entry.demo_id).actions
-        self._actions, self._taken = recorded[kept_actions(recorded, "drop")], 0
-
-    def act(self, look: Look) -> Floats:
-        actions = self._actions[self._taken : self._taken + self._chunk]
-        self._taken += self._chunk
-        return actions if len(actions) else np.tile(DUMMY_ACTION, (self._chunk, 1))
-
-    def end(self, success: bool) -> None: ...
-
-    def close(self) -> None: ...
 
 
 class Checkpoint:

@@ -1,6 +1,6 @@
 """A model server of vla-eval that replays LIBERO's demonstrations with its eyes closed: what evaluation must score.
 
-``python -m pipeline.evaluation.replay_server --address localhost:8000 --args.chunk 8``
+``python -m pipeline.evaluation.replay_server --address localhost:8000 --args.chunk 8``, or ``--args.tracked true``
 """
 
 from __future__ import annotations
@@ -9,9 +9,16 @@ from typing import Any
 
 from vla_eval.model_servers.base import ModelServer, SessionContext
 from vla_eval.model_servers.serve import run_server
-from vla_eval.specs import GRIPPER_CLOSE_POS, IMAGE_RGB, POSITION_DELTA, ROTATION_AA, DimSpec
+from vla_eval.specs import (
+    GRIPPER_CLOSE_POS,
+    IMAGE_RGB,
+    POSITION_DELTA,
+    ROTATION_AA,
+    STATE_EEF_POS_AA_GRIP,
+    DimSpec,
+)
 
-from pipeline.evaluation.policies import Replay
+from pipeline.evaluation.replays import Replay, TrackedReplay
 from pipeline.evaluation.tasks import EvaluationTask
 
 
@@ -19,28 +26,33 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
     """Answers with the actions of the starter set's demonstration of the task.
 
     Args:
-        chunk: how many actions each answer has; all are taken before the next look.
+        chunk: how many actions each answer has; all are taken before the next look. Of no effect when tracked.
+        tracked: follow the demonstration's path by the state in each observation, one action at a time.
     """
 
-    def __init__(self, *, chunk: int = 1):
-        self._chunk = chunk
-        self._replays: dict[str, Replay] = {}
+    def __init__(self, *, chunk: int = 1, tracked: bool = False):
+        self._chunk, self._tracked = chunk, tracked
+        self._replays: dict[str, Replay | TrackedReplay] = {}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         task = config["task"]
         fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
-        replay = self._replays[ctx.session_id] = Replay(self._chunk)
+        replay = self._replays[ctx.session_id] = TrackedReplay() if self._tracked else Replay(self._chunk)
         replay.begin(EvaluationTask(**{**fields, "name": task["task_name"]}))
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
         actions = self._replays[ctx.session_id].act(lambda _: obs)
-        await ctx.send_action({"actions": actions[0] if self._chunk == 1 else actions})
+        # A chunk of one is sent as one action (7,).
+        await ctx.send_action({"actions": actions.squeeze()})
+
+    def get_observation_params(self) -> dict[str, Any]:
+        return {"send_state": self._tracked}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
-        return {"image": IMAGE_RGB}
+        return {"image": IMAGE_RGB, **({"state": STATE_EEF_POS_AA_GRIP} if self._tracked else {})}
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pipeline.files import replaced
 Row = dict[str, Any]
 """One episode's result, JSON-serialisable."""
 
-GROUPINGS = (("suite",), ("axis",), ("component",), ("level",), ("axis", "level"), ("suite", "axis"))
+GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
 """What success rates are given by, beside the whole."""
 
 _Z = 1.959963984540054
@@ -23,13 +23,23 @@ _Z = 1.959963984540054
 
 
 class EpisodeFiles:
-    """``<folder>/episodes/<episode>.json``: a file that exists is complete, so a run goes on where it was killed."""
+    """``<folder>/episodes/<episode>.json``: a file that exists is complete, so a run goes on where it was killed.
+
+    ``<folder>/videos/<episode>.mp4`` is there for some, and then before the episode's own file.
+    """
 
     def __init__(self, folder: Path):
-        self.folder = folder / "episodes"
+        self.folder, self._videos = folder / "episodes", folder / "videos"
 
     def path(self, episode: str) -> Path:
         return self.folder / f"{episode}.json"
+
+    def video(self, episode: str) -> Path:
+        return self._videos / f"{episode}.mp4"
+
+    def save_video(self, episode: str, content: bytes) -> None:
+        with replaced(self.video(episode)) as temporary:
+            temporary.write_bytes(content)
 
     def save(self, row: Row) -> None:
         with replaced(self.path(row["episode"])) as temporary:
@@ -48,7 +58,7 @@ class EpisodeFiles:
                 raise PipelineError(f"not a result ({error})", where=path, remedy="delete it and run again") from error
 
 
-def wilson(successes: int, trials: int) -> tuple[float, float]:
+def wilson(successes: float, trials: float) -> tuple[float, float]:
     """The 95 % interval of a success rate (Wilson, 1927); it holds for few trials and for rates near 0 and 1."""
     if trials == 0:
         return 0.0, 1.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import matplotlib as mpl
@@ -169,6 +169,32 @@ def bars(title: str, counts: Mapping[str, int], group: str, label: str) -> Panel
         axes.grid(visible=False, axis="y")
 
     return panel(title, draw, 0.8 + 0.2 * len(ordered))
+
+
+class Share(NamedTuple):
+    """A share in [0, 1] with its interval, and the colour that it is drawn in."""
+
+    share: float
+    low: float
+    high: float
+    colour: str
+
+
+def intervals(title: str, rows: Mapping[str, Sequence[Share]], label: str) -> Panel:
+    """A line for each row with its shares and their intervals, below each other."""
+    most = max(map(len, rows.values()))
+
+    def draw(axes: Axes) -> None:
+        for height, shares in enumerate(rows.values()):
+            for place, shown in enumerate(shares):
+                at = height + 0.6 * ((place + 0.5) / most - 0.5)
+                axes.plot([shown.low, shown.high], [at, at], color=shown.colour, linewidth=1.6, solid_capstyle="butt")
+                axes.plot([shown.share], [at], "o", color=shown.colour, markersize=4.5)
+        axes.set_yticks(range(len(rows)), [name.replace("_", " ") for name in rows])
+        axes.set(xlabel=label, xlim=(-0.02, 1.02), ylim=(len(rows) - 0.5, -0.5))
+        axes.grid(visible=False, axis="y")
+
+    return panel(title, draw, 0.8 + (0.14 + 0.12 * most) * len(rows))
 
 
 def _references_first(groups: Groups) -> list[tuple[str, Values]]:

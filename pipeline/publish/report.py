@@ -10,15 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.axes import from_json
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
 from pipeline.libero.tasks import find_task
-from pipeline.publish import clips, coverage, figures, yields
+from pipeline.publish import clips, coverage, figures, pages, yields
 from pipeline.publish.clips import Clip
 from pipeline.publish.coverage import AxisPlots, Draw
 from pipeline.publish.figures import Panel
@@ -67,15 +65,8 @@ def page(config: Config, test: TestSet) -> str:
     actions = _actions(kept, FrameStore(data / "frames", config.render))
     axes = list(dict.fromkeys(row["axis"] for row in kept))
     sheets = _pictures(data / "sheets")
-    environment = Environment(
-        loader=PackageLoader("pipeline.publish"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.globals["colour"] = figures.colour
-    return environment.get_template("report.html.j2").render(
+    return pages.render(
+        "report.html.j2",
         name=config.name,
         headline=_headline(asked, kept),
         yields=yields.tables(asked),
@@ -93,11 +84,6 @@ def page(config: Config, test: TestSet) -> str:
         example=min(row["episode_id"] for row in kept),
         settings=_settings(config),
     )
-
-
-def write(html: str, path: Path) -> None:
-    with replaced(path) as temporary:
-        temporary.write_text(html)
 
 
 def _headline(asked: Rows, kept: Rows) -> dict[str, str]:

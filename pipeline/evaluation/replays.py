@@ -1,0 +1,105 @@
+"""Scripted policies that repeat the starter set's demonstration of a task: what an evaluation can be checked with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipeline.evaluation.episode import Wanted
+from pipeline.evaluation.policies import Look
+from pipeline.evaluation.simulator import DUMMY_ACTION, Simulator
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
+from pipeline.physics.reference import Reference
+from pipeline.physics.tracking import Hand, Route, follow
+from pipeline.scenes.noops import kept_actions
+from pipeline.types import Demo, Floats, Scene
+
+
+class Replay:
+    """The demonstration's actions, open-loop and without no-ops, then nothing.
+
+    Args:
+        chunk: how many actions at a time.
+    """
+
+    name = "replay"
+
+    def __init__(self, chunk: int = 8):
+        self._chunk = chunk
+
+    def begin(self, task: EvaluationTask) -> None:
+        recorded = _demonstration(task.suite, task.base).actions
+        self._actions, self._taken = recorded[kept_actions(recorded, "drop")], 0
+
+    def act(self, look: Look) -> Floats:
+        actions = self._actions[self._taken : self._taken + self._chunk]
+        self._taken += self._chunk
+        return actions if len(actions) else np.tile(DUMMY_ACTION, (self._chunk, 1))
+
+    def end(self, success: bool) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class TrackedReplay:
+    """Follows the hand's path of the demonstration by feedback, one action at a time.
+
+    The law is that of the tracked replay that makes datasets (``pipeline.physics.tracking``). It has the end effector's
+    pose alone, which is all that an observation tells, so it does not know where objects are: it goes where the
+    demonstration went, from wherever the arm starts.
+    """
+
+    name = "tracked replay"
+
+    def begin(self, task: EvaluationTask) -> None:
+        self._reference = _reference(task.suite, task.base)
+        self._actions: Iterator[Floats] | None = None
+
+    def act(self, look: Look) -> Floats:
+        position, axis_angle, _ = np.split(look(Wanted(images=False))["states"].astype(np.float64), (3, 6))
+        self._hand: Hand = position, Rotation.from_rotvec(axis_angle)
+        if self._actions is None:
+            route = Route.through(self._reference, self._hand, {})
+            # Nothing is held in this reference, so that no object's pose is asked for.
+            self._actions = follow(route, lambda: self._hand, lambda _: np.zeros(7))
+        # At the end of the path the hand rests, and holds or lets go as the demonstration did.
+        return next(self._actions, np.append(np.zeros(6), self._reference.actions[-1, 6]))
+
+    def end(self, success: bool) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def _demonstration(suite: str, base: str) -> Demo:
+    source = StarterSource()
+    return source.load(source.index([find_task(suite, base)]).entries[0].demo_id)
+
+
+@lru_cache(maxsize=8)
+def _reference(suite: str, base: str) -> Reference:
+    """What observations tell of the demonstration, replayed open-loop from its own first state."""
+    demo = _demonstration(suite, base)
+    actions = demo.actions[kept_actions(demo.actions, "drop")]
+    with closing(Simulator(demo.task)) as simulator:
+        scene = Scene(simulator.place_fixtures(0), demo.init_state)
+        simulator.start_scene(scene, settle=False)
+        states, observed = [simulator.state], [simulator.observed.state]
+        for action in actions:
+            simulator.step(action)
+            states.append(simulator.state)
+            observed.append(simulator.observed.state)
+    position_m, axis_angle, _ = np.split(np.stack(observed).astype(np.float64), (3, 6), axis=1)
+    return replace(
+        Reference.of(scene.model_xml, np.stack(states), actions),
+        positions_m=position_m,
+        rotations=Rotation.from_rotvec(axis_angle),
+        held={},
+        carried={},
+    )

@@ -1,0 +1,29 @@
+"""HTML pages from ``templates/``, that need nothing beside themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from pipeline.files import replaced
+from pipeline.publish import figures
+
+
+def render(template: str, **values: Any) -> str:
+    """A page; names that ``values`` lacks are an error, and what they hold is escaped."""
+    environment = Environment(
+        loader=PackageLoader("pipeline.publish"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals["colour"] = figures.colour
+    return environment.get_template(template).render(**values)
+
+
+def write(html: str, path: Path) -> None:
+    with replaced(path) as temporary:
+        temporary.write_text(html)

@@ -1,0 +1,171 @@
+"""The report of evaluations says what the episodes' files say: merged, weighted, compared, beside published rows."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from html_page import Page, needs_nothing_beside_itself, screenshot
+
+from pipeline.errors import PipelineError
+from pipeline.evaluation.comparison import compare, mcnemar, paired
+from pipeline.evaluation.findings import FAILURES
+from pipeline.evaluation.merging import read
+from pipeline.evaluation.paper_table import paper_table
+from pipeline.evaluation.results import EpisodeFiles, Row
+from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.publish import evaluation_report
+from pipeline.rendering.mp4 import mp4
+from pipeline.seeding import digest
+
+
+@pytest.fixture(scope="module")
+def subset() -> list[EvaluationTask]:
+    return select(Selection(source="libero_plus", subset=60))
+
+
+def result(task: EvaluationTask, policy: str, success: bool, prompt: str = "clean", steps: int = 100) -> Row:
+    return {
+        **asdict(task),
+        "episode": digest(str(task), policy, prompt)[:16],
+        "policy": policy,
+        "success": success,
+        "reason": "success" if success else "step_limit",
+        "steps": steps,
+        "looks": steps // 8,
+        "seed": 0,
+        "prompt": "turn on the stove",
+        "perturbations": [],
+        "settings": {"prompt": prompt, "seed": 0},
+        "versions": {"mujoco": "3.2.7", "opengl": "llvmpipe"},
+    }
+
+
+def test_the_published_rows_are_whole_and_add_up() -> None:
+    table = paper_table({})
+    assert sum(table.tasks.values()) == 10_030
+    assert len(table.published) == 11
+    for row in table.published:
+        # Each total is the mean over tasks of the columns, all of them rounded to a tenth.
+        assert row.shared == pytest.approx(row.total, abs=0.1), row.name
+
+
+def test_an_episode_counts_for_the_test_tasks_that_it_stands_for() -> None:
+    robot = {task.level: task for task in select(Selection(source="libero_plus", axes=("robot",)))}
+    line = paper_table({"mine": [result(robot[1], "mine", True), result(robot[5], "mine", False)]}).evaluated[0]
+    # 156 tasks of level 1 and 371 of level 5: 156 / 527, and 527^2 / (156^2 + 371^2) episodes' worth.
+    assert line.cells["robot"].rate == pytest.approx(0.29602, abs=1e-5)
+    assert line.cells["robot"].effective == pytest.approx(1.71462, abs=1e-5)
+    assert line.cells.keys() == {"robot"}
+    assert line.total is None
+    assert line.shared is not None
+    assert line.shared.rate == line.cells["robot"].rate
+    assert "level 2" in line.cells["robot"].absent
+
+
+def test_all_tasks_of_a_column_weigh_the_same() -> None:
+    rows = [result(task, "mine", task.level == 1) for task in select(Selection(source="libero_plus", axes=("camera",)))]
+    (line,) = paper_table({"mine": rows}).evaluated
+    # Of level 1: 10 by distance, 6 by orientation, 117 by spherical position.
+    assert line.cells["camera"].rate == pytest.approx(133 / 1599)
+    assert line.cells["camera"].effective == pytest.approx(1599)
+    assert line.cells["camera"].absent == ""
+
+
+def test_a_column_says_what_it_does_not_rest_on() -> None:
+    rows = [result(task, "mine", True) for task in select(Selection(source="libero_plus", axes=("pose",)))]
+    (line,) = paper_table({"mine": rows}).evaluated
+    assert line.cells["layout"].episodes == 696
+    assert line.cells["layout"].absent == "confounding objects (829 tasks)"
+
+
+def test_mcnemars_test_is_exact() -> None:
+    # 5 and 1 of 6: 2 (1 + 6) / 2^6.
+    assert mcnemar(5, 1) == mcnemar(1, 5) == pytest.approx(14 / 64)
+    assert mcnemar(0, 0) == mcnemar(3, 3) == 1
+
+
+def test_policies_are_compared_on_the_episodes_that_both_ran(subset: list[EvaluationTask]) -> None:
+    first = [result(task, "first", True) for task in subset[:10]]
+    second = [result(task, "second", at % 2 == 0) for at, task in enumerate(subset[4:])]
+    pairs = paired(first, second)
+    assert len(pairs) == 6
+    whole = compare(pairs)["all"]
+    assert (whole["both"], whole["only_first"], whole["only_second"], whole["neither"]) == (3, 3, 0, 0)
+    assert whole["p_value"] == pytest.approx(0.25)
+    assert sum(axis["episodes"] for axis in compare(pairs)["by_axis"].values()) == 6
+
+
+def write(folder: Path, rows: list[Row]) -> Path:
+    files = EpisodeFiles(folder)
+    for row in rows:
+        files.save(row)
+    return folder
+
+
+def test_folders_of_several_machines_are_one_result(subset: list[EvaluationTask], tmp_path: Path) -> None:
+    one = write(tmp_path / "one", [result(task, "mine", True) for task in subset[:30]])
+    other = write(tmp_path / "other", [result(task, "mine", True) for task in subset[20:]])
+    write(other, [{**result(subset[0], "mine", False, steps=0), "episode": "0", "reason": "refused"}])
+    (merged,) = read([one, other])
+    assert (merged.name, len(merged.rows), merged.refused) == ("mine", 60, 1)
+    polluted = write(tmp_path / "polluted", [result(subset[0], "mine", False, prompt="benchmark")])
+    assert [policy.name for policy in read([one, polluted])] == ["mine, prompt clean", "mine, prompt benchmark"]
+    different = write(tmp_path / "different", [result(subset[0], "mine", False)])
+    with pytest.raises(PipelineError, match=r"two results of libero_plus.*'success': True.*'success': False"):
+        read([one, different])
+    with pytest.raises(PipelineError, match="no results"):
+        read([one, tmp_path / "absent"])
+
+
+@pytest.fixture(scope="module")
+def written(subset: list[EvaluationTask], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page about two policies, one with videos."""
+    folder = tmp_path_factory.mktemp("results")
+    tasks = [*subset, *select(Selection(suites=("libero_goal",)))]
+    better = write(folder / "better", [result(task, "better", at % 4 > 0) for at, task in enumerate(tasks)])
+    worse = write(folder / "worse", [result(task, "worse", at % 4 == 0) for at, task in enumerate(tasks)])
+    film = mp4([np.full((256, 256, 3), grey, np.uint8) for grey in (0, 90, 200)], [0, 8, 20])
+    for path in (worse / "episodes").glob("*.json"):
+        EpisodeFiles(worse).save_video(path.stem, film)
+    evaluation_report.write(read([better, worse]), folder / "report.html")
+    return folder / "report.html"
+
+
+def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) -> None:
+    html = written.read_text()
+    needs_nothing_beside_itself(html)
+    page = Page(html)
+    words = " ".join(page.text.split())
+    found: dict[str, Any] = json.loads(written.with_suffix(".json").read_text())
+    for row in found["paper_table"]["published"]:
+        assert " ".join([row["name"], *map(str, row["rates"].values()), str(row["total"])]) in words
+    for policy in found["policies"].values():
+        for one in policy["results"].values():
+            assert f"{100 * one['all']['rate']:.1f} %" in words
+            for group in (*one["by_axis"].values(), *one["by_level"].values(), *one["by_suite"].values()):
+                assert f"), {group['successes']}/{group['episodes']}" in words
+    assert "confounding objects (829 tasks)" in words
+    assert "ran the same 60 episodes" in words
+    assert "better (first) and worse (second)" in words
+    failures = found["failures"]
+    axes = {(failure["policy"], failure["source"], failure["axis"]) for failure in failures}
+    assert len(failures) <= FAILURES * len(axes)
+    assert len(page.of("video")) == sum(failure["policy"] == "worse" for failure in failures) > 5
+    assert all(failure["episode"] in words for failure in failures)
+
+
+@pytest.mark.parametrize("width_px", [360, 1200])
+def test_a_browser_shows_it(written: Path, width_px: int) -> None:
+    shown = screenshot(written, width_px, 3000)
+    assert all(screenful.std() > 5 for screenful in np.split(shown, 5))
+    assert shown[400:, -6:].std() < 25
+
+
+def test_the_page_has_the_name_of_a_page(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="not the name of a page"):
+        evaluation_report.write([], tmp_path / "report.json")
