@@ -91,8 +91,8 @@ def _expand(arguments: argparse.Namespace) -> int:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     # The simulator takes seconds to import, which the other commands can do without.
-    from pipeline.evaluation.episode import Settings
     from pipeline.evaluation.evaluate import PolicyConfig, evaluate
+    from pipeline.evaluation.settings import Settings
     from pipeline.evaluation.tasks import Selection
 
     selection = Selection(

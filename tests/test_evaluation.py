@@ -30,8 +30,9 @@ from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 from pipeline.axes.camera import CameraPerturbation  # noqa: E402
 from pipeline.errors import PipelineError  # noqa: E402
 from pipeline.evaluation import libero_plus  # noqa: E402
-from pipeline.evaluation.episode import EpisodeEnvironment, Wanted  # noqa: E402
+from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.initial_states import libero_states  # noqa: E402
+from pipeline.evaluation.settings import Wanted  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select  # noqa: E402
 from pipeline.rendering.jpeg import to_policy  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
@@ -97,8 +98,8 @@ def test_a_camera_task_is_seen_from_the_axis_camera(evaluated: EpisodeEnvironmen
     clean = evaluated.observation(Wanted())["images"]
     evaluated.reset(task)
     moved = evaluated.observation(Wanted())["images"]
-    assert evaluated._renderer is not None
-    camera = evaluated._renderer.model.camera("agentview")
+    assert evaluated._picture._renderer is not None
+    camera = evaluated._picture._renderer.model.camera("agentview")
     test = libero_plus.by_name()[task.suite, task.name]
     own = CameraPerturbation.model_validate({"component": test.component, "level": 1, **test.parameters})
     nominal = evaluated._opened.model.camera("agentview")

@@ -21,9 +21,10 @@ from pipeline.evaluation import composition, construction, disjoint, goals
 from pipeline.evaluation.composition import Pair
 from pipeline.evaluation.construction import candidates, construct, difficulty
 from pipeline.evaluation.disjoint import PlannedDraws
-from pipeline.evaluation.episode import EpisodeEnvironment, Settings, Wanted
+from pipeline.evaluation.episode import EpisodeEnvironment
 from pipeline.evaluation.held_out import OWN_AXES
 from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, draw, select
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
@@ -301,7 +302,7 @@ def test_nothing_is_said_and_black_views_are_not_rendered() -> None:
         "agentview": ((256, 256, 3), np.False_),
         "wrist": ((256, 256, 3), np.False_),
     }
-    assert environment._renderer is None
+    assert environment._picture._renderer is None
     environment.settings = Settings(black="agentview")
     environment.reset(task)
     images = environment.observation(Wanted())["images"]

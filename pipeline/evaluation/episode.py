@@ -4,85 +4,33 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, field_serializer
 
-from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, of_layer
-from pipeline.axes.base import Frozen
+from pipeline.axes import AnyPerturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import disjoint, goals, libero_plus
 from pipeline.evaluation.asset_archive import Assets, having
 from pipeline.evaluation.drawn_scene import drawn_scene
 from pipeline.evaluation.initial_states import libero_states, moved_state
-from pipeline.evaluation.libero_plus import Prompt
+from pipeline.evaluation.picture import VIEWS, Picture
+from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.simulator import Observed, Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.rendering.jpeg import to_policy
-from pipeline.rendering.renderer import Renderer
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Demo, Floats, Frame, Scene, Task
 
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
 """Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
-
-VIEWS = {"agentview": "agentview", "wrist": "robot0_eye_in_hand"}
-"""What policies call the two views, and their cameras in the scene."""
-
-
-class Settings(Frozen):
-    """What holds for all episodes of an evaluation.
-
-    Attributes:
-        prompt: the wording of test tasks; ``blank`` says nothing in any task.
-        black: which views are black, to see what a policy does without them.
-        seed: of held-out draws and of noise that is random.
-        fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
-        initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
-            starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
-            Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
-        plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
-            it by the SHA-256 of its file.
-    """
-
-    prompt: Prompt | Literal["blank"] = "clean"
-    seed: int = 0
-    fixture_seed: int = 0
-    initial_states: Literal["libero", "demonstration"] = "libero"
-    # What came later is left out where it is not used, so that results keep their names.
-    black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
-    plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
-
-    @field_serializer("plan")
-    def _name_by_content(self, plan: Path) -> str:
-        return disjoint.sha256_of(plan)
-
-
-class Wanted(NamedTuple):
-    """What a policy asks to see.
-
-    Attributes:
-        wrist: the wrist's view beside the agent view.
-        state: position, axis-angle and fingers.
-        shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
-            robosuite and OpenVLA's data have it.
-        images: any view at all; without them nothing is rendered.
-    """
-
-    wrist: bool = True
-    state: bool = True
-    shortest_rotation: bool = False
-    images: bool = True
 
 
 @dataclass(frozen=True)
@@ -116,10 +64,7 @@ class EpisodeEnvironment:
         self.settings, self._archive = settings, archive
         self._simulator: Simulator | None = None
         self._key: tuple[str, ...] = ()
-        self._renderer: Renderer | None = None
-        self._rendered: object = None
-        self._changes = ExitStack()
-        self._looks_changed = False
+        self._picture = Picture()
         self._perturbations: tuple[AnyPerturbation, ...] = ()
         self._running = False
 
@@ -129,7 +74,7 @@ class EpisodeEnvironment:
         Raises:
             PipelineError: when the task cannot be rebuilt here.
         """
-        self._restore_looks()
+        self._picture.restore()
         self._running = False
         self.task, self._base = task, find_task(task.suite, task.base)
         self.limit = STEP_LIMITS[task.suite]
@@ -204,7 +149,8 @@ class EpisodeEnvironment:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
         if view not in self._seen:
             black = self.settings.black in (view, "all")
-            self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8) if black else self._render(view)
+            looked = partial(self._picture.frame, view, self.observed, self._perturbations, self._progress.steps)
+            self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8) if black else looked()
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
@@ -222,7 +168,7 @@ class EpisodeEnvironment:
         return seen
 
     def close(self) -> None:
-        self._close_renderer()
+        self._picture.close()
         if self._simulator is not None:
             self._simulator.close()
             self._simulator = None
@@ -254,7 +200,7 @@ class EpisodeEnvironment:
         noise = (libero_plus.noise(test, self.settings.seed),) if test.axis == "noise" else ()
         self._perturbations = (libero_plus.camera(test), *noise)
         self._opened.start(self.settings.fixture_seed, state, posture)
-        self._show()
+        self._picture.show(self._opened.model)
 
     def _start_goal(self) -> None:
         """Start LIBERO's own task with another goal."""
@@ -267,7 +213,7 @@ class EpisodeEnvironment:
         states = libero_states(self._base)
         number = self.task.number % len(states)
         self._opened.start(self.settings.fixture_seed + number, states[number])
-        self._show()
+        self._picture.show(self._opened.model)
 
     def _start_libero(self) -> None:
         """Start LIBERO's own task, or held-out draws on it.
@@ -299,12 +245,12 @@ class EpisodeEnvironment:
         settle = self.settings.initial_states == "libero"
         if scene is None and settle:
             self._opened.start(seed, demo.init_state)
-            self._show()
+            self._picture.show(self._opened.model)
             return
         # A demonstration was recorded from its first state on, by an arm that holds the posture it starts in.
         scene = scene or self._nominal(seed, demo)
         self._opened.start_scene(scene, settle)
-        self._show(scene.model_xml)
+        self._picture.show(scene.model_xml)
 
     @property
     def _test(self) -> TestTask:
@@ -331,43 +277,6 @@ class EpisodeEnvironment:
         if key != self._key:
             self.close()
             self._simulator, self._key = Simulator(task, files), key
-
-    def _show(self, model_xml: str | None = None) -> None:
-        """Render from here on what the simulator has now.
-
-        Args:
-            model_xml: the scene with its images, where the simulator has it without.
-        """
-        shown = model_xml if model_xml is not None else self._opened.model
-        if shown is not self._rendered:
-            self._close_renderer()
-            self._rendered = shown
-
-    def _render(self, view: str) -> Frame:
-        if self._renderer is None:
-            model: Any = self._rendered
-            self._renderer = Renderer(model)
-        if not self._looks_changed:
-            looks = of_layer(self._perturbations, RenderPerturbation)
-            self._changes.enter_context(self._renderer.perturbed(looks))
-            self._looks_changed = True
-        observed, model = self.observed, self._renderer.model
-        self._renderer.restore(np.concatenate([[0.0], observed.qpos, np.zeros(model.nv)]), observed.site_alpha)
-        frame = self._renderer.frame(VIEWS[view])
-        for noise in of_layer(self._perturbations, PixelPerturbation):
-            if view == "agentview":
-                frame = noise.apply(frame, self._progress.steps)
-        return to_policy(frame)
-
-    def _restore_looks(self) -> None:
-        self._changes.close()
-        self._looks_changed = False
-
-    def _close_renderer(self) -> None:
-        self._restore_looks()
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
 
 def _checked(action: ArrayLike) -> Floats:

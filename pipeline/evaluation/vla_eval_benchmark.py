@@ -22,7 +22,8 @@ from vla_eval.specs import (
 
 from pipeline import gl
 from pipeline.errors import PipelineError
-from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment, Settings, Wanted
+from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 
 

@@ -1,0 +1,57 @@
+"""What holds for all episodes of an evaluation, and what a policy asks to see of each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from pydantic import Field, field_serializer
+
+from pipeline.axes.base import Frozen
+from pipeline.evaluation import disjoint
+from pipeline.evaluation.libero_plus import Prompt
+
+
+class Settings(Frozen):
+    """What holds for all episodes of an evaluation.
+
+    Attributes:
+        prompt: the wording of test tasks; ``blank`` says nothing in any task.
+        black: which views are black, to see what a policy does without them.
+        seed: of held-out draws and of noise that is random.
+        fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
+        initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
+            starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
+            Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
+        plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
+            it by the SHA-256 of its file.
+    """
+
+    prompt: Prompt | Literal["blank"] = "clean"
+    seed: int = 0
+    fixture_seed: int = 0
+    initial_states: Literal["libero", "demonstration"] = "libero"
+    # What came later is left out where it is not used, so that results keep their names.
+    black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
+    plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
+
+    @field_serializer("plan")
+    def _name_by_content(self, plan: Path) -> str:
+        return disjoint.sha256_of(plan)
+
+
+class Wanted(NamedTuple):
+    """What a policy asks to see.
+
+    Attributes:
+        wrist: the wrist's view beside the agent view.
+        state: position, axis-angle and fingers.
+        shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
+            robosuite and OpenVLA's data have it.
+        images: any view at all; without them nothing is rendered.
+    """
+
+    wrist: bool = True
+    state: bool = True
+    shortest_rotation: bool = False
+    images: bool = True
