@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import replaced, scratch
 from pipeline.rendering.jpeg import resized
 from pipeline.seeding import digest
 
@@ -26,11 +26,14 @@ def provenance(root: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def chosen(rows: Iterable[EpisodeRow], axes: Sequence[str]) -> list[EpisodeRow]:
+def chosen(rows: Iterable[EpisodeRow], perturbed_by: Sequence[str]) -> list[EpisodeRow]:
     """An arm's episodes: of each task as many as it has clean twins.
 
-    These are the episodes that perturb ``axes`` and nothing else, and clean twins in place of those that are missing:
-    first twins of demonstrations that no perturbed episode was made from.
+    These are the perturbed episodes of the arm, and clean twins in place of those that are missing: first twins of
+    demonstrations that no perturbed episode was made from.
+
+    Args:
+        perturbed_by: axes or combinations, as in ``plan.episodes``.
 
     Raises:
         PipelineError: when a task has more perturbed episodes than twins.
@@ -41,7 +44,7 @@ def chosen(rows: Iterable[EpisodeRow], axes: Sequence[str]) -> list[EpisodeRow]:
     arm: list[EpisodeRow] = []
     for (suite, task), episodes in sorted(by_task.items()):
         twins = [row for row in episodes if row["axis"] == "clean"]
-        perturbed = [row for row in episodes if row["axis"] != "clean" and set(row["axis"].split("+")) <= {*axes}]
+        perturbed = [row for row in episodes if row["axis"] in perturbed_by]
         if len(perturbed) > len(twins):
             raise PipelineError(
                 f"{len(perturbed)} perturbed episodes and {len(twins)} clean ones; all arms have as many as there are "
@@ -78,7 +81,7 @@ def write_small(source: Path, rows: Sequence[EpisodeRow], out: Path, frame_px: i
         vector.lerobot_key: {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
         for vector in vectors
     }
-    with replaced(out) as unfinished, local_only(out.parent / ".cache"):
+    with replaced(out) as unfinished, scratch(out.parent / ".cache") as cache, local_only(cache):
         run = LeRobotDataset(source.name, root=source, video_backend="pyav")
         small = LeRobotDataset.create(
             out.name, SCHEMA.fps_hz, features, root=unfinished, robot_type=SCHEMA.robot_type, use_videos=False

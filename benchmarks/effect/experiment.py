@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
+from pipeline.axes import axes_of
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
@@ -55,9 +56,10 @@ class Experiment(Frozen):
 
     Attributes:
         data: an ordinary run configuration, which makes the episodes of all arms.
-        demonstrations: so many of each task are made by ``demos expand`` into the run's ``demos.root`` first.
-        arms: name to the axes whose episodes are in it; clean twins make up for the others. The first arm is the one
-            that the others are compared with.
+        demonstrations: so many of each task are made by ``demos expand`` into the run's ``demos.root`` first; none
+            when left out.
+        arms: name to what its episodes are perturbed by, axes or combinations of the run's ``plan.episodes``; clean
+            twins make up for the others. The first arm is the one that the others are compared with.
         frame_px: height and width of the frames that policies see.
         policy: options of lerobot's policy, among them its ``type``.
         seeds: one policy of each arm is trained from each.
@@ -72,13 +74,17 @@ class Experiment(Frozen):
     seeds: tuple[int, ...] = Field(min_length=1)
     evaluation: EvaluationConfig
 
+    @field_validator("arms")
+    @classmethod
+    def _canonical(cls, arms: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+        return {arm: tuple("+".join(axes_of(name)) for name in names) for arm, names in arms.items()}
+
     @model_validator(mode="after")
     def _matches_run(self) -> Experiment:
-        planned = {axis for axis in type(self.run.plan.axes).model_fields if getattr(self.run.plan.axes, axis)}
-        if unknown := {axis for axes in self.arms.values() for axis in axes} - planned:
+        if unknown := {name for names in self.arms.values() for name in names} - self.run.plan.episodes.keys():
             raise ValueError(f"{self.data} has no episodes of {', '.join(sorted(unknown))}")
-        if (self.demonstrations is not None) != (self.run.demos.root is not None):
-            raise ValueError("demonstrations goes with demos.source: hdf5 in the run's configuration, and only with it")
+        if self.demonstrations is not None and self.run.demos.root is None:
+            raise ValueError(f"demonstrations: {self.data} has no demos.root to make them in")
         return self
 
     @cached_property

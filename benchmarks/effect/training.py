@@ -55,7 +55,8 @@ def train(
         }
         command([program, *(f"--{name}={value}" for name, value in options.items())])
     elif _step(last) < training.steps:
-        command([program, f"--config_path={last / 'pretrained_model' / 'train_config.json'}", "--resume=true"])
+        config = last / "pretrained_model" / "train_config.json"
+        command([program, f"--config_path={config}", "--resume=true", f"--steps={training.steps}"])
     last = _last_checkpoint(outputs)
     assert last is not None, "lerobot-train saves after the last step"
     put_in_place(last / "pretrained_model", out)
