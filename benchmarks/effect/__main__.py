@@ -37,10 +37,15 @@ class Shell:
     def __init__(self, out: Path):
         out.mkdir(parents=True, exist_ok=True)
         self._times = out / "times.jsonl"
-        # Nothing is fetched from the hub, and the copies that `datasets` makes stay here.
-        offline = {"HF_HUB_OFFLINE": "1", "HF_DATASETS_CACHE": str((out / ".cache").resolve())}
-        path = os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH"))))
-        self._environment = {**os.environ, **offline, "PYTHONPATH": path}
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))),
+            # Nothing is fetched from the hub, and the copies that `datasets` makes stay here.
+            "HF_HUB_OFFLINE": "1",
+            "HF_DATASETS_CACHE": str((out / ".cache").resolve()),
+            # Where other work shares the cores, PyTorch's threads would spend them on waiting for each other.
+            "OMP_WAIT_POLICY": "passive",
+        }
 
     def __call__(self, part: str, command: list[str]) -> None:
         """Run a command to its end.
@@ -99,18 +104,25 @@ def run(experiment: Experiment, out: Path) -> None:
                 options = experiment.policy, experiment.training, seed
                 train(dataset, policy, *options, lambda command: shell("training", command))
             evaluate(experiment, policy, out / "evaluations" / name, shell)
-    lines = report.table(report.read(out / "evaluations", policies))
+    lines, hours = report.table(report.read(out / "evaluations", policies)), shell.hours()
+    contents = {arm: report.contents(dataset) for arm, dataset in datasets.items()}
+    command = shlex.join(["python", "benchmarks/effect", *sys.argv[1:]])
     print(report.markdown(lines))
+    print(
+        f"\n{sum(contents[next(iter(contents))].values())} episodes in each arm, {experiment.training.steps} steps of "
+        f"{experiment.training.batch_size} frames, seeds {', '.join(map(str, experiment.seeds))}; hours on "
+        f"{os.cpu_count()} cores: {', '.join(f'{part} {taken}' for part, taken in hours.items())}; `{command}`"
+    )
     print(
         json.dumps(
             {
                 "experiment": experiment.model_dump(mode="json"),
                 "tasks": experiment.tasks,
-                "episodes_by_axis": {arm: report.contents(dataset) for arm, dataset in datasets.items()},
+                "episodes_by_axis": contents,
                 "table": lines,
-                "hours": shell.hours(),
+                "hours": hours,
                 "cores": os.cpu_count(),
-                "command": shlex.join(["python", "benchmarks/effect", *sys.argv[1:]]),
+                "command": command,
             }
         )
     )
