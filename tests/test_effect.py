@@ -94,7 +94,7 @@ def small_experiment(folder: Path, demos: Path) -> Path:
     (folder / "data.yaml").write_text(yaml.safe_dump(run))
     experiment = {
         "data": "data.yaml",
-        "arms": {"clean": [], "perturbed": ["noise"]},
+        "arms": {"perturbed": ["noise"]},
         "frame_px": 32,
         "policy": {
             **{"type": "act", "pretrained_backbone_weights": None, "chunk_size": 100, "n_action_steps": 100},
@@ -117,16 +117,16 @@ def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path, mon
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
-    assert found["episodes_by_axis"] == {"clean": {"clean": 1}, "perturbed": {"noise": 1}}
+    assert found["episodes_by_axis"] == {"perturbed": {"noise": 1}}
     (line,) = found["table"]
-    assert (line["source"], line["axis"], line["arms"]["clean"]["episodes"]) == ("libero", "clean", 1)
+    assert (line["source"], line["axis"], line["arms"]["perturbed"]["episodes"]) == ("libero", "clean", 1)
     assert {*found["hours"]} == {"data", "training", "evaluation"}
 
     # A training that was stopped goes on from its last checkpoint.
     monkeypatch.chdir(tmp_path)
     experiment = read(file)
-    dataset = tmp_path / "out" / "datasets" / experiment.dataset_name("clean")
-    assert [row["axis"] for row in provenance(dataset)] == ["clean"]
+    dataset = tmp_path / "out" / "datasets" / experiment.dataset_name("perturbed")
+    assert [row["axis"] for row in provenance(dataset)] == ["noise"]
     commands: list[list[str]] = []
 
     def stopped(command: list[str]) -> None:
