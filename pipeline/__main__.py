@@ -13,6 +13,7 @@ import yaml
 from pipeline.axes import Axes
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
+from pipeline.evaluation import analyses
 from pipeline.files import replaced
 from pipeline.formats.registry import FORMATS, formats_of
 from pipeline.libero.fetch import fetch
@@ -96,6 +97,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     selection = Selection(
         source=arguments.source,
+        file=arguments.tasks_from,
         suites=tuple(arguments.suite),
         axes=tuple(arguments.axis),
         components=tuple(arguments.component),
@@ -105,17 +107,24 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         subset=arguments.subset,
         seed=arguments.seed,
     )
-    settings = Settings(prompt=arguments.prompt, seed=arguments.seed, initial_states=arguments.initial_states)
+    settings = Settings(
+        prompt=arguments.prompt,
+        seed=arguments.seed,
+        initial_states=arguments.initial_states,
+        black=arguments.black,
+        plan=arguments.plan,
+    )
     policy = PolicyConfig(
         kind=arguments.replay or ("checkpoint" if arguments.checkpoint else "server"),
         address=str(arguments.checkpoint or arguments.server or ""),
         label=arguments.label,
         look_every=arguments.look_every,
+        timeout_s=arguments.timeout,
     )
     compute = ComputeConfig(cluster="loop" if arguments.workers == 1 else "local", workers=arguments.workers)
     with runner(compute, arguments.out) as run:
-        found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos)
-    print(json.dumps({"all": found["all"], "by_axis": found["by_axis"]}))
+        found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets)
+    print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
     return 0
 
 
@@ -303,7 +312,16 @@ def parser() -> argparse.ArgumentParser:
         "followed by feedback (tracked)",
     )
     command.add_argument(
-        "--source", choices=("libero", "libero_plus", "own"), default="libero", help="of the tasks (default: libero)"
+        "--source",
+        choices=("libero", "libero_plus", "own", "pairs", "goals"),
+        default="libero",
+        help="of the tasks (default: libero)",
+    )
+    command.add_argument(
+        "--tasks-from", type=Path, metavar="FILE", help="in place of a source, a list that `analyse construct` wrote"
+    )
+    command.add_argument(
+        "--plan", type=Path, metavar="FILE", help="draw held-out draws anew that overlap with this training plan"
     )
     command.add_argument("--suite", nargs="+", default=benchmark.SUITES, metavar="SUITE", help="of these suites only")
     command.add_argument("--axis", nargs="+", default=(), metavar="AXIS", help="of these axes only")
@@ -318,9 +336,16 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument(
         "--prompt",
-        choices=("clean", "benchmark"),
+        choices=("clean", "benchmark", "blank"),
         default="clean",
-        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name",
+        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name; "
+        "or say nothing at all",
+    )
+    command.add_argument(
+        "--black",
+        choices=("none", "agentview", "all"),
+        default="none",
+        help="show the policy black frames in place of the agent view, or of all views (default: none)",
     )
     command.add_argument(
         "--initial-states",
@@ -333,6 +358,19 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--look-every", type=_positive, default=1, metavar="N", help="the server uses one observation in N (default: 1)"
     )
+    command.add_argument(
+        "--assets",
+        type=Path,
+        metavar="DIR",
+        help="LIBERO-Plus's unpacked asset archive, which its light, layout and most of its background tasks need",
+    )
+    command.add_argument(
+        "--timeout",
+        type=_positive,
+        default=120,
+        metavar="S",
+        help="seconds that a server's answer may take (default: 120)",
+    )
     command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one for each core)")
     command.add_argument(
         "--videos",
@@ -341,6 +379,8 @@ def parser() -> argparse.ArgumentParser:
         help="of which episodes to keep a video, of the frames that the policy looked at and the last (default: none)",
     )
     command.set_defaults(run=_evaluate)
+
+    analyses.add_commands(commands)
 
     command = commands.add_parser(
         "evaluation-report",

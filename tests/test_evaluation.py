@@ -191,16 +191,15 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -
 
 
 @contextmanager
-def replay_server(*arguments: str) -> Iterator[str]:
+def model_server(module: str, *arguments: str) -> Iterator[str]:
     """A model server of vla-eval in a process of its own."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    address = ["--address", f"127.0.0.1:{port}"]
     server = subprocess.Popen(
-        [sys.executable, "-m", "pipeline.evaluation.replay_server", *address, *arguments],
+        [sys.executable, "-m", module, "--address", f"127.0.0.1:{port}", *arguments],
         cwd=REPOSITORY,
-        env=os.environ,
+        env={**os.environ, "PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"},
     )
     try:
         while server.poll() is None:
@@ -217,7 +216,7 @@ def replay_server(*arguments: str) -> Iterator[str]:
 
 @pytest.mark.slow
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
-    with replay_server("--args.chunk", "8") as address:
+    with model_server("pipeline.evaluation.replay_server", "--args.chunk", "8") as address:
         ours = tmp_path / "ours"
         arguments = ["--server", address, "--workers", "1", "--videos", "all"]
         subprocess.run(command(ours, *arguments), cwd=REPOSITORY, check=True)
@@ -246,7 +245,7 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_a_path_is_followed_by_what_an_observation_has(tmp_path: Path) -> None:
-    with replay_server("--args.tracked", "true") as address:
+    with model_server("pipeline.evaluation.replay_server", "--args.tracked", "true") as address:
         arguments = ["--suite", "libero_goal", "--server", address, "--workers", "1"]
         subprocess.run(command(tmp_path, *arguments), cwd=REPOSITORY, check=True)
     (row,) = rows(tmp_path).values()

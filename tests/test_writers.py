@@ -135,7 +135,7 @@ def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
         for view, seen in source.geometry.items():
             np.testing.assert_array_equal(metadata.pop(f"{view}_intrinsics"), seen.intrinsics)
             np.testing.assert_array_equal(metadata.pop(f"{view}_extrinsics"), seen.extrinsics)
-        texts = {name: str(text) for name, text in metadata.items()}
+        texts = {name: str(text) for name, text in metadata.items() if name != "instances"}
         assert texts == {"file_path": source.provenance["demo_source"], **source.provenance}
 
 
@@ -192,19 +192,28 @@ def test_rlds_holds_the_episodes(written: Written) -> None:
 
 @pytest.mark.slow
 def test_rlds_reads_with_tensorflow(written: Written, tmp_path: Path) -> None:
+    """As it is by default, and with extras."""
+    extended = write_rlds(tmp_path, with_extras, extras=EXTRAS).folder / SET / "1.0.0"
     requirements = ["--with", "tensorflow-cpu==2.21.0", "--with", "tensorflow-datasets==4.9.10"]
     script, target = Path(tf_readback.__file__), tmp_path / "read.npz"
     command = ["uv", "run", "--no-project", "--isolated", "--python", "3.11", *requirements, "python", str(script)]
-    done = subprocess.run([*command, str(written.version), str(target)], capture_output=True, text=True)
+    done = subprocess.run([*command, str(target), str(written.version), str(extended)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith("tensorflow")
-    read = np.load(target)
-    assert_episodes(
-        [
-            {name.split("/", 1)[1]: read[name] for name in read.files if name.startswith(f"{index}/")}
-            for index in range(len({name.split("/")[0] for name in read.files}))
-        ]
-    )
+    saved = np.load(target)
+    read = [
+        {name.split("/", 1)[1]: saved[name] for name in saved.files if name.startswith(f"{index}/")}
+        for index in range(len({name.split("/")[0] for name in saved.files}))
+    ]
+    assert_episodes(read[: len(IDS)])
+    assert_episodes(read[len(IDS) :])
+    for episode_id, leaves in zip(IDS, read[len(IDS) :], strict=True):
+        source = with_extras(episode_id)
+        assert json.loads(str(leaves["metadata/instances"])) == list(source.instances)
+        for view, seen in source.geometry.items():
+            for extra, maps in seen.maps.items():
+                first = cv2.imdecode(np.frombuffer(maps[0], np.uint8), -1)
+                np.testing.assert_array_equal(leaves[f"{view}_{extra}"][..., 0], first)
 
 
 def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import math
 from functools import cache
 from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
 
@@ -65,16 +66,20 @@ class NoisePerturbation(PixelPerturbation):
         The clearance keeps to the middle half between two severities. The parameters that do not set the strength
         are not compared, so an equal strength counts as equal.
         """
+        tested, severities = _tested(test, self.component, self.effect.strength[0])
+        return np.abs(severities - self.severity(test)) if tested else severities
+
+    def severity(self, test: TestSet) -> float:
+        """The strength on the scale of the component's test severities, 0 where nothing changes; NaN without any."""
         name, clean = self.effect.strength
-        tested, severities = _tested(test, self.component, name)
+        tested, _ = _tested(test, self.component, name)
         if not tested:
-            return severities
+            return math.nan
         steps = (clean, *tested)
         value = float(getattr(self.effect, name))
         # Beyond the strongest severity the last step is continued.
         upper = min(max(bisect.bisect_left(steps, value), 1), len(tested))
-        severity = upper - (steps[upper] - value) / (steps[upper] - steps[upper - 1])
-        return np.abs(severities - severity)
+        return upper - (steps[upper] - value) / (steps[upper] - steps[upper - 1])
 
 
 @cache

@@ -6,26 +6,31 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, field_serializer
 
-from pipeline.axes import AnyPerturbation, PhysicsPerturbation, PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.axes.base import Frozen
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.evaluation import libero_plus
+from pipeline.evaluation import disjoint, goals, libero_plus
+from pipeline.evaluation.asset_archive import Assets, having
+from pipeline.evaluation.drawn_scene import drawn_scene
 from pipeline.evaluation.initial_states import libero_states, moved_state
 from pipeline.evaluation.libero_plus import Prompt
 from pipeline.evaluation.simulator import Observed, Simulator
-from pipeline.evaluation.tasks import EvaluationTask, draw
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.physics.roll_out import roll_out
 from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.testset.benchmark import TestTask
+from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Demo, Floats, Frame, Scene, Task
 
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
@@ -34,26 +39,33 @@ STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, 
 VIEWS = {"agentview": "agentview", "wrist": "robot0_eye_in_hand"}
 """What policies call the two views, and their cameras in the scene."""
 
-_ATTEMPTS = 20
-"""How often a held-out draw that its scene refuses is drawn anew."""
-
 
 class Settings(Frozen):
     """What holds for all episodes of an evaluation.
 
     Attributes:
-        prompt: the wording of test tasks.
+        prompt: the wording of test tasks; ``blank`` says nothing in any task.
+        black: which views are black, to see what a policy does without them.
         seed: of held-out draws and of noise that is random.
         fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
         initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
             starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
-            Test tasks have a state of their own in both.
+            Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
+        plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
+            it by the SHA-256 of its file.
     """
 
-    prompt: Prompt = "clean"
+    prompt: Prompt | Literal["blank"] = "clean"
     seed: int = 0
     fixture_seed: int = 0
     initial_states: Literal["libero", "demonstration"] = "libero"
+    # What came later is left out where it is not used, so that results keep their names.
+    black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
+    plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
+
+    @field_serializer("plan")
+    def _name_by_content(self, plan: Path) -> str:
+        return disjoint.sha256_of(plan)
 
 
 class Wanted(NamedTuple):
@@ -80,8 +92,9 @@ class Progress:
     Attributes:
         steps: actions taken, without the settling steps.
         success: whether the goal was reached; then the episode is over.
-        over: whether it was reached, the limit was, or the simulation became unstable.
-        reason: ``success``, ``step_limit``, ``simulation_unstable``, or ``running``.
+        over: whether it was reached, the limit was, or the simulation became unstable; or the episode cannot begin.
+        reason: ``success``, ``step_limit``, ``simulation_unstable``, ``running``, or ``refused`` where the scene does
+            not take what was drawn. Such an episode is over before its first look and says nothing of a policy.
     """
 
     steps: int
@@ -94,10 +107,13 @@ class EpisodeEnvironment:
     """Runs episodes one after the other; keep one for many, ordered by task: what is built for a scene is reused.
 
     Frames are rendered when they are asked for, and only then.
+
+    Args:
+        archive: folder of LIBERO-Plus's asset archive, for test tasks of light, background and layout.
     """
 
-    def __init__(self, settings: Settings = Settings()):  # noqa: B008 - frozen
-        self.settings = settings
+    def __init__(self, settings: Settings = Settings(), archive: Path | None = None):  # noqa: B008 - frozen
+        self.settings, self._archive = settings, archive
         self._simulator: Simulator | None = None
         self._key: tuple[str, ...] = ()
         self._renderer: Renderer | None = None
@@ -108,7 +124,7 @@ class EpisodeEnvironment:
         self._running = False
 
     def reset(self, task: EvaluationTask) -> Progress:
-        """Start an episode: LIBERO's reset, the initial state, ten settling steps.
+        """Start an episode: LIBERO's reset, the initial state, ten settling steps; over where the scene is refused.
 
         Raises:
             PipelineError: when the task cannot be rebuilt here.
@@ -118,12 +134,18 @@ class EpisodeEnvironment:
         self.task, self._base = task, find_task(task.suite, task.base)
         self.limit = STEP_LIMITS[task.suite]
         self.resolved: Mapping[str, Any] = {}
-        if task.source == "libero_plus":
-            self._start_test_task()
-        else:
-            self._start_libero()
-        self._seen: dict[str, Frame] = {}
+        self._perturbations = ()
         self._progress = Progress(0, False, False, "running")
+        self._seen: dict[str, Frame] = {}
+        try:
+            if task.source == "libero_plus":
+                self._start_test_task()
+            elif task.source == "goals":
+                self._start_goal()
+            else:
+                self._start_libero()
+        except RefusedError:
+            self._progress = Progress(0, False, True, "refused")
         self._running = True
         return self._progress
 
@@ -162,6 +184,8 @@ class EpisodeEnvironment:
     @property
     def instruction(self) -> str:
         """What the policy is told."""
+        if self.settings.prompt == "blank":
+            return ""
         if self.task.source == "libero_plus":
             return libero_plus.instruction(self._test, self.settings.prompt)
         return self._base.instruction
@@ -179,7 +203,8 @@ class EpisodeEnvironment:
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
         if view not in self._seen:
-            self._seen[view] = self._render(view)
+            black = self.settings.black in (view, "all")
+            self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8) if black else self._render(view)
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
@@ -212,10 +237,12 @@ class EpisodeEnvironment:
     def _start_test_task(self) -> None:
         test = self._test
         posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
-        if test.axis == "background":
-            self._build(self._base, test.name, libero_plus.images(test))
+        if test.axis in ("light", "background"):
+            self._build(self._base, test.name, self._assets(test).scene(test))
             state = libero_states(self._base)[0]
-        elif test.axis == "pose":
+        elif test.axis in ("pose", "layout"):
+            if test.axis == "layout":
+                self._assets(test).register_objects(test)
             with tempfile.TemporaryDirectory() as folder:
                 file = Path(folder) / f"{self._base.name}.bddl"
                 file.write_text(libero_plus.bddl_text(test))
@@ -229,8 +256,25 @@ class EpisodeEnvironment:
         self._opened.start(self.settings.fixture_seed, state, posture)
         self._show()
 
+    def _start_goal(self) -> None:
+        """Start LIBERO's own task with another goal."""
+        replacement = goals.find(self._base, self.task.name)
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / self._base.bddl_file.name
+            file.write_text(replacement.bddl_text(self._base))
+            self._build(replace(self._base, bddl_file=file), f"{replacement.old} {replacement.new}")
+        self._base = replace(self._base, instruction=replacement.instruction)
+        states = libero_states(self._base)
+        number = self.task.number % len(states)
+        self._opened.start(self.settings.fixture_seed + number, states[number])
+        self._show()
+
     def _start_libero(self) -> None:
-        """Start LIBERO's own task, or a held-out draw on it."""
+        """Start LIBERO's own task, or held-out draws on it.
+
+        Raises:
+            RefusedError: see ``drawn_scene``.
+        """
         self._build(self._base)
         source = StarterSource()
         demo = source.load(source.index([self._base]).entries[0].demo_id)
@@ -239,26 +283,16 @@ class EpisodeEnvironment:
             states = libero_states(self._base)
             number = self.task.number % len(states)
             seed, demo = seed + number, replace(demo, init_state=states[number])
-        if self.task.source == "libero":
-            self._perturbations = ()
-            self._start(demo, seed, None)
-            return
-        for attempt in range(_ATTEMPTS):
-            drawn = draw(self.task, self.settings.seed, attempt)
-            self._perturbations = (drawn,)
-            scene = None
-            if isinstance(drawn, PhysicsPerturbation):
-                try:
-                    nominal = Scene(self._opened.place_fixtures(seed), demo.init_state)
-                    scene = drawn.apply(nominal, demo, roll_out)
-                except RefusedError:
-                    continue
-                self.resolved = scene.resolved
-            self._start(demo, seed, scene)
-            return
-        raise PipelineError(
-            f"none of {_ATTEMPTS} draws fits the scene", where=str(self.task), remedy="leave this task out"
-        )
+        scene = None
+        if self.task.source == "own":
+            nominal = partial(self._nominal, seed, demo)
+            planned = None if self.settings.plan is None else disjoint.planned(self.settings.plan)
+            self._perturbations, scene = drawn_scene(self.task, self.settings.seed, demo, nominal, planned)
+        self.resolved = scene.resolved if scene else {}
+        self._start(demo, seed, scene)
+
+    def _nominal(self, seed: int, demo: Demo) -> Scene:
+        return Scene(self._opened.place_fixtures(seed), demo.init_state)
 
     def _start(self, demo: Demo, seed: int, scene: Scene | None) -> None:
         """Start from a demonstration's initial state, in LIBERO's scene or a changed one."""
@@ -268,7 +302,7 @@ class EpisodeEnvironment:
             self._show()
             return
         # A demonstration was recorded from its first state on, by an arm that holds the posture it starts in.
-        scene = scene or Scene(self._opened.place_fixtures(seed), demo.init_state)
+        scene = scene or self._nominal(seed, demo)
         self._opened.start_scene(scene, settle)
         self._show(scene.model_xml)
 
@@ -278,20 +312,25 @@ class EpisodeEnvironment:
         key = (self.task.suite, self.task.name)
         if key not in tests:
             raise PipelineError(f"LIBERO-Plus has no test task {self.task.name!r}", where=self.task.suite)
-        if not libero_plus.runnable(tests[key]):
-            raise PipelineError(
-                f"changes the {tests[key].axis}, for which the asset archive of LIBERO-Plus is needed",
-                where=str(self.task),
-                expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}",
-            )
         return tests[key]
 
-    def _build(self, task: Task, scene: str = "", images: Mapping[str, str] | None = None) -> None:
+    def _assets(self, test: TestTask) -> Assets:
+        assets = having(test, self._archive)
+        if assets is None:
+            raise PipelineError(
+                f"changes the {test.axis}, for which the asset archive of LIBERO-Plus is needed",
+                where=str(self.task),
+                expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}" if self._archive is None else None,
+                remedy="name the unpacked archive: --assets DIR",
+            )
+        return assets
+
+    def _build(self, task: Task, scene: str = "", files: SceneFiles | None = None) -> None:
         """Have the simulator of a task, or of another scene of it."""
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()
-            self._simulator, self._key = Simulator(task, images), key
+            self._simulator, self._key = Simulator(task, files), key
 
     def _show(self, model_xml: str | None = None) -> None:
         """Render from here on what the simulator has now.

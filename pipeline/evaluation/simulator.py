@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -13,6 +14,7 @@ from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment, control_env, seeded
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import proprioception
+from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Scene, Task
 
 SETTLING_STEPS = 10
@@ -84,11 +86,14 @@ class Simulator(Environment):
 
     Args:
         task: the task to build.
-        images: of ``floor`` and ``wall``, by their names among LIBERO's textures; the arena's own by default.
+        files: of the arena, by absolute paths; the task's own by default.
     """
 
-    def __init__(self, task: Task, images: Mapping[str, str] | None = None):
-        super().__init__(task, None if images is None else _styles(images))
+    def __init__(self, task: Task, files: SceneFiles | None = None):
+        if files is None:
+            super().__init__(task)
+        else:
+            super().__init__(task, _styles({"floor": files.floor, "wall": files.wall}), files.scene_xml)
         self._rewind: _Rewind | None = None
 
     @property
@@ -186,12 +191,15 @@ class Simulator(Environment):
 
 
 def _styles(images: Mapping[str, str]) -> dict[str, str]:
-    """``scene_properties`` for images. LIBERO finds them by its own names for them, and has no name for some."""
+    """``scene_properties`` for images, which LIBERO looks for where its arena has the image that they replace.
+
+    LIBERO finds them by its own names for them, and has no name for some.
+    """
     control_env()  # which takes care of how it is imported
     from libero.libero.envs.arenas.style import STYLE_MAPPING
 
     for part, image in images.items():
-        STYLE_MAPPING[part][image] = image
+        STYLE_MAPPING[part][image] = Path(image).name
     return {f"{part}_style": image for part, image in images.items()}
 
 

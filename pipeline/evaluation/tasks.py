@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cache
-from itertools import zip_longest
+from itertools import combinations, product, zip_longest
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
 from pipeline import seeding
-from pipeline.axes import AnyAxis, AnyPerturbation, Axes
-from pipeline.axes.base import Frozen, Level
+from pipeline.axes import AnyPerturbation, axes_of
+from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
-from pipeline.evaluation import libero_plus
+from pipeline.evaluation import goals, held_out, libero_plus
+from pipeline.evaluation.held_out import LEVELS, OWN_AXES
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import SUITES
+from pipeline.types import Task
 
-Source = Literal["libero", "libero_plus", "own"]
-LEVELS: tuple[Level, ...] = (1, 2, 3, 4, 5)
-OWN_AXES = ("layout", "pose", "robot", "camera", "light", "background", "noise")
-"""The axes with draws of their own to hold out. Language is none: its rewrites are a list, which training uses up."""
+Source = Literal["libero", "libero_plus", "own", "goals"]
+PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
+"""The six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
 
 
 @dataclass(frozen=True, order=True)
@@ -32,12 +34,14 @@ class EvaluationTask:
     """One thing to do in one scene; all else is looked up by these.
 
     Attributes:
-        source: ``libero``, ``libero_plus``, or ``own`` for a held-out draw of one of this project's axes.
+        source: ``libero``, ``libero_plus``, ``own`` for held-out draws of one or more of this project's axes, or
+            ``goals`` for a LIBERO task that asks for another object of its scene.
         suite, base: of the LIBERO task.
         name: of the test task in LIBERO-Plus; else made of what follows, once among the tasks of its source and suite.
-        axis, component: what is perturbed; ``clean`` where nothing is.
-        level: strength, 1 to 5; 0 where nothing tells.
-        number: which of LIBERO's initial states (``libero``), or which draw (``own``); 0 in ``libero_plus``.
+        axis, component: what is perturbed, several joined by +; ``clean`` where nothing is. In ``goals`` the component
+            is the category of the object that is asked for.
+        level: strength, 1 to 5, of all that is drawn; 0 where nothing tells.
+        number: which draw (``own``), and which of LIBERO's initial states; 0 in ``libero_plus``.
     """
 
     source: Source
@@ -57,16 +61,19 @@ class Selection(Frozen):
     """Which tasks to evaluate on; what is left out does not restrict.
 
     Attributes:
-        source: where they come from.
+        source: where they come from. ``pairs`` are, for every two axes, LIBERO's task, the held-out draw of either
+            axis, and both draws together, on the same initial states.
+        file: a list of tasks that ``analyse construct`` wrote, in place of a source.
         suites, axes, components, levels: those of the tasks wanted.
         tasks: shell-style patterns, one of which must match the task's name or its LIBERO task's.
-        episodes: how many of LIBERO's 50 initial states of each task (``libero``), or draws of each task, axis and
-            level (``own``).
+        episodes: how many of LIBERO's 50 initial states of each task (``libero``, ``goals``, ``pairs``), or draws of
+            each task, axis and level (``own``).
         subset: at most so many, spread evenly over suites, axes, components and levels.
         seed: of the subset and of all draws.
     """
 
-    source: Source = "libero"
+    source: Source | Literal["pairs"] = "libero"
+    file: Path | None = None
     suites: tuple[str, ...] = SUITES
     axes: tuple[str, ...] = ()
     components: tuple[str, ...] = ()
@@ -77,16 +84,19 @@ class Selection(Frozen):
     seed: int = 0
 
 
-def select(selection: Selection) -> list[EvaluationTask]:
+def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
     """The tasks that a selection names, in a fixed order.
+
+    Args:
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
 
     Raises:
         PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.
     """
     _check_names(selection)
     wanted = [task for task in _listed(selection) if _matches(task, selection)]
-    if selection.source == "libero_plus":
-        wanted = _without_archive(wanted, selection)
+    if selection.source == "libero_plus" and selection.file is None:
+        wanted = _runnable(wanted, selection, archive)
     if not wanted:
         raise PipelineError("no task is left", where=f"selection {selection.model_dump(exclude_defaults=True)}")
     return wanted if selection.subset is None else balanced(wanted, selection.subset, selection.seed)
@@ -113,65 +123,127 @@ def _in_turn(wanted: list[EvaluationTask], columns: tuple[str, ...], seed: int) 
     return [task for turn in zip_longest(*rows) for task in turn if task is not None]
 
 
-def draw(task: EvaluationTask, seed: int, attempt: int = 0) -> AnyPerturbation:
-    """The perturbation of a held-out draw.
+def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> AnyPerturbation:
+    """The perturbation of a held-out draw on one axis: of ``axis`` where the task joins several."""
+    base = find_task(task.suite, task.base)
+    return held_out.draw(base, axis or task.axis, task.level, task.number, seed, attempt)
 
-    Its key begins with ``evaluation``, which no plan's does, so that no seed makes the two draw alike.
+
+def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
+    """A held-out draw on a LIBERO task; None where an axis cannot change anything that the task has.
 
     Args:
-        attempt: counts the draws that a scene refused.
+        axis: one, or several joined by +.
     """
-    axis = _axis(task.axis).model_copy(update={"levels": (task.level,)})
-    key = seeding.rng("evaluation", seed, task.axis, task.suite, task.base, task.level, task.number, attempt)
-    drawn: AnyPerturbation = axis.sample(key, find_task(task.suite, task.base), task.number)
-    return drawn
+    axes = axes_of(axis)
+    if not all(held_out.axis(one).applies(task) for one in axes):
+        return None
+    component = "+".join(held_out.draw(task, one, level, number, seed).component for one in axes)
+    name = f"{task.name}_{axis}_level{level}_draw{number}"
+    return EvaluationTask("own", task.suite, task.name, name, axis, component, level, number)
 
 
-@cache
-def _axis(name: str) -> AnyAxis:
-    """An axis with its default ranges."""
-    axis: AnyAxis = getattr(Axes.model_validate({name: {}}), name)
-    return axis
+def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
+    """The tasks that ``analyse construct`` or ``analyse grade`` listed.
+
+    Raises:
+        PipelineError: when the file is not such a list, or its draws were made under another seed.
+    """
+    try:
+        content = json.loads(file.read_text())
+        names = EvaluationTask.__dataclass_fields__
+        listed = [EvaluationTask(**{name: task[name] for name in names}) for task in content["tasks"]]
+        drawn_under = content["seed"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise PipelineError(
+            f"not a list of tasks ({error!r})", where=file, expected="a file that `analyse construct` wrote"
+        ) from error
+    if drawn_under != seed:
+        raise PipelineError(
+            f"these tasks were drawn under seed {drawn_under}, not {seed}", where=file, remedy=f"--seed {drawn_under}"
+        )
+    return listed
 
 
 def _listed(selection: Selection) -> Iterator[EvaluationTask]:
+    if selection.file is not None:
+        yield from read_tasks(selection.file, selection.seed)
+        return
     if selection.source == "libero_plus":
         for test in benchmark.load().tasks:
             level = libero_plus.level_of(test)
             yield EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, level, 0)
         return
-    for suite in selection.suites:
-        for task in tasks(suite):
-            for number in range(selection.episodes):
-                if selection.source == "libero":
-                    name = f"{task.name}_state{number}"
-                    yield EvaluationTask("libero", suite, task.name, name, "clean", "clean", 0, number)
-                    continue
-                for axis in selection.axes or OWN_AXES:
-                    for level in selection.levels or LEVELS:
-                        name = f"{task.name}_{axis}_level{level}_draw{number}"
-                        undrawn = EvaluationTask("own", suite, task.name, name, axis, "", level, number)
-                        if _axis(axis).applies(task):
-                            component = draw(undrawn, selection.seed).component
-                            yield EvaluationTask("own", suite, task.name, name, axis, component, level, number)
+    every = [(place, task) for suite in selection.suites for place, task in enumerate(tasks(suite))]
+    for place, task in every:
+        for number in range(selection.episodes):
+            match selection.source:
+                case "libero":
+                    yield _clean(task, number)
+                case "goals":
+                    for replacement in goals.replacements(task):
+                        name, kind = replacement.name(task, number), replacement.category
+                        yield EvaluationTask("goals", task.suite, task.name, name, "goal", kind, 0, number)
+                case "own":
+                    kinds = product(selection.axes or OWN_AXES, selection.levels or LEVELS)
+                    drawn = (drawn_task(task, axis, level, number, selection.seed) for axis, level in kinds)
+                    yield from filter(None, drawn)
+                case "pairs":
+                    yield from _pairs(task, place + number, number, selection)
+
+
+def _clean(task: Task, number: int) -> EvaluationTask:
+    return EvaluationTask("libero", task.suite, task.name, f"{task.name}_state{number}", "clean", "clean", 0, number)
+
+
+def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator[EvaluationTask]:
+    """All combinations of none, one and two axes on one initial state, at one level.
+
+    Args:
+        turn: place of the task in its suite and number of the state, added: which of the levels it is.
+    """
+    levels, axes = selection.levels or LEVELS, axes_of("+".join(selection.axes or PAIR_AXES))
+    pairs = ("+".join(pair) for pair in combinations(axes, 2))
+    yield _clean(task, number)
+    level = levels[turn % len(levels)]
+    drawn = (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs))
+    yield from filter(None, drawn)
 
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
-    restricted = (
-        (task.suite, selection.suites),
+    kinds = (
         (task.axis, selection.axes),
         (task.component, selection.components),
         (task.level, selection.levels),
     )
+    # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
+    restricted = ((task.suite, selection.suites), *(() if selection.source == "pairs" else kinds))
     named = any(fnmatch.fnmatch(name, pattern) for pattern in selection.tasks for name in (task.name, task.base))
     return all(not allowed or value in allowed for value, allowed in restricted) and (named or not selection.tasks)
 
 
 def _check_names(selection: Selection) -> None:
+    if selection.file is not None:
+        return
+    if selection.source == "pairs" and (selection.subset or selection.components):
+        raise PipelineError(
+            "pairs would lose some of their four combinations",
+            where="subset" if selection.subset else "components",
+            remedy="restrict pairs by suite, axis, level, task and episodes",
+        )
+    if "language" in selection.axes and selection.source in ("own", "pairs"):
+        raise PipelineError(
+            "language has no held-out draws: its rewrites are a list, and plans train on all of it",
+            where="axes",
+            expected=" or ".join(OWN_AXES),
+            remedy="--source libero_plus --axis language, whose 1,537 instructions every plan keeps clear of",
+        )
     offered = {
         "libero": {"clean"},
         "libero_plus": {axis for axis, _ in benchmark.COUNTS},
         "own": set(OWN_AXES),
+        "goals": {"goal"},
+        "pairs": set(OWN_AXES),
     }[selection.source]
     for field, named, known in (("suites", selection.suites, SUITES), ("axes", selection.axes, offered)):
         if unknown := [name for name in named if name not in known]:
@@ -180,23 +252,24 @@ def _check_names(selection: Selection) -> None:
             )
 
 
-def _without_archive(wanted: list[EvaluationTask], selection: Selection) -> list[EvaluationTask]:
+def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
     """Those that can be rebuilt; says how many cannot.
 
     Raises:
         PipelineError: when nothing can be rebuilt of an axis that is asked for by name.
     """
     tests = libero_plus.by_name()
-    left = [task for task in wanted if libero_plus.runnable(tests[task.suite, task.name])]
+    left = [task for task in wanted if libero_plus.runnable(tests[task.suite, task.name], archive)]
     missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
     if missing and (not left or {*selection.axes} - {task.axis for task in left}):
         raise PipelineError(
-            f"{counts} of {len(wanted)} tasks need the asset archive of LIBERO-Plus, which this project cannot fetch",
-            where="axes",
+            f"{counts} of {len(wanted)} tasks need files of LIBERO-Plus's asset archive",
+            where="axes" if archive is None else archive,
             expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}, or 62 of background in libero_object",
-            remedy=f"--axis {' '.join(libero_plus.RUNNABLE)}, or held-out draws of the same axes with --source own",
+            remedy=f"name the unpacked archive: --assets DIR; or --axis {' '.join(libero_plus.RUNNABLE)}; or held-out "
+            "draws of the same axes: --source own",
         )
     if missing:
-        print(f"left out, because they need the asset archive of LIBERO-Plus: {counts}")
+        print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")
     return left

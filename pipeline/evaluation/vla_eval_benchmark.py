@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,6 +21,7 @@ from vla_eval.specs import (
 )
 
 from pipeline import gl
+from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment, Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 
@@ -38,6 +40,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
             names it. Its model servers set these.
         env_seed: as there, of LIBERO's reset.
+        assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
         seed: as there; without an effect, since nothing here uses a global generator.
     """
 
@@ -59,23 +62,30 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         send_state: bool = False,
         quat_no_antipodal: bool = False,
         env_seed: int | None = None,
+        assets: str | None = None,
         seed: int | None = None,
     ):
         super().__init__()
         del seed
         self._selection = Selection.model_validate(selection or {})
         fixtures = {} if env_seed is None else {"fixture_seed": env_seed}
-        self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}))
+        self._archive = None if assets is None else Path(assets)
+        self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}), self._archive)
         self._look_every = max(1, look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
-        return [{**asdict(task), "name": str(task), "task_name": task.name} for task in select(self._selection)]
+        return [
+            {**asdict(task), "name": str(task), "task_name": task.name}
+            for task in select(self._selection, self._archive)
+        ]
 
     def reset(self, task: dict[str, Any]) -> Any:
         fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
-        self._environment.reset(EvaluationTask(**{**fields, "name": task["task_name"]}))
+        progress = self._environment.reset(EvaluationTask(**{**fields, "name": task["task_name"]}))
+        if progress.over:
+            raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
         return self._look()
 
     def step(self, action: dict[str, Any]) -> StepResult:

@@ -93,9 +93,10 @@ class Environment:
     Args:
         task: the task to build.
         scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
+        scene_xml: absolute path of another file for the arena.
     """
 
-    def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None):
+    def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
         self.task = task
         with seeded(0):
             self._env = control_env()(
@@ -105,6 +106,7 @@ class Environment:
                 use_camera_obs=False,
                 ignore_done=True,
                 scene_properties=scene_properties,
+                scene_xml=scene_xml,
             )
         self._control_step = ControlStep(self._env.env)
         self._openings = len(self._env.env.object_property_initializers)

@@ -19,6 +19,7 @@ from pipeline.publish.yields import Cell, Table
 TITLES = {
     "libero_plus": "LIBERO-Plus's test tasks",
     "own": "Held-out draws of this project's axes",
+    "goals": "Other goals in LIBERO's scenes",
     "libero": "LIBERO's tasks, unperturbed",
 }
 """Of sources of tasks; others have their own names as titles."""

@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from pipeline import gl
 from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SCHEMA
+from pipeline.rendering.culling import Culling
 from pipeline.types import Frame
+
+_CULLED = mujoco.mjNGROUP - 1
+"""A group of geoms that nothing in LIBERO is in, and that is not drawn."""
 
 
 class Surfaces(NamedTuple):
@@ -49,6 +53,8 @@ class Renderer:
         self._option = mujoco.MjvOption()
         # As robosuite's off-screen context: visual meshes without the collision geometry.
         self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
+        self._option.geomgroup[_CULLED] = 0
+        self._culling = Culling(self.model, width / height)
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
         """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
@@ -61,8 +67,16 @@ class Renderer:
 
     def frame(self, camera: str) -> Frame:
         """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
-        self._renderer.update_scene(self.data, camera, self._option)
-        return np.ascontiguousarray(self._renderer.render()[::-1])
+        drawn = self._culling.drawn(self.data, camera)
+        groups = self.model.geom_group.copy()
+        flags = self._renderer.scene.flags
+        try:
+            self.model.geom_group[~drawn.geoms] = _CULLED
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = drawn.reflections
+            self._renderer.update_scene(self.data, camera, self._option)
+            return np.ascontiguousarray(self._renderer.render()[::-1])
+        finally:
+            self.model.geom_group[:] = groups
 
     def geoms(self, camera: str) -> NDArray[np.int32]:
         """(H, W) the geom that each pixel of :meth:`frame` shows, by its number in the model; -1 for none."""

@@ -28,6 +28,7 @@ _NAME = re.compile(
     r"|(?:_moved)?_level(?P<level>\d)_sample(?P<sample>\d))"
 )
 _LIGHT = re.compile(r".*_([a-z]+)_light_sync_modified_(\d+)")
+_BASE_CLASS = re.compile(r"libero_\w*?_manipulation")
 _SCENE_FILE = re.compile(r".*_table_(?P<surface>.+?)(?:_bg_(?P<wall>.+))?\.xml")
 _NOISE = {
     "motion": ("motion_blur", ("radius_px", "sigma_px")),
@@ -46,6 +47,19 @@ class TestChange(NamedTuple):
     axis: str
     component: str
     parameters: dict[str, Value]
+
+
+class SceneFiles(NamedTuple):
+    """What a test task's scene is made from, by paths below the benchmark's assets.
+
+    Attributes:
+        scene_xml: the arena.
+        floor, wall: images that LIBERO sets in it.
+    """
+
+    scene_xml: str
+    floor: str
+    wall: str
 
 
 class Reader:
@@ -115,6 +129,23 @@ class Reader:
             return TestChange(base.name, "pose", "pose", {**drawn, **moved})
         component = "theme" if match["theme"] else "surface"
         return TestChange(base.name, "background", component, self._textures(scene, component == "theme"))
+
+    def scene_files(self, suite: str, name: str) -> SceneFiles:
+        """What a task's arena is made from; a class that does not say leaves it to the class of its arena."""
+        problem = self._scene(suite, name).problem
+        settings = self._classes[_BASE_CLASS.match(problem)[0]] | self._classes[problem]  # type: ignore[index]
+        floor, wall = self._floors[settings["floor_style"]], self._walls[settings["wall_style"]]
+        return SceneFiles(settings["scene_xml"], f"textures/{floor}", f"textures/{wall}")
+
+    def object_models(self) -> dict[str, str]:
+        """Category of an added object, as BDDL files name it, to its MJCF below the benchmark's assets."""
+        listed = re.findall(
+            r'^class (\w+)\(CustomObjects\):.*?"assets/(new_objects/[^"]+)"',
+            self._text("envs/objects/custom_objects.py"),
+            flags=re.MULTILINE | re.DOTALL,
+        )
+        # As LIBERO registers classes: BottleOfBabyOil_2 is bottle_of_baby_oil__2.
+        return {"_".join(re.sub("([A-Z0-9])", r" \1", name).split()).lower(): path for name, path in listed}
 
     def _scene(self, suite: str, name: str) -> Bddl:
         file = f"bddl_files/{suite}/{name}.bddl"

@@ -1,0 +1,141 @@
+"""Scenes, images and models that test tasks of light, background and layout need, and where they are.
+
+62 background tasks need LIBERO's own assets alone. The others need LIBERO-Plus's asset archive (``assets.zip``, 6.4 GB,
+in the dataset Sylvest/LIBERO-plus on the hub), which takes the place of LIBERO's assets in the benchmark. Which files a
+task needs is in the benchmark's code, which is read as text.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from libero.libero import get_libero_path
+
+from pipeline.errors import PipelineError
+from pipeline.physics.environment import control_env
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestTask
+from pipeline.testset.definitions import Reader, SceneFiles
+
+_ROTATION_RAD = {"x": (-np.pi / 2, -np.pi / 2), "y": (-np.pi, -np.pi), "z": (np.pi, np.pi)}
+"""How LIBERO's reset turns an added object: the same for all 867 models of the benchmark."""
+
+
+@dataclass(frozen=True)
+class Assets:
+    """LIBERO's assets, or the unpacked archive.
+
+    Args:
+        folder: where it was unpacked. The archive has its files below the path that they had on the machine that packed
+            it, so this may be any folder on the way to the one with ``scenes``.
+    """
+
+    folder: Path
+
+    @cached_property
+    def root(self) -> Path:
+        """The folder with ``scenes``, ``textures`` and ``new_objects``.
+
+        Raises:
+            PipelineError: when there is none.
+        """
+        root = self.folder
+        while not (root / "scenes").is_dir():
+            below = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+            if len(below) != 1:
+                raise PipelineError(
+                    "not the unpacked asset archive of LIBERO-Plus",
+                    where=root,
+                    expected="a folder with scenes, textures and new_objects, or one that leads to it",
+                    remedy="unpack assets.zip of the dataset Sylvest/LIBERO-plus, and name that folder",
+                )
+            (root,) = below
+        return root.resolve()
+
+    def holds(self, test: TestTask) -> bool:
+        """Whether the files that a light, background or layout task names are there."""
+        if test.axis == "layout":
+            paths: Iterable[str] = object_models(test).values()
+        else:
+            paths = scene_files(test)
+        return all((self.root / path).is_file() for path in paths)
+
+    def scene(self, test: TestTask) -> SceneFiles:
+        """The files of a light or background task; absolute paths."""
+        return SceneFiles(*(str(self.root / path) for path in scene_files(test)))
+
+    def register_objects(self, test: TestTask) -> None:
+        """Let LIBERO build scenes with the objects that a layout task adds, by the categories of its BDDL file."""
+        control_env()  # which takes care of how it is imported
+        from libero.libero.envs.base_object import OBJECTS_DICT
+
+        for category, path in object_models(test).items():
+            OBJECTS_DICT[category] = _object_class(category, self.root / path)
+
+
+def having(test: TestTask, archive: Path | None) -> Assets | None:
+    """LIBERO's assets or the archive, whichever has the files of a light, background or layout task; None if neither.
+
+    Args:
+        archive: folder of the unpacked archive, where there is one.
+    """
+    folders = [Path(get_libero_path("assets")), *([] if archive is None else [archive])]
+    return next((assets for assets in map(Assets, folders) if assets.holds(test)), None)
+
+
+def scene_files(test: TestTask) -> SceneFiles:
+    """Of a light or background task, by their paths in the archive."""
+    return _reader().scene_files(test.suite, test.name)
+
+
+def object_models(test: TestTask) -> dict[str, str]:
+    """Category to MJCF, by its path in the archive, of the objects that a layout task adds."""
+    return {category: _models()[category] for category in str(test.parameters["category"]).split(",")}
+
+
+@cache
+def _reader() -> Reader:
+    return Reader(zipfile.ZipFile(benchmark.fetch_testset()))
+
+
+@cache
+def _models() -> dict[str, str]:
+    return _reader().object_models()
+
+
+def _object_class(category: str, file: Path) -> Any:
+    """What LIBERO makes each object of a category with."""
+    from robosuite.models.objects import MujocoXMLObject
+
+    class AddedObject(MujocoXMLObject):  # type: ignore[misc]
+        """A model of the archive as the benchmark's code loads it."""
+
+        def __init__(self, name: str = category):
+            joints = [{"type": "free", "damping": "0.0005"}]
+            super().__init__(str(file), name=name, joints=joints, obj_type="all", duplicate_collision_geoms=False)
+            self.category_name = category
+            self.object_properties: dict[str, Any] = {"vis_site_names": {}}
+            self.rotation, self.rotation_axis = _ROTATION_RAD, None
+
+        def _get_object_subtree(self) -> Any:
+            """The body ``object``; robosuite expects it in another body, these models may have it at the top."""
+            if self.worldbody.find("./body/body[@name='object']") is not None:
+                return super()._get_object_subtree()
+            body = self.worldbody.find("./body[@name='object']")
+            if body is None:
+                raise PipelineError("the model has no body 'object'", where=file)
+            holder = ET.SubElement(self.worldbody, "body")
+            holder.append(body)
+            try:
+                return super()._get_object_subtree()
+            finally:
+                self.worldbody.remove(holder)
+
+    return AddedObject

@@ -1,0 +1,158 @@
+"""A benchmark made as LIBERO-Plus was: 14,000 candidates, filtered, balanced to about 10,000, graded by models.
+
+LIBERO-Plus drew 500 candidates of each of its seven dimensions in each of four suites. Here the seven are this
+project's axes with held-out draws: its layout is the axes layout and pose, and language has no draws of its own.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import count, islice, product
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import PipelineError
+from pipeline.evaluation.disjoint import PlannedDraws
+from pipeline.evaluation.held_out import LEVELS, OWN_AXES
+from pipeline.evaluation.results import Row
+from pipeline.evaluation.tasks import EvaluationTask, balanced, draw, drawn_task
+from pipeline.files import replaced
+from pipeline.libero.tasks import find_task, tasks
+from pipeline.testset.benchmark import SUITES
+
+CANDIDATES = 500
+"""Of each axis in each suite, spread evenly over tasks and levels."""
+
+SIZE = 10_000
+"""How many tasks the benchmark has; LIBERO-Plus has 10,030."""
+
+Identity = tuple[str, str, str]
+"""Source, suite and name of a task, which are once in a benchmark."""
+
+
+@dataclass(frozen=True)
+class Construction:
+    """A benchmark, and what was left out of its candidates.
+
+    Attributes:
+        tasks: what it consists of.
+        candidates: how many were drawn.
+        refused: of these, whose scene takes no draw, as results say.
+        overlapping: of these, what a plan has or comes too close to.
+    """
+
+    tasks: list[EvaluationTask]
+    candidates: int
+    refused: int
+    overlapping: int
+
+    def counts(self) -> dict[str, Any]:
+        """What there is of each kind, JSON-serialisable."""
+        by_kind = Counter(f"{task.axis}/{task.component}" for task in self.tasks)
+        return {
+            "candidates": self.candidates,
+            "refused": self.refused,
+            "overlapping": self.overlapping,
+            "tasks": len(self.tasks),
+            "by_axis": dict(sorted(Counter(task.axis for task in self.tasks).items())),
+            "by_component": dict(sorted(by_kind.items())),
+        }
+
+
+def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
+    """``each`` held-out draws of every axis in every suite; parameters only, no scene is built.
+
+    The number of a draw counts up once all tasks and levels had one, so initial states differ too.
+    """
+    drawn: list[EvaluationTask] = []
+    for suite, axis in product(SUITES, OWN_AXES):
+        every = (
+            drawn_task(task, axis, level, number, seed)
+            for number in count()
+            for level, task in product(LEVELS, tasks(suite))
+        )
+        drawn += islice((task for task in every if task is not None), each)
+    return drawn
+
+
+def construct(
+    drawn: Sequence[EvaluationTask],
+    seed: int,
+    size: int = SIZE,
+    results: Iterable[Row] = (),
+    plan: PlannedDraws | None = None,
+) -> Construction:
+    """Filter candidates, and choose some evenly: axes in turn, of each axis its components, then levels, then suites.
+
+    Args:
+        results: episodes of candidates that were run; those whose scene was refused are left out.
+        plan: a training plan; candidates that overlap with it are left out.
+    """
+    refused = {_identity(row) for row in results if row["reason"] == "refused"}
+    there = [task for task in drawn if (task.source, task.suite, task.name) not in refused]
+    apart = [task for task in there if plan is None or not _overlaps(task, seed, plan)]
+    return Construction(balanced(apart, size, seed), len(drawn), len(drawn) - len(there), len(there) - len(apart))
+
+
+def _overlaps(task: EvaluationTask, seed: int, plan: PlannedDraws) -> bool:
+    return plan.overlap(draw(task, seed), find_task(task.suite, task.base))
+
+
+def difficulty(solved: int, models: int) -> int:
+    """Level 1 to 5 of a task that ``solved`` of some models solve.
+
+    LIBERO-Plus has four models, and 5 minus how many solve the task. For any number of models this is 5 minus four
+    times the share that solves it, rounded to the nearest, halves to the harder: with up to seven models, 1 means that
+    all solve the task and 5 that none does.
+    """
+    # ceil(4 solved / models - 1 / 2) in whole numbers.
+    return 5 + (models - 8 * solved) // (2 * models)
+
+
+def grade(results: Sequence[Iterable[Row]]) -> list[dict[str, Any]]:
+    """Every task that all models ran, as JSON, with its ``difficulty`` and how many models solve it.
+
+    Args:
+        results: the episodes of each model.
+
+    Raises:
+        PipelineError: when a model has two results of one task, or no task was run by all.
+    """
+    outcomes = [_outcomes(rows) for rows in results]
+    shared = [identity for identity in outcomes[0] if all(identity in of_model for of_model in outcomes)]
+    if not shared:
+        raise PipelineError("no task was run by all models", remedy="evaluate all of them with the same --tasks-from")
+    graded = []
+    for identity in shared:
+        rows = [of_model[identity] for of_model in outcomes]
+        solved = sum(bool(row["success"]) for row in rows)
+        fields = {name: rows[0][name] for name in EvaluationTask.__dataclass_fields__}
+        graded.append({**fields, "solved": solved, "difficulty": difficulty(solved, len(rows))})
+    return graded
+
+
+def _outcomes(rows: Iterable[Row]) -> dict[Identity, Row]:
+    outcomes: dict[Identity, Row] = {}
+    for row in rows:
+        if row["reason"] == "refused":
+            continue
+        if outcomes.setdefault(_identity(row), row) is not row:
+            raise PipelineError(
+                f"several results of {'/'.join(_identity(row))}", expected="one model under one setting in each folder"
+            )
+    return outcomes
+
+
+def _identity(row: Row) -> Identity:
+    return row["source"], row["suite"], row["name"]
+
+
+def write(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
+    """Write a list of tasks that ``evaluate --tasks-from`` reads."""
+    content = [task if isinstance(task, dict) else asdict(task) for task in listed]
+    lines = ",\n".join(json.dumps(task) for task in content)
+    with replaced(file) as temporary:
+        temporary.write_text(f'{{"seed": {seed}, "tasks": [\n{lines}\n]}}\n')

@@ -1,0 +1,201 @@
+"""The proof that held-out draws are none of a plan: how close each comes to the nearest planned one."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.axes import AnyPerturbation, from_json
+from pipeline.axes.background import BackgroundPerturbation
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.layout import LayoutPerturbation
+from pipeline.axes.light import LightPerturbation
+from pipeline.axes.noise import NoiseAxis, NoisePerturbation
+from pipeline.axes.pose import PosePerturbation
+from pipeline.axes.robot import RobotPerturbation
+from pipeline.axes.scene import ScenePerturbation
+from pipeline.errors import PipelineError
+from pipeline.files import Edition, edition
+from pipeline.run import plan
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.testset.definitions import Value
+from pipeline.types import Floats, Task
+
+
+class PlannedDraws:
+    """What a plan draws, to keep held-out draws clear of it.
+
+    Distances are those of the leakage report, with the plan in the place of the benchmark's test tasks. Of light, whose
+    test tasks cannot be compared with, two draws are 0 apart where all their parameters are equal, else 1.
+
+    Args:
+        rows: of the plan, reserves among them.
+    """
+
+    def __init__(self, rows: Iterable[plan.Row]):
+        self._draws: dict[str, list[AnyPerturbation]] = defaultdict(list)
+        self._episodes: dict[str, list[str]] = defaultdict(list)
+        tests: list[TestTask] = []
+        for row in rows:
+            for one in from_json(row.perturbations):
+                self._draws[one.axis].append(one)
+                self._episodes[one.axis].append(row.episode_id)
+                tests.append(TestTask(row.suite, row.task, row.episode_id, one.axis, one.component, _as_test(one)))
+        self._tests = TestSet(tuple(tests))
+
+    def nearest(self, drawn: AnyPerturbation, task: Task) -> tuple[float, str]:
+        """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
+        episode, where there is none to compare with."""
+        distances = self._distances(drawn, task)
+        if np.isnan(distances).all():
+            return math.inf, ""
+        closest = int(np.nanargmin(distances))
+        distance = float(distances[closest])
+        return distance, self._episodes[drawn.axis][closest] if math.isfinite(distance) else ""
+
+    def count(self, name: str) -> int:
+        """How many planned draws an axis has."""
+        return len(self._draws[name])
+
+    def overlap(self, drawn: AnyPerturbation, task: Task) -> bool:
+        """Whether a draw is a planned one, or closer to one than the axis keeps from the benchmark's test tasks."""
+        distance, _ = self.nearest(drawn, task)
+        return distance == 0 or distance < drawn.clearance
+
+    def _distances(self, drawn: AnyPerturbation, task: Task) -> Floats:
+        """(N,) to the planned draws of the axis, NaN where there is nothing to compare."""
+        match drawn:
+            case RobotPerturbation():
+                return np.asarray(np.linalg.norm(self._robot_offsets_rad - drawn.joint_offsets_rad, axis=1))
+            case NoisePerturbation():
+                return np.abs(self._severities[drawn.component] - drawn.severity(benchmark.load()))
+            case BackgroundPerturbation():
+                shown = _images(drawn)
+                return np.array([0.0 if shown & images else 1.0 for images in self._background_images])
+            case LightPerturbation():
+                return np.array([float(planned != drawn) for planned in self._draws["light"]])
+            case _:
+                return drawn.distances(self._tests, task)
+
+    @cached_property
+    def _robot_offsets_rad(self) -> Floats:
+        offsets = [one.joint_offsets_rad for one in self._draws["robot"] if isinstance(one, RobotPerturbation)]
+        return np.array(offsets).reshape(-1, 7)
+
+    @cached_property
+    def _severities(self) -> Mapping[str, Floats]:
+        """Component to (N,) the severities of the planned draws of noise, NaN where they are of another."""
+        test = benchmark.load()
+        draws = [one for one in self._draws["noise"] if isinstance(one, NoisePerturbation)]
+        severities = np.array([one.severity(test) for one in draws])
+        components = np.array([one.component for one in draws], dtype=str)
+        return {name: np.where(components == name, severities, np.nan) for name in NoiseAxis.model_fields}
+
+    @cached_property
+    def _background_images(self) -> list[frozenset[str]]:
+        return [_images(one) for one in self._draws["background"] if isinstance(one, BackgroundPerturbation)]
+
+
+def planned(file: Path) -> PlannedDraws:
+    """The draws of a plan's file, read once a process.
+
+    Raises:
+        PipelineError: when it is not a plan of this version.
+    """
+    return _planned(file, sha256_of(file))
+
+
+@cache
+def _planned(file: Path, sha256: str) -> PlannedDraws:
+    return PlannedDraws(plan.read(file))
+
+
+def sha256_of(file: Path) -> str:
+    """By which results name a plan.
+
+    Raises:
+        PipelineError: when the file cannot be read.
+    """
+    try:
+        return _sha256(file, edition(file))
+    except OSError as error:
+        raise PipelineError(f"cannot be read ({error})", where=file, expected="data/<run>/plan.parquet") from error
+
+
+@cache
+def _sha256(file: Path, version: Edition) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def _images(one: BackgroundPerturbation) -> frozenset[str]:
+    return frozenset(covering.sha256 for covering in one.coverings)
+
+
+def _as_test(one: AnyPerturbation) -> dict[str, Value]:
+    """The parameters of a planned draw as a test task has them, where its axis reads them to compare."""
+    match one:
+        case CameraPerturbation():
+            return one.model_dump(exclude={"axis", "component", "level"})
+        case LayoutPerturbation():
+            return {"category": ",".join(added.category for added in one.objects)}
+        case PosePerturbation():
+            return {"target": one.moved, "dx_m": one.dx_m, "dy_m": one.dy_m}
+        case ScenePerturbation():
+            return {"moves": ";".join(f"{move.name}:{move.dx_m},{move.dy_m}" for move in one.moves)}
+        case _:
+            return {}
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How close held-out draws of one axis come to a plan.
+
+    Attributes:
+        draws: how many there are.
+        planned: how many the plan has on this axis.
+        overlaps: the draws that a planned one repeats, or comes closer to than ``clearance``.
+        smallest: the least distance of all; None where nothing could be compared.
+        closest: the held-out draw and the planned episode that it belongs to.
+        clearance: the least distance that the leakage report allows between a plan and the benchmark.
+    """
+
+    draws: int
+    planned: int
+    overlaps: int
+    smallest: float | None
+    closest: tuple[str, str] | None
+    clearance: float
+
+
+def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: PlannedDraws) -> dict[str, HeldOut]:
+    """Axis to how close held-out draws come to a plan.
+
+    Args:
+        drawn: the name of each, the draw, and the task that it changes.
+    """
+    by_axis: dict[str, list[tuple[str, AnyPerturbation, Task]]] = defaultdict(list)
+    for name, one, task in drawn:
+        by_axis[one.axis].append((name, one, task))
+    return {name: _held_out(by_axis[name], planned_draws) for name in by_axis}
+
+
+def _held_out(drawn: Sequence[tuple[str, AnyPerturbation, Task]], planned_draws: PlannedDraws) -> HeldOut:
+    nearest = [(*planned_draws.nearest(one, task), name) for name, one, task in drawn]
+    smallest, episode, name = min(nearest)
+    first = drawn[0][1]
+    return HeldOut(
+        draws=len(drawn),
+        planned=planned_draws.count(first.axis),
+        overlaps=sum(planned_draws.overlap(one, task) for _, one, task in drawn),
+        smallest=smallest if math.isfinite(smallest) else None,
+        closest=(name, episode) if math.isfinite(smallest) else None,
+        clearance=first.clearance,
+    )
