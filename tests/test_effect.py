@@ -83,7 +83,7 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     assert line["arms"]["perturbed"]["successes"] == 9
     assert line["p_values"] == {"perturbed": 2 / 2**5}
     # Wilson's interval of 4 in 10: (0.4 + 0.19207) / 1.38415 and 0.25958 to either side.
-    assert "| light | held-out draws | 10 | 40 % (17-69) | 90 % (60-98) | 0.062 |" in markdown([line])
+    assert "| light | own draws | 10 | 40 % (17-69) | 90 % (60-98) | 0.062 |" in markdown([line])
 
 
 def small_experiment(folder: Path, demos: Path) -> Path:

@@ -152,12 +152,17 @@ def evaluate(experiment: Experiment, policy: Path, out: Path, shell: Shell) -> N
     suites, names = zip(*(task.split("/") for task in tasks), strict=True)
     each = math.ceil(wanted.episodes / len(tasks))
     selections = [["--source", "libero", "--episodes", str(min(each, 50))]]
-    for source, axes in (("libero_plus", wanted.libero_plus), ("own", wanted.own)):
+    apart = ["--plan", str(experiment.run.data / "plan.parquet")]
+    # A draw is made for each task, axis and one of five levels.
+    draws = ["--episodes", str(math.ceil(each / 5))]
+    for source, axes, options in (
+        ("libero_plus", wanted.libero_plus, []),
+        ("own", wanted.held_out, [*draws, *apart]),
+        ("own", wanted.redrawn, draws),
+    ):
         if axes:
             subset = str(wanted.episodes * len(axes))
-            # A held-out draw is made for each task, axis and one of five levels.
-            draws = str(math.ceil(each / 5))
-            selections.append(["--source", source, "--axis", *axes, "--subset", subset, "--episodes", draws])
+            selections.append(["--source", source, *options, "--subset", subset, "--axis", *axes])
     for selection in selections:
         shell(
             "evaluation",

@@ -41,13 +41,15 @@ class EvaluationConfig(Frozen):
     Attributes:
         episodes: at least so many of each axis, as far as the test tasks go, and of LIBERO's initial states.
         libero_plus: axes evaluated on LIBERO-Plus's test tasks.
-        own: axes evaluated on held-out draws.
+        held_out: axes evaluated on draws that keep clear of the plan's.
+        redrawn: axes evaluated on new draws of what the plan draws from, where it leaves too little to hold out.
         initial_states: ``demonstration`` starts where the starter set's demonstration does.
     """
 
     episodes: int = Field(ge=1)
     libero_plus: tuple[PLUS_AXES, ...] = ()
-    own: tuple[OWN_AXES, ...] = ()
+    held_out: tuple[OWN_AXES, ...] = ()
+    redrawn: tuple[OWN_AXES, ...] = ()
     initial_states: Literal["libero", "demonstration"] = "libero"
 
 

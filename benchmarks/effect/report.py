@@ -13,7 +13,7 @@ from pipeline.evaluation import merging
 from pipeline.evaluation.comparison import compare, paired
 from pipeline.evaluation.results import Row, wilson
 
-SOURCES = {"libero": "LIBERO's own tasks", "libero_plus": "LIBERO-Plus test tasks", "own": "held-out draws"}
+SOURCES = {"libero": "LIBERO's own tasks", "libero_plus": "LIBERO-Plus test tasks", "own": "own draws"}
 
 Results = Mapping[str, Sequence[Sequence[Row]]]
 """Arm to the rows of its policies, a policy for each seed, in the same order for all arms."""
