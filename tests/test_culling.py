@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import arenas
 import mujoco
 import numpy as np
 import pytest
+from arenas import TASKS
 
 from pipeline import seeding
-from pipeline.rendering.culling import Culling, Drawn
+from pipeline.episode_schema import SCHEMA
+from pipeline.rendering.culling import Culling, Part
 from pipeline.rendering.renderer import Renderer
+from pipeline.types import Frame
 
 GEOMS = 30
 SHAPES = {"sphere": "0.05", "box": "0.1 0.02 0.05", "cylinder": "0.03 0.2"}
@@ -45,22 +49,45 @@ def renderer(request: pytest.FixtureRequest) -> Iterator[Renderer]:
     opened.close()
 
 
-def test_the_same_pixels_with_less_drawn(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def plain(renderer: Renderer, camera: str) -> Frame:
+    """A frame for which everything is drawn."""
+    whole = slice(0, SCHEMA.frame.shape[0]), slice(0, SCHEMA.frame.shape[1])
+    with pytest.MonkeyPatch.context() as patch:
+        everything = Part(np.ones(renderer.model.ngeom, np.bool_), True, *whole)
+        patch.setattr(Culling, "parts", lambda *_: [everything])
+        return renderer.frame(camera)
+
+
+def test_the_same_pixels_with_less_drawn(renderer: Renderer) -> None:
     rng = seeding.rng("test_culling", "eyes")
-    left_out, without_reflections = 0, 0
-    for _ in range(24):
+    left_out, reflecting_parts = 0, []
+    for _ in range(40):
         quat_wxyz = rng.normal(size=4)
         renderer.data.mocap_quat[0] = quat_wxyz / np.linalg.norm(quat_wxyz)
         mujoco.mj_forward(renderer.model, renderer.data)
-        drawn = Culling(renderer.model, 1.0).drawn(renderer.data, "eye")
-        left_out += int((~drawn.geoms).sum())
-        without_reflections += not drawn.reflections
-        culled = renderer.frame("eye")
-        with monkeypatch.context() as patch:
-            patch.setattr(Culling, "drawn", lambda *_: Drawn(np.ones(renderer.model.ngeom, np.bool_), True))
-            assert np.array_equal(renderer.frame("eye"), culled)
+        parts = renderer._culling.parts(renderer.data, "eye")
+        left_out += int((~parts[0].geoms).sum())
+        reflecting_parts.append(len(parts) - 1 if not parts[0].reflections else -1)
+        assert np.array_equal(renderer.frame("eye"), plain(renderer, "eye"))
     if renderer.model.light_castshadow.any():
-        assert left_out == without_reflections == 0, "what is not in the picture may cast a shadow into it"
+        assert left_out == 0, "what is not in the picture may cast a shadow into it"
+        assert set(reflecting_parts) == {-1}
     else:
-        assert left_out > 24 * GEOMS / 2
-        assert 0 < without_reflections < 24
+        assert left_out > 40 * GEOMS / 2
+        assert {0, 1} <= set(reflecting_parts), "no reflection, and one for which a rectangle is drawn"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arena", TASKS)
+def test_the_same_pixels_in_every_arena(arena: str) -> None:
+    opened = arenas.renderer(arena)
+    rng = seeding.rng("test_culling", arena)
+    try:
+        for _ in range(3):
+            # The first seven are the arm's.
+            opened.data.qpos[:7] += rng.uniform(-0.3, 0.3, 7)
+            mujoco.mj_forward(opened.model, opened.data)
+            for camera in (view.camera for view in SCHEMA.views.values()):
+                assert np.array_equal(opened.frame(camera), plain(opened, camera)), camera
+    finally:
+        opened.close()

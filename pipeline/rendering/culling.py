@@ -2,11 +2,13 @@
 
 MuJoCo draws every geom of a scene whether it is in the picture or not, and all of them once more where a box or a plane
 reflects. In LIBERO's wrist view most of the robot, which has more than half of a scene's triangles, is behind the
-camera.
+camera; what reflects is a plate of the stove, around which little is to be seen.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from itertools import product
 from typing import NamedTuple
 
 import mujoco
@@ -16,68 +18,122 @@ from numpy.typing import NDArray
 from pipeline.types import Floats
 
 MARGIN_M = 1e-3
-"""Added to every radius, for what the rasteriser rounds."""
+"""Added around every geom, for what the rasteriser rounds."""
+
+EDGE_PX = 3
+"""How much wider than a reflecting box its rectangle is, for the smoothing of edges."""
 
 
-class Drawn(NamedTuple):
-    """What a picture has to draw.
+class Part(NamedTuple):
+    """A rectangle of a picture, and what has to be drawn for it.
 
     Attributes:
         geoms: (ngeom,) which geoms.
-        reflections: whether a reflecting geom is in the picture.
+        reflections: whether one of them reflects.
+        rows, columns: of the picture, the first row at the top.
     """
 
     geoms: NDArray[np.bool_]
     reflections: bool
+    rows: slice
+    columns: slice
 
 
 class Culling:
-    """Tells by bounding spheres what a camera can see of a model.
+    """Tells by the boxes around geoms what a camera can see of a model.
 
     Args:
-        aspect: width of the pictures over their height.
+        height, width: of the pictures, in pixels.
+        hidden_groups: groups of geoms that are not drawn.
     """
 
-    def __init__(self, model: mujoco.MjModel, aspect: float):
-        self._model, self._aspect = model, aspect
+    def __init__(self, model: mujoco.MjModel, height: int, width: int, hidden_groups: Collection[int]):
+        self._model, self._height, self._width = model, height, width
+        self._hidden_groups = list(hidden_groups)
         # A plane has no bound: it is drawn wherever it is.
-        unbounded = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        self._radius_m: Floats = np.where(unbounded, np.inf, model.geom_rbound + MARGIN_M)
+        self._unbounded = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        centres_m, halves_m = model.geom_aabb[:, None, :3], model.geom_aabb[:, None, 3:] + MARGIN_M
+        self._corners_m: Floats = centres_m + np.array(list(product((-1, 1), repeat=3))) * halves_m
         flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
         self._flat = np.flatnonzero(flat & (model.geom_matid >= 0))
 
-    def drawn(self, data: mujoco.MjData, camera: str) -> Drawn:
-        """What one picture of the data's state has to draw; positions must be up to date.
+    def parts(self, data: mujoco.MjData, camera: str) -> list[Part]:
+        """What a picture of the data's state is made of; positions must be up to date.
 
-        Where something reflects, also what its mirror image may show: the reflecting side is a box's upper z face, or
-        the plane (``mjr_render``).
+        The first part is all of the picture. Where a box reflects, a further part is the rectangle around it, for which
+        mirror images are drawn too; in the first part nothing reflects.
         """
         model = self._model
+        whole = slice(0, self._height), slice(0, self._width)
         if (model.light_castshadow & model.light_active).any():
             # A shadow may come from outside of the picture.
-            return Drawn(np.ones(model.ngeom, np.bool_), True)
-        number = model.camera(camera).id
-        seen = self._in_frustum(data, number, data.geom_xpos)
-        mirrors = self._flat[model.mat_reflectance[model.geom_matid[self._flat]] > 0]
-        geoms = seen.copy()
-        # MuJoCo has the first of them reflect: without it, that would be another.
-        geoms[mirrors] = True
-        mirrors = mirrors[seen[mirrors]]
-        for mirror in mirrors:
-            normal = data.geom_xmat[mirror].reshape(3, 3)[:, 2]
-            is_box = model.geom_type[mirror] == mujoco.mjtGeom.mjGEOM_BOX
-            face_m = data.geom_xpos[mirror] + normal * (model.geom_size[mirror, 2] if is_box else 0)
-            height_m = (data.geom_xpos - face_m) @ normal
-            geoms |= self._in_frustum(data, number, data.geom_xpos - 2 * height_m[:, None] * normal)
-        return Drawn(geoms, len(mirrors) > 0)
+            return [Part(np.ones(model.ngeom, np.bool_), True, *whole)]
+        view = _View(model, data, camera, self._height, self._width)
+        corners_m = data.geom_xpos[:, None] + self._corners_m @ data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
+        seen = self._unbounded | view.shows(corners_m, *whole)
+        reflects = model.mat_reflectance[model.geom_matid[self._flat]] > 0
+        mirrors = self._flat[reflects & ~np.isin(model.geom_group[self._flat], self._hidden_groups)]
+        seen_mirrors = mirrors[seen[mirrors]]
+        rectangles = [
+            whole if self._unbounded[mirror] else view.rectangle(corners_m[mirror]) or whole for mirror in seen_mirrors
+        ]
+        images = [self._mirrored(data, corners_m, mirror) for mirror in seen_mirrors]
+        parts = [] if whole in rectangles else [Part(seen, False, *whole)]
+        for rectangle in [whole] if whole in rectangles else rectangles:
+            geoms = self._unbounded | view.shows(corners_m, *rectangle)
+            for mirrored, image_m in images:
+                geoms |= mirrored & view.shows(image_m, *rectangle)
+            # MuJoCo has the first of them reflect: without it, that would be another.
+            geoms[mirrors] = True
+            parts.append(Part(geoms, True, *rectangle))
+        return parts
 
-    def _in_frustum(self, data: mujoco.MjData, camera: int, centres_m: Floats) -> NDArray[np.bool_]:
-        """(ngeom,) whether the bounding sphere at each of ``centres_m`` (ngeom, 3) is in or on the camera's pyramid."""
-        # The camera looks along -z, with y up.
-        right, up, back = ((centres_m - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)).T
-        half_rad = np.radians(self._model.cam_fovy[camera]) / 2
-        inside = np.ones(len(centres_m), np.bool_)
-        for off_axis, angle_rad in ((up, half_rad), (right, np.arctan(self._aspect * np.tan(half_rad)))):
-            # How far outside of the nearer of two opposite sides, which pass through the camera.
-            inside &= np.abs(off_axis) * np.cos(angle_rad) + back * np.sin(angle_rad) <= self._radius_m
+    def _mirrored(self, data: mujoco.MjData, corners_m: Floats, mirror: int) -> tuple[NDArray[np.bool_], Floats]:
+        """(ngeom,) which geoms have a part before a mirror, and (ngeom, 8, 3) the images of their corners.
+
+        The reflecting side is that of a plane, or a box's upper z face (``mjr_render``).
+        """
+        normal = data.geom_xmat[mirror].reshape(3, 3)[:, 2]
+        face_m = 0 if self._unbounded[mirror] else self._model.geom_size[mirror, 2]
+        heights_m = (corners_m - data.geom_xpos[mirror]) @ normal - face_m
+        return (heights_m > 0).any(axis=1), corners_m - 2 * heights_m[..., None] * normal
+
+
+class _View:
+    """The pyramid that a camera sees, in its own frame: it looks along -z, with y up."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, height: int, width: int):
+        number = model.camera(camera).id
+        self._model, self._height, self._width = model, height, width
+        self._position_m, self._axes = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
+        half_tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
+        # Pixels for each metre to the side at a metre of depth.
+        self._scale_px = height / 2 / half_tangent
+
+    def shows(self, corners_m: Floats, rows: slice, columns: slice) -> NDArray[np.bool_]:
+        """(N,) whether boxes with ``corners_m`` (N, 8, 3) may be in what a rectangle shows."""
+        right, up, back = np.moveaxis((corners_m - self._position_m) @ self._axes, -1, 0)
+        inside = np.ones(len(corners_m), np.bool_)
+        for off_axis, low_px, high_px in (
+            (right, columns.start - self._width / 2, columns.stop - self._width / 2),
+            (up, self._height / 2 - rows.stop, self._height / 2 - rows.start),
+        ):
+            # A box is outside when all of it is beyond one side; the sides pass through the camera.
+            inside &= ~(off_axis + high_px / self._scale_px * back > 0).all(axis=1)
+            inside &= ~(off_axis + low_px / self._scale_px * back < 0).all(axis=1)
         return inside
+
+    def rectangle(self, corners_m: Floats) -> tuple[slice, slice] | None:
+        """Rows and columns around a box with ``corners_m`` (8, 3), some pixels wider; None when it reaches behind the
+        camera."""
+        right, up, back = ((corners_m - self._position_m) @ self._axes).T
+        if (back >= -MARGIN_M).any():
+            return None
+        rows = self._height / 2 + up / back * self._scale_px
+        columns = self._width / 2 - right / back * self._scale_px
+        return _around(rows, self._height), _around(columns, self._width)
+
+
+def _around(places_px: Floats, size_px: int) -> slice:
+    low, high = np.clip((np.floor(places_px.min()) - EDGE_PX, np.ceil(places_px.max()) + EDGE_PX), 0, size_px)
+    return slice(int(low), int(high))

@@ -54,7 +54,8 @@ class Renderer:
         # As robosuite's off-screen context: visual meshes without the collision geometry.
         self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
         self._option.geomgroup[_CULLED] = 0
-        self._culling = Culling(self.model, width / height)
+        hidden = np.flatnonzero(np.logical_not(self._option.geomgroup))
+        self._culling = Culling(self.model, height, width, hidden.tolist())
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
         """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
@@ -67,16 +68,17 @@ class Renderer:
 
     def frame(self, camera: str) -> Frame:
         """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
-        drawn = self._culling.drawn(self.data, camera)
         groups = self.model.geom_group.copy()
-        flags = self._renderer.scene.flags
+        frame = np.empty((*SCHEMA.frame.shape,), np.uint8)
         try:
-            self.model.geom_group[~drawn.geoms] = _CULLED
-            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = drawn.reflections
-            self._renderer.update_scene(self.data, camera, self._option)
-            return np.ascontiguousarray(self._renderer.render()[::-1])
+            for part in self._culling.parts(self.data, camera):
+                self.model.geom_group[:] = np.where(part.geoms, groups, _CULLED)
+                self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = part.reflections
+                self._renderer.update_scene(self.data, camera, self._option)
+                frame[part.rows, part.columns] = self._renderer.render()[part.rows, part.columns]
         finally:
             self.model.geom_group[:] = groups
+        return np.ascontiguousarray(frame[::-1])
 
     def geoms(self, camera: str) -> NDArray[np.int32]:
         """(H, W) the geom that each pixel of :meth:`frame` shows, by its number in the model; -1 for none."""
