@@ -15,6 +15,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.settings import Wanted
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.rendering.jpeg import resized
 from pipeline.types import Floats
 
 _VIEWS = {"image": "agentview", "wrist_image": "wrist"}
@@ -166,7 +167,8 @@ class Server:
 class Checkpoint:
     """A policy that lerobot saved, run in this process.
 
-    It is asked for a chunk where it makes chunks, so that it looks once in ``n_action_steps``.
+    It is asked for a chunk where it makes chunks, so that it looks once in ``n_action_steps``. Frames get the size of
+    those that it was trained on.
 
     Args:
         folder: with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
@@ -197,6 +199,7 @@ class Checkpoint:
                 f"the policy wants the images {', '.join(unknown)}", where=folder, expected=", ".join(cameras)
             )
         self._cameras = {key: name for key, name in cameras.items() if key in config.image_features}
+        self._sizes_px = {key: config.image_features[key].shape[1:] for key in self._cameras}
         chunked = getattr(config, "n_obs_steps", 1) == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
         self._chunk = int(getattr(config, "n_action_steps", 1)) if chunked else 1
 
@@ -205,10 +208,10 @@ class Checkpoint:
 
     def act(self, look: Look) -> Floats:
         seen = look(Wanted())
-        batch: dict[str, Any] = {
-            key: self._torch.from_numpy(seen["images"][name]).permute(2, 0, 1)[None].float() / 255
-            for key, name in self._cameras.items()
-        }
+        batch: dict[str, Any] = {}
+        for key, name in self._cameras.items():
+            frame = resized(seen["images"][name], *self._sizes_px[key])
+            batch[key] = self._torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255
         batch["observation.state"] = self._torch.from_numpy(seen["states"])[None]
         batch["task"] = [seen["task_description"]]
         with self._torch.inference_mode():

@@ -24,6 +24,13 @@ def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
     return np.ascontiguousarray(frame[::-1, ::-1])
 
 
+def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
+    """A frame at another size, each pixel the mean of the area that it covers; itself where that is its size."""
+    if frame.shape[:2] == (height_px, width_px):
+        return frame
+    return np.asarray(cv2.resize(frame, (width_px, height_px), interpolation=cv2.INTER_AREA), np.uint8)
+
+
 def encode(frame: Frame, config: RenderConfig) -> bytes:
     """JPEG file of an RGB frame; every dataset carries these bytes or pixels decoded from them."""
     done, packed = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])

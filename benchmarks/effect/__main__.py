@@ -1,0 +1,178 @@
+"""Does a policy that is trained on perturbed episodes hold up better than one that is trained on clean ones?
+
+    nice -n 10 python benchmarks/effect benchmarks/effect/two_cores.yaml
+
+Makes the data, trains a policy of each arm from each seed, evaluates them on the same episodes, and prints the table
+and, last, one line of JSON. Stopped at any time, the same command goes on. docs/effect.md tells what it costs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import shlex
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import report
+from arms import chosen, provenance, write_small
+from experiment import Experiment, read
+from training import train
+
+from pipeline.errors import PipelineError
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+STAGES = ("inputs", "plan", "leakage", "replay", "render", "export_lerobot")
+"""What a LeRobot dataset needs of `dvc repro`."""
+
+
+class Shell:
+    """Runs commands, each as a person would, and adds what they took to ``times.jsonl``."""
+
+    def __init__(self, out: Path):
+        out.mkdir(parents=True, exist_ok=True)
+        self._times = out / "times.jsonl"
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))),
+            # Nothing is fetched from the hub, and the copies that `datasets` makes stay here.
+            "HF_HUB_OFFLINE": "1",
+            "HF_DATASETS_CACHE": str((out / ".cache").resolve()),
+            # Where other work shares the cores, PyTorch's threads would spend them on waiting for each other.
+            "OMP_WAIT_POLICY": "passive",
+        }
+
+    def __call__(self, part: str, command: list[str]) -> None:
+        """Run a command to its end.
+
+        Raises:
+            PipelineError: when it fails.
+        """
+        print(f"$ {shlex.join(command)}", file=sys.stderr, flush=True)
+        start = time.perf_counter()
+        try:
+            done = subprocess.run(command, env=self._environment, stdout=sys.stderr, check=False)
+        finally:
+            with self._times.open("a") as file:
+                file.write(json.dumps({"part": part, "seconds": round(time.perf_counter() - start, 1)}) + "\n")
+        if done.returncode:
+            raise PipelineError(
+                f"ended with {done.returncode}", where=shlex.join(command), remedy="see what it printed, and run again"
+            )
+
+    def hours(self) -> dict[str, float]:
+        """Part to its hours, those of stopped commands too."""
+        seconds: Counter[str] = Counter()
+        for line in self._times.read_text().splitlines():
+            taken = json.loads(line)
+            seconds[taken["part"]] += taken["seconds"]
+        return {part: round(taken / 3600, 2) for part, taken in seconds.items()}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("experiment", type=Path, help="such as benchmarks/effect/two_cores.yaml")
+    parser.add_argument("--out", type=Path, help="folder of all but the run's data (default: data/effect/<experiment>)")
+    arguments = parser.parse_args()
+    try:
+        run(read(arguments.experiment), arguments.out or Path("data/effect") / arguments.experiment.stem)
+    except PipelineError as error:
+        sys.exit(f"error: {error}")
+
+
+def run(experiment: Experiment, out: Path) -> None:
+    """Do what is not done yet, and print the report.
+
+    Raises:
+        PipelineError: when a command fails, or the run has too few episodes.
+    """
+    shell = Shell(out)
+    datasets = {arm: out / "datasets" / experiment.dataset_name(arm) for arm in experiment.arms}
+    make_data(experiment, datasets, shell)
+    policies: dict[str, list[str]] = {arm: [] for arm in experiment.arms}
+    for seed in experiment.seeds:
+        for arm, dataset in datasets.items():
+            name = experiment.policy_name(arm, seed)
+            policies[arm].append(name)
+            policy = out / "policies" / name
+            if not policy.exists():
+                options = experiment.policy, experiment.training, seed
+                train(dataset, policy, *options, lambda command: shell("training", command))
+            evaluate(experiment, policy, out / "evaluations" / name, shell)
+    lines, hours = report.table(report.read(out / "evaluations", policies)), shell.hours()
+    contents = {arm: report.contents(dataset) for arm, dataset in datasets.items()}
+    command = shlex.join(["python", "benchmarks/effect", *sys.argv[1:]])
+    print(report.markdown(lines))
+    print(
+        f"\n{sum(contents[next(iter(contents))].values())} episodes in each arm, {experiment.training.steps} steps of "
+        f"{experiment.training.batch_size} frames, seeds {', '.join(map(str, experiment.seeds))}; hours on "
+        f"{os.cpu_count()} cores: {', '.join(f'{part} {taken}' for part, taken in hours.items())}; `{command}`"
+    )
+    print(
+        json.dumps(
+            {
+                "experiment": experiment.model_dump(mode="json"),
+                "tasks": experiment.tasks,
+                "episodes_by_axis": contents,
+                "table": lines,
+                "hours": hours,
+                "cores": os.cpu_count(),
+                "command": command,
+            }
+        )
+    )
+
+
+def make_data(experiment: Experiment, datasets: dict[str, Path], shell: Shell) -> None:
+    """The dataset of each arm, from one run of the pipeline."""
+    missing = [arm for arm, dataset in datasets.items() if not dataset.exists()]
+    if not missing:
+        return
+    demos = experiment.run.demos
+    if experiment.demonstrations is not None:
+        per_task = str(experiment.demonstrations)
+        words = ["demos", "expand", str(demos.root), "--per-task", per_task, "--tasks", *experiment.tasks]
+        shell("data", [sys.executable, "-m", "pipeline", *words])
+    for stage in STAGES:
+        shell("data", [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(experiment.data)])
+    source = experiment.run.data / "lerobot" / experiment.run.export.lerobot.name
+    rows = provenance(source)
+    for arm in missing:
+        write_small(source, chosen(rows, experiment.arms[arm]), datasets[arm], experiment.frame_px)
+
+
+def evaluate(experiment: Experiment, policy: Path, out: Path, shell: Shell) -> None:
+    """Every episode of a policy; the same for all policies."""
+    wanted, tasks = experiment.evaluation, experiment.tasks
+    suites, names = zip(*(task.split("/") for task in tasks), strict=True)
+    each = math.ceil(wanted.episodes / len(tasks))
+    selections = [["--source", "libero", "--episodes", str(min(each, 50))]]
+    apart = ["--plan", str(experiment.run.data / "plan.parquet")]
+    # A draw is made for each task, axis and one of five levels.
+    draws = ["--episodes", str(math.ceil(each / 5))]
+    for source, axes, options in (
+        ("libero_plus", wanted.libero_plus, []),
+        ("own", wanted.held_out, [*draws, *apart]),
+        ("own", wanted.redrawn, draws),
+    ):
+        if axes:
+            subset = str(wanted.episodes * len(axes))
+            selections.append(["--source", source, *options, "--subset", subset, "--axis", *axes])
+    for selection in selections:
+        shell(
+            "evaluation",
+            [
+                *(sys.executable, "-m", "pipeline", "evaluate", str(out), "--checkpoint", str(policy)),
+                *("--label", policy.name, "--initial-states", wanted.initial_states),
+                *("--suite", *dict.fromkeys(suites), "--task", *names, *selection),
+            ],
+        )
+
+
+if __name__ == "__main__":
+    main()

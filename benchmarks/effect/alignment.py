@@ -1,0 +1,79 @@
+"""Does a policy see in the evaluation what it saw in training, at the step that the action belongs to?
+
+    python benchmarks/effect/alignment.py benchmarks/effect/one_episode_data.yaml
+
+For a finished run of starter demonstrations (`benchmarks/effect benchmarks/effect/one_episode.yaml` makes one): sends
+the actions of each clean episode in the evaluation, and compares frame and state before each action with those of the
+dataset at the same step, one before and one after. Both differences must be smallest at the same step. The last line is
+JSON: median differences of grey levels and of states by shift.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+from arms import provenance
+
+from pipeline.config import load
+from pipeline.episode_schema import SCHEMA
+from pipeline.evaluation.episode import EpisodeEnvironment, Settings, Wanted
+from pipeline.evaluation.tasks import Selection, select
+from pipeline.rendering.jpeg import decode
+from pipeline.types import Floats
+
+VIEWS = {"agentview": SCHEMA.views["image"].lerobot_key, "wrist": SCHEMA.views["wrist_image"].lerobot_key}
+SHIFTS = (-1, 0, 1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("data", type=Path, help="configuration of the run, with frames: images")
+    config = load(parser.parse_args().data)
+    root = config.data / "lerobot" / config.export.lerobot.name
+    columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *VIEWS.values()]
+    table = pq.read_table(root / "data", columns=columns)
+    environment = EpisodeEnvironment(Settings(initial_states="demonstration"))
+    measured = []
+    for row in provenance(root):
+        if row["axis"] == "clean":
+            episode = table.filter(np.array(table["episode_index"]) == row["episode_index"])
+            (task,) = select(Selection(suites=(row["suite"],), tasks=(row["task"],)))
+            environment.reset(task)
+            measured.append(compare(environment, episode.to_pydict()) | {"task": str(task)})
+    environment.close()
+    print(json.dumps(measured))
+
+
+def compare(environment: EpisodeEnvironment, episode: dict[str, list[object]]) -> dict[str, object]:
+    """Send an episode's actions; median difference to the dataset by what is compared and by shift."""
+    frames = {view: [decode(frame["bytes"]) for frame in episode[key]] for view, key in VIEWS.items()}  # type: ignore[index]
+    states: Floats = np.array(episode[SCHEMA.state.lerobot_key])
+    actions: Floats = np.array(episode[SCHEMA.action.lerobot_key])
+    differences: dict[str, dict[int, list[float]]] = {
+        name: {shift: [] for shift in SHIFTS} for name in (*VIEWS, "state")
+    }
+    for step, action in enumerate(actions):
+        seen = environment.observation(Wanted())
+        for shift in SHIFTS:
+            other = min(max(step + shift, 0), len(actions) - 1)
+            for view in VIEWS:
+                apart = np.abs(seen["images"][view].astype(float) - frames[view][other])
+                differences[view][shift].append(float(apart.mean()))
+            differences["state"][shift].append(float(np.abs(seen["states"] - states[other]).max()))
+        if environment.step(action).over:
+            break
+    medians = {
+        name: {str(shift): round(float(np.median(values)), 5) for shift, values in by_shift.items()}
+        for name, by_shift in differences.items()
+    }
+    largest = {name: round(max(by_shift[0]), 5) for name, by_shift in differences.items()}
+    progress = environment.progress
+    return {"median": medians, "largest_at_same_step": largest, "steps": progress.steps, "success": progress.success}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""Which of a run's episodes an arm is trained on, and those as a LeRobot dataset of small frames."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.files import replaced, scratch
+from pipeline.rendering.jpeg import resized
+from pipeline.seeding import digest
+
+EpisodeRow = Mapping[str, Any]
+"""An episode of ``meta/provenance.parquet``."""
+
+
+def provenance(root: Path) -> list[dict[str, Any]]:
+    """The episodes of a LeRobot dataset that a run made."""
+    rows: list[dict[str, Any]] = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
+    return rows
+
+
+def chosen(rows: Iterable[EpisodeRow], perturbed_by: Sequence[str]) -> list[EpisodeRow]:
+    """An arm's episodes: of each task as many as it has clean twins.
+
+    These are the perturbed episodes of the arm, and clean twins in place of those that are missing: first twins of
+    demonstrations that no perturbed episode was made from.
+
+    Args:
+        perturbed_by: axes or combinations, as in ``plan.episodes``.
+
+    Raises:
+        PipelineError: when a task has more perturbed episodes than twins.
+    """
+    by_task: dict[tuple[str, str], list[EpisodeRow]] = defaultdict(list)
+    for row in rows:
+        by_task[row["suite"], row["task"]].append(row)
+    arm: list[EpisodeRow] = []
+    for (suite, task), episodes in sorted(by_task.items()):
+        twins = [row for row in episodes if row["axis"] == "clean"]
+        perturbed = [row for row in episodes if row["axis"] in perturbed_by]
+        if len(perturbed) > len(twins):
+            raise PipelineError(
+                f"{len(perturbed)} perturbed episodes and {len(twins)} clean ones; all arms have as many as there are "
+                "clean ones",
+                where=f"{suite}/{task}",
+                remedy="lower plan.episodes in the run's configuration, or give it more demonstrations",
+            )
+        used = {row["demo_id"] for row in perturbed}
+        twins.sort(key=lambda row: (row["demo_id"] in used, digest("twin", row["episode_id"])))
+        arm += perturbed + twins[: len(twins) - len(perturbed)]
+    return sorted(arm, key=lambda row: int(row["episode_index"]))
+
+
+def write_small(source: Path, rows: Sequence[EpisodeRow], out: Path, frame_px: int) -> None:
+    """Write episodes of a dataset as a LeRobot dataset with square frames of ``frame_px``, stored as images.
+
+    Decoding a small image costs a training step next to nothing; decoding video costs more than the step.
+
+    Args:
+        source: root of the run's LeRobot dataset.
+        rows: the episodes, of ``meta/provenance.parquet``.
+        out: root of the new dataset; complete once it is there. ``meta/provenance.parquet`` has its episodes.
+    """
+    # lerobot takes seconds to import.
+    import pyarrow as pa
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from pipeline.formats.lerobot_write import local_only
+
+    views = [view.lerobot_key for view in SCHEMA.views.values()]
+    vectors = [SCHEMA.state, SCHEMA.action]
+    frame = {"dtype": "image", "shape": (frame_px, frame_px, 3), "names": list(SCHEMA.frame.names)}
+    features = {key: dict(frame) for key in views} | {
+        vector.lerobot_key: {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
+        for vector in vectors
+    }
+    with replaced(out) as unfinished, scratch(out.parent / ".cache") as cache, local_only(cache):
+        run = LeRobotDataset(source.name, root=source, video_backend="pyav")
+        small = LeRobotDataset.create(
+            out.name, SCHEMA.fps_hz, features, root=unfinished, robot_type=SCHEMA.robot_type, use_videos=False
+        )
+        bounds = {name: run.meta.episodes[f"dataset_{name}_index"] for name in ("from", "to")}
+        for row in rows:
+            number = int(row["episode_index"])
+            for index in range(bounds["from"][number], bounds["to"][number]):
+                step = run[index]
+                pixels = {key: np.rint(step[key].numpy().transpose(1, 2, 0) * 255).astype(np.uint8) for key in views}
+                small.add_frame(
+                    {key: resized(pixels[key], frame_px, frame_px) for key in views}
+                    | {vector.lerobot_key: step[vector.lerobot_key].numpy() for vector in vectors}
+                    | {"task": step["task"]}
+                )
+            small.save_episode()
+        small.finalize()
+        renumbered = [{**row, "episode_index": number} for number, row in enumerate(rows)]
+        pq.write_table(pa.Table.from_pylist(renumbered), unfinished / "meta" / "provenance.parquet")
