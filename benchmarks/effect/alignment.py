@@ -20,7 +20,8 @@ from arms import provenance
 
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
-from pipeline.evaluation.episode import EpisodeEnvironment, Settings, Wanted
+from pipeline.evaluation.episode import EpisodeEnvironment
+from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.tasks import Selection, select
 from pipeline.rendering.jpeg import decode
 from pipeline.types import Floats
