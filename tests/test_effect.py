@@ -19,8 +19,8 @@ EFFECT = REPOSITORY / "benchmarks" / "effect"
 sys.path.append(str(EFFECT))
 
 from arms import chosen, provenance  # noqa: E402
+from comparison_table import markdown, table  # noqa: E402
 from experiment import TrainingConfig, read  # noqa: E402
-from report import markdown, table  # noqa: E402
 from training import train  # noqa: E402
 
 
