@@ -19,7 +19,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-import report
+import comparison_table
 from arms import chosen, provenance, write_small
 from experiment import Experiment, read
 from training import train
@@ -104,10 +104,10 @@ def run(experiment: Experiment, out: Path) -> None:
                 options = experiment.policy, experiment.training, seed
                 train(dataset, policy, *options, lambda command: shell("training", command))
             evaluate(experiment, policy, out / "evaluations" / name, shell)
-    lines, hours = report.table(report.read(out / "evaluations", policies)), shell.hours()
-    contents = {arm: report.contents(dataset) for arm, dataset in datasets.items()}
+    lines, hours = comparison_table.table(comparison_table.read(out / "evaluations", policies)), shell.hours()
+    contents = {arm: comparison_table.contents(dataset) for arm, dataset in datasets.items()}
     command = shlex.join(["python", "benchmarks/effect", *sys.argv[1:]])
-    print(report.markdown(lines))
+    print(comparison_table.markdown(lines))
     print(
         f"\n{sum(contents[next(iter(contents))].values())} episodes in each arm, {experiment.training.steps} steps of "
         f"{experiment.training.batch_size} frames, seeds {', '.join(map(str, experiment.seeds))}; hours on "
