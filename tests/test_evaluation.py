@@ -246,9 +246,8 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_a_path_is_followed_by_what_an_observation_has(tmp_path: Path) -> None:
-    with model_server("pipeline.evaluation.replay_server", "--args.tracked", "true") as address:
-        arguments = ["--suite", "libero_goal", "--server", address, "--workers", "1"]
-        subprocess.run(command(tmp_path, *arguments), cwd=REPOSITORY, check=True)
+    arguments = ["--suite", "libero_goal", "--replay", "tracked", "--workers", "1"]
+    subprocess.run(command(tmp_path, *arguments), cwd=REPOSITORY, check=True)
     (row,) = rows(tmp_path).values()
     assert row["success"]
     assert row["looks"] == row["steps"], "feedback at every step"

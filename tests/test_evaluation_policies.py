@@ -55,20 +55,30 @@ def test_other_episodes_are_run_when_one_gets_no_action(tmp_path: Path, fault: s
 
 @pytest.mark.slow
 def test_a_server_that_dies_ends_the_run_and_the_same_command_goes_on(tmp_path: Path) -> None:
-    def run(address: str) -> subprocess.CompletedProcess[str]:
+    def run(address: str, workers: int) -> subprocess.CompletedProcess[str]:
         suites = ["--suite", *MILK_THEN_STOVE.suites, "--task", *MILK_THEN_STOVE.tasks]
-        options = ["--initial-states", "demonstration", "--server", address, "--label", "policy", "--workers", "2"]
+        options = [
+            "--initial-states",
+            "demonstration",
+            "--server",
+            address,
+            "--label",
+            "policy",
+            "--workers",
+            str(workers),
+        ]
         command = [sys.executable, "-m", "pipeline", "evaluate", str(tmp_path), *suites, *options]
+        command += ["--workers", str(workers)]
         return subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
 
     with model_server("faulty_server", "--args.fault", "die") as address:
-        stopped = run(address)
+        stopped = run(address, 2)
     assert stopped.returncode == 1
     assert "Traceback" not in stopped.stderr
     assert "run the same command again" in stopped.stderr
     assert not any(row["base"].startswith("pick_up_the_milk") for row in rows(tmp_path).values())
     with model_server("pipeline.evaluation.replay_server", "--args.chunk", "8") as address:
-        assert run(address).returncode == 0
+        assert run(address, 1).returncode == 0
     assert [row["success"] for row in rows(tmp_path).values()] == [True, True]
 
 
