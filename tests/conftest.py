@@ -51,8 +51,8 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 
 LONG = (
-    *("test_dependencies", "test_evaluation", "test_run", "test_exports", "test_cluster", "test_writers"),
-    *("test_validate", "test_render", "test_pose", "test_tracking"),
+    *("test_dependencies", "test_evaluation", "test_run", "test_evaluation_policies", "test_preview", "test_effect"),
+    *("test_exports", "test_cluster", "test_writers", "test_validate", "test_render", "test_pose", "test_tracking"),
 )
 """Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
 

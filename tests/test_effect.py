@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -123,7 +124,7 @@ def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path) -> 
     assert {*found["hours"]} == {"data", "training", "evaluation"}
 
 
-class Stopped(Exception):
+class StoppedError(Exception):
     """The training's process was killed."""
 
 
@@ -143,13 +144,17 @@ def test_a_training_that_was_stopped_goes_on_from_its_last_checkpoint(tmp_path: 
         (outputs / "checkpoints" / "last").unlink(missing_ok=True)
         (outputs / "checkpoints" / "last").symlink_to(checkpoint)
         if step < 2:
-            raise Stopped
+            raise StoppedError
 
-    options = tmp_path / "dataset", tmp_path / "policy", {}, TrainingConfig(steps=2, batch_size=2, save_every=1), 0
-    with pytest.raises(Stopped):
-        train(*options, partial(stopped_after, 1))
+    training = TrainingConfig(steps=2, batch_size=2, save_every=1)
+
+    def run(command: Callable[[list[str]], None]) -> None:
+        train(tmp_path / "dataset", tmp_path / "policy", {}, training, 0, command)
+
+    with pytest.raises(StoppedError):
+        run(partial(stopped_after, 1))
     assert not (tmp_path / "policy").exists()
-    train(*options, partial(stopped_after, 2))
+    run(partial(stopped_after, 2))
     assert (tmp_path / "policy").is_dir()
     assert not started.parent.exists()
     assert "--resume=true" not in commands[0]
