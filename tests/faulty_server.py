@@ -6,7 +6,6 @@ import os
 from typing import Any
 
 import anyio
-import numpy as np
 from vla_eval.model_servers.base import SessionContext
 from vla_eval.model_servers.serve import run_server
 
@@ -14,7 +13,7 @@ from pipeline.evaluation.replay_server import ReplayServer
 
 
 class FaultyServer(ReplayServer):
-    """Args: fault: ``shape``, ``nan``, ``text``, ``hang``, ``raise`` or ``die``."""
+    """Args: fault: ``hang``, ``raise`` or ``die``."""
 
     def __init__(self, *, fault: str):
         super().__init__(chunk=8)
@@ -25,11 +24,8 @@ class FaultyServer(ReplayServer):
         (self._faulty.add if "milk" in config["task"]["name"] else self._faulty.discard)(ctx.session_id)
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
-        answers = {"shape": np.zeros((2, 6)), "nan": np.full(7, np.nan), "text": "left"}
         if ctx.session_id not in self._faulty:
             await super().on_observation(obs, ctx)
-        elif self._fault in answers:
-            await ctx.send_action({"actions": answers[self._fault]})
         elif self._fault == "hang":
             await anyio.sleep_forever()
         elif self._fault == "raise":
