@@ -105,6 +105,7 @@ def nothing_left(fn: Callable[..., Any], items: Sequence[Any], description: str)
     raise AssertionError(f"{len(items)} jobs are run again")
 
 
+@pytest.mark.slow
 def test_each_bad_demonstration_is_a_verdict(
     root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,6 +138,7 @@ def test_each_bad_demonstration_is_a_verdict(
     assert all(not verdict.kept for verdict in plan.select(rows, verdicts).values())
 
 
+@pytest.mark.slow
 def test_a_bad_scene_leaves_no_trace_in_its_worker() -> None:
     good = good_recording()
     environment = Environment(STOVE)

@@ -148,6 +148,7 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
         client.submit(Workplace(Path.cwd(), folder / "token", "another setup").enter).result()
 
 
+@pytest.mark.slow
 def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path) -> None:
     # The device's name tells the width of its vectors.
     address = cluster((1, {"MUJOCO_GL": "osmesa", "LP_NATIVE_VECTOR_WIDTH": "128"}))

@@ -83,6 +83,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "where"), KILLED)
 def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: Path) -> None:
     made, source = target(name, tmp_path), episodes()

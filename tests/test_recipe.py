@@ -222,6 +222,7 @@ def trained(data: Path, tmp_path: Path) -> Path:
     return folder.parent
 
 
+@pytest.mark.slow
 def test_openvla_oft_is_given_datasets_recipe_and_schedule(trained: Path, tmp_path: Path) -> None:
     checkout = stand_in(tmp_path / "oft", OFT)
     seen = run(checkout, trained / "finetune" / "run_openvla_oft.py", "--dataset_name", f"{NAME}_spatial")
@@ -252,6 +253,7 @@ def test_openvla_oft_is_given_datasets_recipe_and_schedule(trained: Path, tmp_pa
     assert (statistics["libero_spatial"], statistics["libero_10"]) == (1, 2)
 
 
+@pytest.mark.slow
 def test_openvla_oft_resumes_by_its_arguments_and_changes_no_file_of_the_run(trained: Path, tmp_path: Path) -> None:
     checkout, script = stand_in(tmp_path / "oft", OFT), trained / "finetune" / "run_openvla_oft.py"
     files = sorted(trained.rglob("*"))

@@ -67,6 +67,7 @@ def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, tmp_path: Path) ->
     assert episode_ids(LeRobotDataset(NAME, root=target.root)) == splits["train"] + splits["val"]
 
 
+@pytest.mark.slow
 def test_lerobots_tools_keep_the_episodes_ids(tmp_path: Path) -> None:
     root = write_lerobot(tmp_path, with_extras, extras=EXTRAS).root
     dataset = LeRobotDataset(NAME, root=root)

@@ -64,6 +64,7 @@ def stage(name: str, folder: Path, environment: dict[str, str]) -> subprocess.Co
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_physics_runs_and_rendering_says_what_to_install(tmp_path: Path, machine: dict[str, str]) -> None:
     config = tiny_config(tmp_path) | {
         "demos": {"source": "starter", "tasks": [f"{STOVE.suite}/{STOVE.name}"]},
@@ -88,6 +89,7 @@ def test_physics_runs_and_rendering_says_what_to_install(tmp_path: Path, machine
         assert gl.REMEDY in done.stderr
 
 
+@pytest.mark.slow
 def test_preview_says_what_to_install(tmp_path: Path, machine: dict[str, str]) -> None:
     command = [sys.executable, "-m", "pipeline", "preview", f"{STOVE.suite}/{STOVE.name}", "camera"]
     done = subprocess.run(
