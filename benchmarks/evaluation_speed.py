@@ -14,14 +14,10 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import socket
-import subprocess
-import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import Any
 
 from pipeline import gl
@@ -35,6 +31,7 @@ from vla_eval.benchmarks.libero.benchmark import LIBEROBenchmark  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
+from pipeline.evaluation import replay_server  # noqa: E402
 from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.policies import Server, checked_actions  # noqa: E402
 from pipeline.evaluation.settings import Wanted  # noqa: E402
@@ -87,8 +84,7 @@ class Harness:
         self._loop.run_until_complete(self._connection.connect(benchmark="LIBEROBenchmark"))
 
     def run(self, task: EvaluationTask, steps: int) -> int:
-        named = {**self._tasks[task.base], **asdict(task), "name": str(task), "task_name": task.name}
-        named["episode_idx"] = task.number
+        named = {**self._tasks[task.base], **task.for_harness(), "episode_idx": task.number}
         episode = SyncEpisodeRunner().run_episode(self._benchmark, named, self._connection, max_steps=steps)
         return int(self._loop.run_until_complete(episode)["steps"])
 
@@ -130,7 +126,7 @@ def main() -> None:
     arguments = parser.parse_args()
     episodes = select(Selection(tasks=tuple(arguments.tasks), episodes=arguments.states))
     results: dict[str, Any] = {"device": CHOICE.device, "episodes": len(episodes)}
-    with replay_server() as address:
+    with replay_server.running("-m", replay_server.__name__) as address:
         for views, both_views in (("agent_view", False), ("both_views", True)):
             results[views] = compared(episodes, arguments.steps, address, both_views)
             print(f"{views}: {json.dumps(results[views])}")
@@ -177,27 +173,6 @@ def figures_of(times: Times, steps: int, episodes: int) -> dict[str, Any]:
         "episodes_an_hour": round(3600 * episodes / wall_s, 1),
         "wall_s_by_part": {part: round(seconds, 2) for part, seconds in times.wall_s.items()},
     }
-
-
-@contextmanager
-def replay_server() -> Iterator[str]:
-    """A model server in a process of its own; yields its address."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    module = ["-m", "pipeline.evaluation.replay_server"]
-    server = subprocess.Popen([sys.executable, *module, "--address", f"127.0.0.1:{port}"])
-    try:
-        while server.poll() is None:
-            try:
-                socket.create_connection(("127.0.0.1", port)).close()
-                break
-            except OSError:
-                time.sleep(0.1)
-        yield f"ws://127.0.0.1:{port}"
-    finally:
-        server.terminate()
-        server.wait()
 
 
 if __name__ == "__main__":

@@ -38,9 +38,9 @@ def main() -> None:
     parser.add_argument("--task", default="libero_goal/put_the_bowl_on_the_plate")
     parser.add_argument("--steps", type=int, help="only so many of the episode's steps")
     arguments = parser.parse_args()
-    task, source = find_task(*arguments.task.split("/")), StarterSource()
+    task = find_task(*arguments.task.split("/"))
     environment = Environment(task)
-    trajectory = replay(environment, source.load(source.index([task]).entries[0].demo_id), "clean", ReplayConfig())
+    trajectory = replay(environment, StarterSource().of(task), "clean", ReplayConfig())
     environment.close()
     trajectory = replace(trajectory, actions=trajectory.actions[: arguments.steps])
     measure(trajectory, task, ())  # the first time, OpenGL compiles its programs

@@ -24,6 +24,7 @@ from rich.table import Table
 
 from pipeline.axes import from_json
 from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
+from pipeline.evaluation.results import wilson
 from pipeline.libero.tasks import SUITES
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay_plan
@@ -137,12 +138,8 @@ def _medians(shapes: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def _interval(kept: int, tried: int) -> tuple[float, float]:
-    """Wilson's 95 % interval of a share."""
-    if not tried:
-        return 0.0, 1.0
-    z = 1.96
-    centre, spread = (kept + z * z / 2) / (tried + z * z), z * np.sqrt(kept * (tried - kept) / tried + z * z / 4)
-    return round(float(centre - spread / (tried + z * z)), 3), round(float(centre + spread / (tried + z * z)), 3)
+    low, high = wilson(kept, tried)
+    return round(low, 3), round(high, 3)
 
 
 def _print(lines: Sequence[Mapping[str, Any]]) -> None:

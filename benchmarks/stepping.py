@@ -36,10 +36,9 @@ TURN = 10
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS))
-    source = StarterSource()
     measured = []
     for task in select_tasks(parser.parse_args().tasks):
-        measured.append(compare(source.load(source.index([task]).entries[0].demo_id)))
+        measured.append(compare(StarterSource().of(task)))
         print(f"{task.suite}/{task.name}: {json.dumps(measured[-1])}")
     steps = sum(one["control_steps"] for one in measured)
     ours, liberos = (

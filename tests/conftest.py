@@ -77,8 +77,7 @@ def memory() -> Iterator[None]:
 
 
 def starter_demo(task: Task) -> Demo:
-    source = StarterSource()
-    return source.load(source.index([task]).entries[0].demo_id)
+    return StarterSource().of(task)
 
 
 Once = Callable[[str, Callable[[Path], None]], Path]

@@ -49,8 +49,8 @@ class Golden:
     @cached_property
     def trajectories(self) -> dict[str, Trajectory]:
         """Case to replay, for the clean one and those that change physics."""
-        source, task = StarterSource(), find_task("libero_goal", "put_the_bowl_on_the_plate")
-        demo = source.load(source.index([task]).entries[0].demo_id)
+        task = find_task("libero_goal", "put_the_bowl_on_the_plate")
+        demo = StarterSource().of(task)
         environment = Environment(task)
         clean = replay(environment, demo, "clean", ReplayConfig())
         reference = Reference.of(clean.model_xml, clean.states, clean.actions)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
-import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +26,7 @@ from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 
 from pipeline.axes.camera import CameraPerturbation  # noqa: E402
 from pipeline.errors import PipelineError  # noqa: E402
-from pipeline.evaluation import libero_plus  # noqa: E402
+from pipeline.evaluation import libero_plus, replay_server  # noqa: E402
 from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.initial_states import libero_states  # noqa: E402
 from pipeline.evaluation.settings import Wanted  # noqa: E402
@@ -191,33 +188,9 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -
     assert found["all"]["successes"] == found["all"]["episodes"] == 2
 
 
-@contextmanager
-def model_server(module: str, *arguments: str) -> Iterator[str]:
-    """A model server of vla-eval in a process of its own."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    server = subprocess.Popen(
-        [sys.executable, "-m", module, "--address", f"127.0.0.1:{port}", *arguments],
-        cwd=REPOSITORY,
-        env={**os.environ, "PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"},
-    )
-    try:
-        while server.poll() is None:
-            try:
-                socket.create_connection(("127.0.0.1", port)).close()
-                break
-            except OSError:
-                time.sleep(0.1)
-        yield f"ws://127.0.0.1:{port}"
-    finally:
-        server.terminate()
-        server.wait()
-
-
 @pytest.mark.slow
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
-    with model_server("pipeline.evaluation.replay_server", "--args.chunk", "8") as address:
+    with replay_server.running("-m", replay_server.__name__, "--args.chunk", "8") as address:
         ours = tmp_path / "ours"
         arguments = ["--server", address, "--workers", "1", "--videos", "all"]
         subprocess.run(command(ours, *arguments), cwd=REPOSITORY, check=True)

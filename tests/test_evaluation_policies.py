@@ -12,16 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-from test_evaluation import model_server, rows
+from test_evaluation import rows
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.evaluate import PolicyConfig, _environment, evaluate
 from pipeline.evaluation.policies import PolicyError, checked_actions
+from pipeline.evaluation.replay_server import running
 from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import Selection
 from pipeline.run.compute import loop
 
 MILK_THEN_STOVE = Selection(suites=("libero_object", "libero_goal"), tasks=("pick_up_the_milk*", "turn_on*"))
+FAULTY_SERVER = str(REPOSITORY / "tests" / "faulty_server.py")
 RECORDED = Settings(initial_states="demonstration")
 
 
@@ -43,7 +45,7 @@ def memory_given_back() -> Iterator[None]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("fault", "message"), [("hang", "within 10 s"), ("raise", "no such camera")])
 def test_other_episodes_are_run_when_one_gets_no_action(tmp_path: Path, fault: str, message: str) -> None:
-    with model_server("faulty_server", "--args.fault", fault) as address:
+    with running(FAULTY_SERVER, "--args.fault", fault) as address:
         policy = PolicyConfig(kind="server", address=address, label="faulty", timeout_s=10)
         with pytest.raises(PipelineError, match=f"(?s)1 episodes have no result.*{message}.*milk"):
             evaluate(MILK_THEN_STOVE, RECORDED, policy, tmp_path, loop)
@@ -57,7 +59,7 @@ def test_other_episodes_are_run_when_one_gets_no_action(tmp_path: Path, fault: s
 def test_a_server_that_dies_ends_the_run(tmp_path: Path) -> None:
     suites = ["--suite", *MILK_THEN_STOVE.suites, "--task", *MILK_THEN_STOVE.tasks]
     options = ["--initial-states", "demonstration", "--workers", "1"]
-    with model_server("faulty_server", "--args.fault", "die") as address:
+    with running(FAULTY_SERVER, "--args.fault", "die") as address:
         command = [sys.executable, "-m", "pipeline", "evaluate", str(tmp_path), *suites, *options, "--server", address]
         stopped = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert stopped.returncode == 1

@@ -21,12 +21,12 @@ from arms import provenance
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.episode import EpisodeEnvironment
-from pipeline.evaluation.settings import Settings, Wanted
+from pipeline.evaluation.settings import VIEWS, Settings, Wanted
 from pipeline.evaluation.tasks import Selection, select
 from pipeline.rendering.jpeg import decode
 from pipeline.types import Floats
 
-VIEWS = {"agentview": SCHEMA.views["image"].lerobot_key, "wrist": SCHEMA.views["wrist_image"].lerobot_key}
+KEYS = {name: SCHEMA.views[view].lerobot_key for name, view in VIEWS.items()}
 SHIFTS = (-1, 0, 1)
 
 
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="configuration of the run, with frames: images")
     config = load(parser.parse_args().data)
     root = config.data / "lerobot" / config.export.lerobot.name
-    columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *VIEWS.values()]
+    columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *KEYS.values()]
     table = pq.read_table(root / "data", columns=columns)
     environment = EpisodeEnvironment(Settings(initial_states="demonstration"))
     measured = []
@@ -51,7 +51,7 @@ def main() -> None:
 
 def compare(environment: EpisodeEnvironment, episode: dict[str, list[object]]) -> dict[str, object]:
     """Send an episode's actions; median difference to the dataset by what is compared and by shift."""
-    frames = {view: [decode(frame["bytes"]) for frame in episode[key]] for view, key in VIEWS.items()}  # type: ignore[index]
+    frames = {view: [decode(frame["bytes"]) for frame in episode[key]] for view, key in KEYS.items()}  # type: ignore[index]
     states: Floats = np.array(episode[SCHEMA.state.lerobot_key])
     actions: Floats = np.array(episode[SCHEMA.action.lerobot_key])
     differences: dict[str, dict[int, list[float]]] = {

@@ -11,7 +11,7 @@ from arms import provenance
 
 from pipeline.evaluation import merging
 from pipeline.evaluation.comparison import compare, paired
-from pipeline.evaluation.results import Row, wilson
+from pipeline.evaluation.results import Row, success_rate
 
 SOURCES = {"libero": "LIBERO's own tasks", "libero_plus": "LIBERO-Plus test tasks", "own": "own draws"}
 
@@ -45,7 +45,7 @@ def table(results: Results) -> list[dict[str, Any]]:
             {
                 "source": source,
                 "axis": axis,
-                "arms": {arm: _rate(_all(policies)) for arm, policies in of.items()},
+                "arms": {arm: success_rate(_all(policies)) for arm, policies in of.items()},
                 "p_values": {arm: found["all"]["p_value"] for arm, found in p_values.items()},
             }
         )
@@ -88,10 +88,3 @@ def contents(dataset: Path) -> dict[str, int]:
 
 def _all(policies: Sequence[Sequence[Row]]) -> list[Row]:
     return [row for rows in policies for row in rows]
-
-
-def _rate(rows: Sequence[Row]) -> dict[str, Any]:
-    successes = sum(row["success"] for row in rows)
-    low, high = wilson(successes, len(rows))
-    rate = successes / len(rows) if rows else 0.0
-    return {"episodes": len(rows), "successes": successes, "rate": rate, "low": low, "high": high}

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import EpisodeFiles, Row
+from pipeline.evaluation.results import EpisodeFiles
 from pipeline.files import replaced
 
 
@@ -56,7 +55,7 @@ def add_commands(commands: Any) -> None:
 def _gap(arguments: argparse.Namespace) -> int:
     from pipeline.evaluation import composition
 
-    measured = composition.pairs(_rows(arguments.results))
+    measured = composition.pairs(EpisodeFiles(arguments.results).some_rows())
     composition.heatmap(measured, arguments.results / "gap.png")
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
     with replaced(arguments.results / "gap.json") as temporary:
@@ -73,7 +72,7 @@ def _construct(arguments: argparse.Namespace) -> int:
         construction.candidates(arguments.seed),
         arguments.seed,
         arguments.size or construction.SIZE,
-        [row for folder in arguments.results for row in _rows(folder)],
+        [row for folder in arguments.results for row in EpisodeFiles(folder).some_rows()],
         disjoint.planned(arguments.plan) if arguments.plan else None,
     )
     construction.write(constructed.tasks, arguments.seed, arguments.out)
@@ -84,7 +83,7 @@ def _construct(arguments: argparse.Namespace) -> int:
 def _grade(arguments: argparse.Namespace) -> int:
     from pipeline.evaluation import construction
 
-    results = [list(_rows(folder)) for folder in arguments.results]
+    results = [list(EpisodeFiles(folder).some_rows()) for folder in arguments.results]
     seed, *others = sorted({row["seed"] for rows in results for row in rows})
     if others:
         raise PipelineError(f"results of seeds {[seed, *others]}", expected="one seed, and so the same draws")
@@ -102,7 +101,7 @@ def _leakage(arguments: argparse.Namespace) -> int:
 
     drawn = [
         (row["name"], one, find_task(row["suite"], row["base"]))
-        for row in _rows(arguments.results)
+        for row in EpisodeFiles(arguments.results).some_rows()
         if row["source"] == "own"
         for one in from_json(json.dumps(row["perturbations"]))
     ]
@@ -111,17 +110,3 @@ def _leakage(arguments: argparse.Namespace) -> int:
     findings = disjoint.compare(drawn, disjoint.planned(arguments.plan))
     print(json.dumps({axis: asdict(finding) for axis, finding in findings.items()}))
     return int(any(finding.overlaps for finding in findings.values()))
-
-
-def _rows(folder: Path) -> Iterator[Row]:
-    """All episodes of a folder.
-
-    Raises:
-        PipelineError: when it has none.
-    """
-    rows = EpisodeFiles(folder).rows()
-    first = next(rows, None)
-    if first is None:
-        raise PipelineError("no results", where=folder, expected="a folder that `evaluate` wrote")
-    yield first
-    yield from rows

@@ -26,7 +26,7 @@ from scipy.stats import chi2_contingency
 
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import Row
+from pipeline.evaluation.results import REFUSED, Row
 from pipeline.files import replaced
 from pipeline.types import Floats
 
@@ -97,7 +97,7 @@ def pairs(rows: Iterable[Row]) -> list[Pair]:
     Raises:
         PipelineError: when they are of several policies or settings, or have no complete trial.
     """
-    listed = [row for row in rows if row["source"] in ("libero", "own") and row["reason"] != "refused"]
+    listed = [row for row in rows if row["source"] in ("libero", "own") and row["reason"] != REFUSED]
     if len({json.dumps([row["policy"], row["settings"]], sort_keys=True) for row in listed}) > 1:
         raise PipelineError(
             "these are results of several policies or settings",
@@ -106,9 +106,7 @@ def pairs(rows: Iterable[Row]) -> list[Pair]:
         )
     clean = {_start(row): bool(row["success"]) for row in listed if row["axis"] == "clean"}
     drawn = {(row["axis"], row["level"], _start(row)): bool(row["success"]) for row in listed if row["axis"] != "clean"}
-    axes = (
-        axes_of("+".join(dict.fromkeys(axis for joined, _, _ in drawn for axis in joined.split("+")))) if drawn else ()
-    )
+    axes = _in_order(axis for joined, _, _ in drawn for axis in joined.split("+"))
     counted = []
     for one, other in combinations(axes, 2):
         both = f"{one}+{other}"

@@ -17,7 +17,7 @@ from typing import Any
 from pipeline.errors import PipelineError
 from pipeline.evaluation.disjoint import PlannedDraws
 from pipeline.evaluation.held_out import LEVELS, OWN_AXES
-from pipeline.evaluation.results import Row
+from pipeline.evaluation.results import REFUSED, Row
 from pipeline.evaluation.tasks import EvaluationTask, balanced, draw, drawn_task
 from pipeline.files import replaced
 from pipeline.libero.tasks import find_task, tasks
@@ -91,7 +91,7 @@ def construct(
         results: episodes of candidates that were run; those whose scene was refused are left out.
         plan: a training plan; candidates that overlap with it are left out.
     """
-    refused = {_identity(row) for row in results if row["reason"] == "refused"}
+    refused = {_identity(row) for row in results if row["reason"] == REFUSED}
     there = [task for task in drawn if (task.source, task.suite, task.name) not in refused]
     apart = [task for task in there if plan is None or not _overlaps(task, seed, plan)]
     return Construction(balanced(apart, size, seed), len(drawn), len(drawn) - len(there), len(there) - len(apart))
@@ -137,7 +137,7 @@ def grade(results: Sequence[Iterable[Row]]) -> list[dict[str, Any]]:
 def _outcomes(rows: Iterable[Row]) -> dict[Identity, Row]:
     outcomes: dict[Identity, Row] = {}
     for row in rows:
-        if row["reason"] == "refused":
+        if row["reason"] == REFUSED:
             continue
         if outcomes.setdefault(_identity(row), row) is not row:
             raise PipelineError(

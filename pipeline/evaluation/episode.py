@@ -19,8 +19,9 @@ from pipeline.evaluation import disjoint, goals, libero_plus
 from pipeline.evaluation.asset_archive import Assets, having
 from pipeline.evaluation.drawn_scene import drawn_scene
 from pipeline.evaluation.initial_states import libero_states, moved_state
-from pipeline.evaluation.picture import VIEWS, Picture
-from pipeline.evaluation.settings import Settings, Wanted
+from pipeline.evaluation.picture import Picture
+from pipeline.evaluation.results import REFUSED
+from pipeline.evaluation.settings import VIEWS, Settings, Wanted
 from pipeline.evaluation.simulator import Observed, Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
@@ -90,7 +91,7 @@ class EpisodeEnvironment:
             else:
                 self._start_libero()
         except RefusedError:
-            self._progress = Progress(0, False, True, "refused")
+            self._progress = Progress(0, False, True, REFUSED)
         self._running = True
         return self._progress
 
@@ -148,9 +149,11 @@ class EpisodeEnvironment:
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
         if view not in self._seen:
-            black = self.settings.black in (view, "all")
-            looked = partial(self._picture.frame, view, self.observed, self._perturbations, self._progress.steps)
-            self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8) if black else looked()
+            if self.settings.black in (view, "all"):
+                self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8)
+            else:
+                steps = self._progress.steps
+                self._seen[view] = self._picture.frame(view, self.observed, self._perturbations, steps)
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
@@ -222,8 +225,7 @@ class EpisodeEnvironment:
             RefusedError: see ``drawn_scene``.
         """
         self._build(self._base)
-        source = StarterSource()
-        demo = source.load(source.index([self._base]).entries[0].demo_id)
+        demo = StarterSource().of(self._base)
         seed = self.settings.fixture_seed
         if self.settings.initial_states == "libero":
             states = libero_states(self._base)

@@ -9,14 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import EpisodeFiles, Row
+from pipeline.evaluation.results import REFUSED, EpisodeFiles, Row
 from pipeline.seeding import digest
 
 OUTCOME = ("success", "reason", "steps")
 """What two results of one episode must have in common."""
-
-REFUSED = "refused"
-"""Why an episode ended that could not begin."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +48,7 @@ def read(folders: Sequence[Path]) -> list[Evaluated]:
     results: dict[str, tuple[Row, EpisodeFiles]] = {}
     for folder in folders:
         files = EpisodeFiles(folder)
-        empty = True
-        for row in files.rows():
-            empty = False
+        for row in files.some_rows():
             earlier, where = results.setdefault(row["episode"], (row, files))
             if any(row[name] != earlier[name] for name in OUTCOME):
                 raise PipelineError(
@@ -63,10 +58,6 @@ def read(folders: Sequence[Path]) -> list[Evaluated]:
                     expected="one result of each episode, the same wherever it was run",
                     remedy="leave one of the folders out, or run them again with another --label for each policy",
                 )
-        if empty:
-            raise PipelineError(
-                "no results", where=folder, expected="a folder that `python -m pipeline evaluate` wrote results into"
-            )
     return _by_policy(list(results.values()))
 
 

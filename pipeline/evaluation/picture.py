@@ -9,14 +9,13 @@ import mujoco
 import numpy as np
 
 from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.evaluation.settings import VIEWS
 from pipeline.evaluation.simulator import Observed
 from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame
-
-VIEWS = {"agentview": "agentview", "wrist": "robot0_eye_in_hand"}
-"""What policies call the two views, and their cameras in the scene."""
 
 
 class Picture:
@@ -45,7 +44,7 @@ class Picture:
         renderer = self._with_looks(perturbations)
         state = np.concatenate([[0.0], observed.qpos, np.zeros(renderer.model.nv)])
         renderer.restore(state, observed.site_alpha)
-        frame = renderer.frame(VIEWS[view])
+        frame = renderer.frame(SCHEMA.views[VIEWS[view]].camera)
         for noise in of_layer(perturbations, PixelPerturbation):
             if view == "agentview":
                 frame = noise.apply(frame, step)

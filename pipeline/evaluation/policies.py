@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,13 +12,10 @@ import numpy as np
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.evaluation.settings import Wanted
+from pipeline.evaluation.settings import VIEWS, Wanted
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.rendering.jpeg import resized
 from pipeline.types import Floats
-
-_VIEWS = {"image": "agentview", "wrist_image": "wrist"}
-"""View of ``schemas/episode.json`` to the name that policies see it by."""
 
 Look = Callable[[Wanted], dict[str, Any]]
 """Gives the observation; frames are rendered when it is called."""
@@ -111,8 +107,7 @@ class Server:
         self._asked = 0
         if not self._connection.is_connected:
             self._connect()
-        named = {**asdict(task), "name": str(task), "task_name": task.name}
-        self._run(self._connection.start_episode({"task": named}), self._connection.timeout)
+        self._run(self._connection.start_episode({"task": task.for_harness()}), self._connection.timeout)
 
     def act(self, look: Look) -> Any:
         if self._asked % self._look_every == 0:
@@ -192,7 +187,7 @@ class Checkpoint:
         self._before, self._after = make_pre_post_processors(
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
         )
-        cameras = {SCHEMA.views[view].lerobot_key: name for view, name in _VIEWS.items()}
+        cameras = {SCHEMA.views[view].lerobot_key: name for name, view in VIEWS.items()}
         unknown = [key for key in config.image_features if key not in cameras]
         if unknown:
             raise PipelineError(

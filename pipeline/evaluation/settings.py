@@ -11,6 +11,9 @@ from pipeline.axes.base import Frozen
 from pipeline.evaluation import disjoint
 from pipeline.evaluation.libero_plus import Prompt
 
+VIEWS = {"agentview": "image", "wrist": "wrist_image"}
+"""What policies call the views, to their names in ``schemas/episode.json``."""
+
 
 class Settings(Frozen):
     """What holds for all episodes of an evaluation.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import fnmatch
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
 from itertools import combinations, product, zip_longest
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -55,6 +55,15 @@ class EvaluationTask:
 
     def __str__(self) -> str:
         return f"{self.source}/{self.suite}/{self.name}"
+
+    def for_harness(self) -> dict[str, Any]:
+        """As vla-eval takes a task, by a ``name`` that no other has; the task's own is ``task_name``."""
+        return {**asdict(self), "name": str(self), "task_name": self.name}
+
+    @classmethod
+    def of_harness(cls, task: Mapping[str, Any]) -> EvaluationTask:
+        """The task that ``for_harness`` gave."""
+        return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
 
 
 class Selection(Frozen):

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -77,14 +76,10 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
-        return [
-            {**asdict(task), "name": str(task), "task_name": task.name}
-            for task in select(self._selection, self._archive)
-        ]
+        return [task.for_harness() for task in select(self._selection, self._archive)]
 
     def reset(self, task: dict[str, Any]) -> Any:
-        fields = {name: task[name] for name in EvaluationTask.__dataclass_fields__}
-        progress = self._environment.reset(EvaluationTask(**{**fields, "name": task["task_name"]}))
+        progress = self._environment.reset(EvaluationTask.of_harness(task))
         if progress.over:
             raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
         return self._look()

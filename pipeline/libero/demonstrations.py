@@ -104,6 +104,10 @@ class StarterSource:
             raise PipelineError(f"the starter set has no {demo_id}", expected=demo.demo_id)
         return demo
 
+    def of(self, task: Task) -> Demo:
+        """The task's one demonstration."""
+        return self._read(task)
+
     def _read(self, task: Task) -> Demo:
         group = "libero-90" if task.suite == "libero_90" else "libero"
         name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
