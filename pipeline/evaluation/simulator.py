@@ -148,7 +148,7 @@ class Simulator(Environment):
         env.robot_configs[0]["initial_qpos"] = None if posture_rad is None else np.array(posture_rad)
         try:
             with seeded(seed):
-                self._env.reset()
+                self._reset_until_placed()
         finally:
             env.robot_configs[0]["initial_qpos"] = None
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
-from functools import lru_cache
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import lru_cache, partial
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import fixed_pose
 from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Task
+
+PLACEMENT_TRIES = 50
+"""Resets, of which each draws 5,000 places for an object that finds none."""
 
 
 class UnusableSceneError(PipelineError):
@@ -84,6 +88,26 @@ def _without_textures(model_xml: str) -> str:
     return ET.tostring(scene, encoding="unicode")
 
 
+def _until_placed(reset: Callable[[], Any], task: Task) -> Any:
+    """Call LIBERO's reset, or its constructor, which resets too, until the random draws give every object a place.
+
+    LIBERO's own wrapper repeats a reset without end, whatever went wrong, and its constructor never.
+
+    Raises:
+        PipelineError: after ``PLACEMENT_TRIES``.
+    """
+    from robosuite.utils.errors import RandomizationError
+
+    for _ in range(PLACEMENT_TRIES):
+        with suppress(RandomizationError):
+            return reset()
+    raise PipelineError(
+        f"LIBERO finds no place for all objects in {PLACEMENT_TRIES} resets",
+        where=task.bddl_file,
+        expected="regions that are large enough for the objects in them",
+    )
+
+
 class Environment:
     """One task's environment; every ``restore`` forgets what happened before it.
 
@@ -98,16 +122,18 @@ class Environment:
 
     def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
         self.task = task
+        build = partial(
+            control_env(),
+            bddl_file_name=str(task.bddl_file),
+            has_renderer=False,
+            has_offscreen_renderer=False,
+            use_camera_obs=False,
+            ignore_done=True,
+            scene_properties=scene_properties,
+            scene_xml=scene_xml,
+        )
         with seeded(0):
-            self._env = control_env()(
-                bddl_file_name=str(task.bddl_file),
-                has_renderer=False,
-                has_offscreen_renderer=False,
-                use_camera_obs=False,
-                ignore_done=True,
-                scene_properties=scene_properties,
-                scene_xml=scene_xml,
-            )
+            self._env = _until_placed(build, task)
         self._control_step = ControlStep(self._env.env)
         self._openings = len(self._env.env.object_property_initializers)
         self._placed: dict[int, str] = {}
@@ -125,12 +151,15 @@ class Environment:
             del self._env.env.object_property_initializers[self._openings :]
             self._scene = None
             with seeded(seed):
-                self._env.reset()
+                self._reset_until_placed()
             self._control_step = ControlStep(self._env.env)
             scene = ET.fromstring(self._env.sim.model.get_xml())
             as_evaluated(scene)
             self._placed[seed] = ET.tostring(scene, encoding="unicode")
         return self._placed[seed]
+
+    def _reset_until_placed(self) -> None:
+        _until_placed(self._env.env.reset, self.task)
 
     def restore(self, model_xml: str, state: Floats) -> None:
         """Put the environment into a recorded scene and state; nothing from before has an effect on what follows.
