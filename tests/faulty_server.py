@@ -1,4 +1,4 @@
-"""A model server of vla-eval that replays demonstrations, except in the milk's episode, where it does as it is told."""
+"""A model server of vla-eval that replays demonstrations, except of the milk and the plate, where it is at fault."""
 
 from __future__ import annotations
 
@@ -13,25 +13,27 @@ from pipeline.evaluation.replay_server import ReplayServer
 
 
 class FaultyServer(ReplayServer):
-    """Args: fault: ``hang``, ``raise`` or ``die``."""
+    """In the milk's episode it hangs, or dies where it is told so; in the plate's it raises an error."""
 
-    def __init__(self, *, fault: str):
+    def __init__(self, *, dies: bool = False):
         super().__init__(chunk=8)
-        self._fault, self._faulty = fault, set[str]()
+        self._dies = dies
+        self._tasks: dict[str, str] = {}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         await super().on_episode_start(config, ctx)
-        (self._faulty.add if "milk" in config["task"]["name"] else self._faulty.discard)(ctx.session_id)
+        self._tasks[ctx.session_id] = config["task"]["base"]
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
-        if ctx.session_id not in self._faulty:
-            await super().on_observation(obs, ctx)
-        elif self._fault == "hang":
-            await anyio.sleep_forever()
-        elif self._fault == "raise":
+        task = self._tasks[ctx.session_id]
+        if "plate" in task:
             raise ValueError("no such camera")
-        else:
+        if "milk" not in task:
+            await super().on_observation(obs, ctx)
+        elif self._dies:
             os._exit(1)
+        else:
+            await anyio.sleep_forever()
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 
 from pipeline.errors import PipelineError
+from pipeline.evaluation import merging
 
 EFFECT = REPOSITORY / "benchmarks" / "effect"
 sys.path.append(str(EFFECT))
@@ -98,7 +99,7 @@ def small_experiment(folder: Path, demos: Path) -> Path:
         "arms": {"perturbed": ["noise"]},
         "frame_px": 32,
         "policy": {
-            **{"type": "act", "pretrained_backbone_weights": None, "chunk_size": 100, "n_action_steps": 100},
+            **{"type": "act", "pretrained_backbone_weights": None, "chunk_size": 100, "n_action_steps": 40},
             **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1, "use_vae": False},
         },
         "training": {"steps": 2, "batch_size": 2, "save_every": 1},
@@ -121,6 +122,8 @@ def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path) -> 
     assert found["episodes_by_axis"] == {"perturbed": {"noise": 1}}
     (line,) = found["table"]
     assert (line["source"], line["axis"], line["arms"]["perturbed"]["episodes"]) == ("libero", "clean", 1)
+    (row,) = merging.read([*(tmp_path / "out" / "evaluations").iterdir()])[0].rows
+    assert (row["reason"], row["steps"], row["looks"]) == ("step_limit", 300, 8), "it looks once in its chunk"
     assert {*found["hours"]} == {"data", "training", "evaluation"}
 
 

@@ -41,6 +41,9 @@ SCENE_AXES = ("pose", "layout", "light", "background")
 FAILURES_IN_A_ROW = 3
 """After so many episodes in a row without an action from the policy a worker stops the evaluation."""
 
+FAULTS_NAMED = 3
+"""So many episodes without a result are named in the message that counts them."""
+
 Videos = Literal["none", "failures", "all"]
 """Of which episodes a video is kept."""
 
@@ -162,8 +165,9 @@ class EvaluationJob:
                 faults.append(f"{error.what} ({task})")
                 _failures.append(faults[-1])
                 if len(_failures) == FAILURES_IN_A_ROW:
+                    stopped = without_result(_failures)
                     _failures.clear()
-                    raise without_result(FAILURES_IN_A_ROW, faults[-1]) from error
+                    raise stopped from error
                 continue
             _failures.clear()
             if seen is not None and row["steps"] and (self.videos == "all" or not row["success"]):
@@ -175,10 +179,11 @@ class EvaluationJob:
         return faults
 
 
-def without_result(episodes: int, fault: str) -> PipelineError:
-    """The policy failed in some episodes, of which ``fault`` is one."""
+def without_result(faults: Sequence[str]) -> PipelineError:
+    """The policy failed in some episodes; the first few are named."""
+    more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
     return PipelineError(
-        f"{episodes} episodes have no result: {fault}",
+        f"{len(faults)} episodes have no result: {'; '.join([*faults[:FAULTS_NAMED], *more])}",
         remedy="mend the policy and run the same command again: finished episodes are kept",
     )
 
@@ -224,7 +229,7 @@ def evaluate(
     with replaced(folder / "summary.json") as temporary:
         temporary.write_text(json.dumps(found, indent=2) + "\n")
     if faults:
-        raise without_result(len(faults), faults[0])
+        raise without_result(faults)
     return found
 
 
