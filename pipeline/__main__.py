@@ -12,8 +12,8 @@ import yaml
 
 from pipeline.axes import Axes
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
-from pipeline.errors import PipelineError
 from pipeline.evaluation import analyses
+from pipeline.exit_status import exit_status
 from pipeline.files import replaced
 from pipeline.formats.registry import FORMATS, formats_of
 from pipeline.libero.fetch import fetch
@@ -144,6 +144,19 @@ def _check_oft(arguments: argparse.Namespace) -> int:
     found = oft_check.check_run(arguments.data)
     print(json.dumps(found))
     return int(any(dataset["violations"] for dataset in found.values()))
+
+
+def _verify(arguments: argparse.Namespace) -> int:
+    from pipeline.validation.verify import verify
+
+    config = owned(arguments.config)
+    with runner(config.compute, config.data) as run:
+        results = verify(config, run)
+    for result in results.values():
+        for damaged in result["damaged"]:
+            print(damaged)
+    print(json.dumps(results))
+    return int(any(result["damaged"] for result in results.values()))
 
 
 def _regenerate(arguments: argparse.Namespace) -> int:
@@ -406,6 +419,15 @@ def parser() -> argparse.ArgumentParser:
     command.set_defaults(run=_check_oft)
 
     command = commands.add_parser(
+        "verify",
+        help="read every stored file of a run, and say which are not what was written",
+        description="Compares trajectories, frames and both datasets with the checksums that they were stored "
+        "with. The last line is JSON. Ends with 1 where a file is damaged: delete it, and `dvc repro` makes it anew.",
+    )
+    command.add_argument("config", type=Path, metavar="CONFIG", help="of the run, such as configs/starter.yaml")
+    command.set_defaults(run=_verify)
+
+    command = commands.add_parser(
         "regenerate",
         help="rebuild one episode from the manifest and its demonstration, and say whether it is the dataset's, byte "
         "for byte",
@@ -444,11 +466,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main() -> int:
     arguments = parser().parse_args()
-    try:
-        return int(arguments.run(arguments))
-    except PipelineError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    return exit_status(lambda: int(arguments.run(arguments)))
 
 
 if __name__ == "__main__":

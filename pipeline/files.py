@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from hashlib import file_digest
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from pipeline.errors import PipelineError
 
 
 def schema_file(name: str) -> Path:
@@ -34,6 +38,35 @@ def edition(path: Path) -> Edition:
     """
     status = path.stat()
     return Edition(path.resolve(), status.st_ino, status.st_size, status.st_mtime_ns)
+
+
+def checksum(file: Path) -> str:
+    """SHA-256 of a file's content, as ``sha256sum`` prints it.
+
+    Raises:
+        OSError: when it cannot be read.
+    """
+    with file.open("rb") as content:
+        return file_digest(content, "sha256").hexdigest()
+
+
+def read_json(file: Path, remedy: str = "dvc repro") -> dict[str, Any]:
+    """A JSON object that a stage wrote.
+
+    Raises:
+        PipelineError: when the file is missing, or is something else.
+    """
+    try:
+        content = json.loads(file.read_bytes())
+        if not isinstance(content, dict):
+            raise TypeError(f"holds {type(content).__name__}")
+    except FileNotFoundError as error:
+        raise PipelineError("not there", where=file, remedy=remedy) from error
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise PipelineError(
+            f"damaged ({error})", where=file, expected="a JSON object", remedy=f"delete it, and {remedy}"
+        ) from error
+    return content
 
 
 @contextmanager

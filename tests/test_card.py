@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +72,7 @@ ROWS = [
 ]
 COVERAGE = {"test_tasks": 313, "compared": 313, "smallest": 5.379, "median": 6.12, "p90": 7.34, "largest": 8.56}
 FINDING = {"rows": 3, "test_tasks": 1599, "comparisons": 4797, "smallest": 5.379, "closest": "e", "clearance": 5.0}
+DATA_SHA256 = hashlib.sha256(b"data").hexdigest()
 VALIDATION: dict[str, dict[str, Any]] = {"gripper": {"checked": 7, "findings": []}}
 
 
@@ -88,6 +92,9 @@ def data(tmp_path: Path) -> Path:
         },
     }.items():
         (tmp_path / name).write_text(json.dumps(report))
+    for kind in ("rlds", "lerobot"):
+        record = {"identity": "", "files": {f"{NAME}/data.bin": DATA_SHA256}, "places": {}}
+        (tmp_path / f"{kind}.json").write_text(json.dumps(record))
     (tmp_path / "sheets").mkdir()
     for axis in ("camera", "camera+background"):
         (tmp_path / "sheets" / f"{axis}.png").write_bytes(axis.encode())
@@ -146,6 +153,20 @@ def test_tables_say_what_the_manifest_says(data: Path) -> None:
     assert "| camera | distance | 313 | 313 | 5.38 | 6.12 | 7.34 | 8.56 |" in text
     assert "hf download OWNER/NAME" in text
     assert re.search(rf"regenerate ({'|'.join(row['episode_id'] for row in ROWS if row['kept'])}) --manifest", text)
+
+
+@pytest.mark.parametrize(("kind", "path"), [("rlds", f"rlds/{NAME}/data.bin"), ("lerobot", "data.bin")])
+def test_a_download_can_be_checked(data: Path, tmp_path: Path, kind: str, path: str) -> None:
+    write(data)
+    download = tmp_path / "download"
+    (download / path).parent.mkdir(parents=True)
+    (download / path).write_bytes(b"data")
+    for file in (data / "manifest.parquet", data / "card" / kind / "SHA256SUMS"):
+        shutil.copy(file, download)
+    check = ["sha256sum", "--check", "--quiet", "SHA256SUMS"]
+    assert subprocess.run(check, cwd=download, check=False).returncode == 0
+    (download / path).write_bytes(b"dara")
+    assert subprocess.run(check, cwd=download, check=False, capture_output=True).returncode == 1
 
 
 def test_pictures_are_beside_the_card_and_only_those_that_exist(data: Path) -> None:

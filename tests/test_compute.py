@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import pytest
+from conftest import REPOSITORY
 
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
@@ -48,6 +51,72 @@ def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
         with runner(ComputeConfig(cluster=address), tmp_path) as elsewhere:
             assert set(elsewhere(process, numbers, "processes")) == workers
         assert list(tmp_path.iterdir()) == []
+
+
+def die(_: int) -> int:
+    os._exit(1)
+
+
+def mark(file: Path) -> None:
+    file.touch()
+    time.sleep(0.1)
+
+
+@pytest.mark.slow
+def test_work_that_ends_its_workers_ends_the_run_with_words(tmp_path: Path) -> None:
+    import dask
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run,
+    ):
+        with pytest.raises(PipelineError, match="ended 2 workers"):
+            run(die, [1], "deaths")
+        assert run(square, [3], "squares") == [9], "a new worker has come"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("gone", "message"), [("worker", "no worker is left"), ("scheduler", "scheduler|no worker")])
+def test_a_cluster_that_goes_away_is_not_waited_for(
+    gone: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import dask
+
+    monkeypatch.setattr("pipeline.run.compute.ALONE_S", 2)
+    monkeypatch.setattr("pipeline.run.compute.LOOK_S", 1)
+    script = Path(sys.executable).parent / "dask"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])}
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+    commands = {
+        "scheduler": ["scheduler", "--host", address, "--no-dashboard"],
+        "worker": ["worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"],
+    }
+    processes = {
+        name: subprocess.Popen([script, *words], cwd=tmp_path, env=environment, stderr=subprocess.DEVNULL)
+        for name, words in commands.items()
+    }
+    working = tmp_path / "working"
+
+    def kill_one_once_there_is_work() -> None:
+        while not working.exists():
+            time.sleep(0.05)
+        processes[gone].kill()
+
+    killer = threading.Thread(target=kill_one_once_there_is_work, daemon=True)
+    killer.start()
+    try:
+        with (
+            dask.config.set({"distributed.comm.timeouts.connect": "30s"}),
+            pytest.raises(PipelineError, match=message),
+            runner(ComputeConfig(cluster=address), tmp_path) as run,
+        ):
+            run(mark, [working] * 10_000, "work")
+    finally:
+        for one in processes.values():
+            one.kill()
+            one.wait()
 
 
 def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -54,8 +54,11 @@ def test_a_stage_opens_all_that_it_declares_and_needs_nothing_else(stage: str, f
         min((tmp_path / store).glob("*.h5"), key=lambda file: file.stat().st_size).unlink()
     # Without other processes: what a worker opens is seen too, but starting them takes longer than the stage.
     file = tmp_path / "configs" / "tiny.yaml"
-    config = yaml.safe_load(file.read_text())
-    file.write_text(yaml.safe_dump({**config, "compute": {"cluster": "loop"}}))
+    config = yaml.safe_load(file.read_text()) | {"compute": {"cluster": "loop"}}
+    if stage == "summary":
+        # Previews of one suite open as much as those of two.
+        config["demos"]["tasks"] = config["demos"]["tasks"][:1]
+    file.write_text(yaml.safe_dump(config))
     link_testset(tmp_path)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
     with opened_files(tmp_path) as opened:

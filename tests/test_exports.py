@@ -135,7 +135,7 @@ def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_p
     export(made, source, loop)
     assert is_current(made, source)
     # What a client leaves is no part of the dataset.
-    first = made.folder / made.record().files[0]
+    first = made.folder / next(iter(made.record().files))
     before = stamps(made.folder)
     (first.parent / "dataset_statistics_0123.json").write_text("{}")
     (made.work / "foreign").mkdir(parents=True)

@@ -393,9 +393,17 @@ def incomplete(data: Path) -> None:
     next((data / "lerobot" / NAME / "videos").rglob("*.mp4")).unlink()
 
 
+def rotten(data: Path) -> None:
+    file = next((data / "lerobot" / NAME / "videos").rglob("*.mp4"))
+    stamp = file.stat().st_mtime_ns
+    file.write_bytes(file.read_bytes()[:-1] + b"?")
+    os.utime(file, ns=(stamp, stamp))
+
+
 @pytest.mark.parametrize(
     ("spoil", "complaint"),
     [
+        (rotten, r"\.mp4: was changed since it was written"),
         (unvalidated, r"validation\.json: not there"),
         (failed, r"1 of 1 checks failed: gripper \(episode-1 is turned\)"),
         (vacuous, "at least one check"),

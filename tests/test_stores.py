@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 from conftest import BOWL, tiny_config
 
@@ -28,6 +29,7 @@ from pipeline.run.frame_store import FrameStore
 from pipeline.run.store import TABLE
 from pipeline.run.streams import streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
 
@@ -89,8 +91,9 @@ def _remove(file: Path) -> None:
 
 
 def _make_foreign(file: Path) -> None:
-    with h5py.File(file, "r+") as opened:
-        opened.attrs["made_by"] = "somebody else"
+    store = TrajectoryStore(file.parent)
+    trajectory, store.made_by = store.load(file.stem), "somebody else"
+    store.save(trajectory)
 
 
 def _take_out_states(file: Path) -> None:
@@ -110,6 +113,36 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     replay_plan(rows, config.demos, config.replay, trajectories, loop)
     assert file.read_bytes() == before
     assert outcome.replayed(rows, trajectories)
+
+
+@pytest.mark.parametrize(("name", "place"), [("states", (3, 1)), ("actions", (2, 0)), ("kept_mask", 0)])
+def test_a_changed_number_is_not_read(trajectories: Path, name: str, place: Any) -> None:
+    file = next(trajectories.glob("*.h5"))
+    with h5py.File(file, "r+") as opened:
+        opened[name][place] = np.logical_not(opened[name][place]) if name == "kept_mask" else -opened[name][place]
+    with pytest.raises(PipelineError, match=rf"damaged .*{name}(?s:.*)delete the file"):
+        TrajectoryStore(trajectories).load(file.stem)
+
+
+def test_no_flipped_bit_is_read(trajectories: Path) -> None:
+    """Either the file is refused, or what is read is what was written."""
+    file = next(trajectories.glob("*.h5"))
+    store, content = TrajectoryStore(trajectories), file.read_bytes()
+    loaded, refused = store.load(file.stem), 0
+    # Half of them in the first part, which has HDF5's own structure.
+    places = rng("test_stores").integers([2048, len(content)], size=(60, 2)).ravel()
+    for place in places:
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(place) % 8
+        file.write_bytes(damaged)
+        try:
+            read = store.load(file.stem)
+        except PipelineError:
+            refused += 1
+        else:
+            for name, value in vars(loaded).items():
+                assert np.array_equal(getattr(read, name), value), name
+    assert refused > len(places) / 2
 
 
 @pytest.mark.parametrize("layer", identity.RECIPES)

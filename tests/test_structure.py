@@ -30,8 +30,10 @@ FLOORS = (
     "export_config",
     "gl",
     "seeding",
+    "tables",
     "files",
     "types",
+    "exit_status",
     "errors",
 )
 """Rooms of ``pipeline`` and modules at its root, top to bottom: what stands above may import what stands below."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable, Mapping
+from contextlib import chdir
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from conftest import BOWL, MILK, STOVE, run_stages, tiny_config
 
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
+from pipeline.files import checksum
 from pipeline.formats import lerobot_video, rlds_write
 from pipeline.formats.base import Copy, Fault
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
@@ -29,6 +32,7 @@ from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import witnesses
 from pipeline.validation.validate import validate
+from pipeline.validation.verify import verify
 
 Tree = dict[str, Any]
 Rows = list[dict[str, Any]]
@@ -215,6 +219,7 @@ def test_planted_faults_stop_the_run_and_nothing_else_is_found(
     index = {names[row["episode_id"]]: row["lerobot_episode_index"] for row in rows if row["kept"]}
     spoil_lerobot(data / "lerobot" / "tiny", index)
     spoil_manifest(data, rows, other)
+    record_as_written(data)
     killed = data / ".work" / "validate" / "of a killed run"
     killed.mkdir(parents=True)
     with pytest.raises(AssertionError, match=r"(?s)findings in all: counts 1, .*try: read data/tiny/validation\.json"):
@@ -253,6 +258,51 @@ def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory])
     assert "gripper command" in found(0.5)[0].what
 
 
+def record_as_written(data: Path) -> None:
+    """As if a writer had made the faults."""
+    for name in ("rlds", "lerobot"):
+        file = data / f"{name}.json"
+        written = {path for path in (data / name).rglob("*") if path.is_file()}
+        files = {path.relative_to(data / name).as_posix(): checksum(path) for path in sorted(written)}
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"files": files}))
+
+
+def flip_a_bit(file: Path) -> None:
+    """As a bad disk does: the file's time stays."""
+    content, stamp = bytearray(file.read_bytes()), file.stat().st_mtime_ns
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    os.utime(file, ns=(stamp, stamp))
+
+
+@pytest.mark.parametrize("part", ["trajectories", "frames", "rlds", "lerobot"])
+def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    config = load(finished.parent.parent / "configs" / "tiny.yaml")
+    with chdir(tmp_path):
+        assert all(result["checked"] and not result["damaged"] for result in verify(config, loop).values())
+        # The largest: a file that holds data.
+        file = max((path for path in (data / part).rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
+        flip_a_bit(file)
+        results = verify(config, loop)
+    (told,) = results.pop(part)["damaged"]
+    assert str(file.relative_to(data)) in told
+    assert "delete" in told
+    assert not any(result["damaged"] for result in results.values())
+
+
+def test_a_changed_dataset_is_not_read_any_further(finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    for name in ("rlds", "lerobot"):
+        flip_a_bit(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))
+    with chdir(tmp_path):
+        report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
+    assert {finding["dataset"] for finding in report["checksums"]["findings"]} == {"rlds", "lerobot"}
+    assert not any(result["findings"] for check, result in report.items() if check != "checksums")
+
+
 def test_what_is_missing_or_cannot_be_read_is_a_finding(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -263,6 +313,10 @@ def test_what_is_missing_or_cannot_be_read_is_a_finding(
     cut.write_bytes(cut.read_bytes()[:-1])
     *others, _ = records(short)
     short.write_bytes(b"".join(map(framed, others)))
+    record_as_written(data)
+    rows = [row for row in manifest.read(data / "manifest.parquet") if row["kept"]]
+    rotten = data / "frames" / f"{rows[0]['trajectory_id']}.h5"
+    flip_a_bit(rotten)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])  # Tested above, and slow.
     report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
@@ -270,7 +324,8 @@ def test_what_is_missing_or_cannot_be_read_is_a_finding(
     assert [dataset for dataset, _ in told] == ["lerobot", "rlds", "rlds"]
     assert re.search(rf"{cut.name}: record \d+ is damaged", told[1][1])
     assert told[2][1] == f"{short.name} has {len(others)} records"
-    rows = [row for row in manifest.read(data / "manifest.parquet") if row["kept"]]
+    assert report["stored"]["findings"]
+    assert all(str(rotten) in finding["what"] for finding in report["stored"]["findings"])
     gone = {
         max((row["rlds_index"], row["episode_id"]) for row in rows if row["rlds_shard"] == shard.name)[1]
         for shard in (cut, short)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -22,7 +21,7 @@ from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.axes.scene import ScenePerturbation
 from pipeline.errors import PipelineError
-from pipeline.files import Edition, edition
+from pipeline.files import Edition, checksum, edition
 from pipeline.run import plan
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -132,7 +131,7 @@ def sha256_of(file: Path) -> str:
 
 @cache
 def _sha256(file: Path, version: Edition) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+    return checksum(file)
 
 
 def _images(one: BackgroundPerturbation) -> frozenset[str]:

@@ -10,7 +10,7 @@ import json
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
@@ -149,12 +149,12 @@ class Export:
 
     Attributes:
         identity: digest of everything that the dataset's bytes depend on.
-        files: all files, below the format's folder.
+        files: all files below the format's folder, each with its SHA-256.
         places: episode id to the format's columns of the manifest.
     """
 
     identity: str
-    files: Sequence[str]
+    files: Mapping[str, str]
     places: Mapping[str, Mapping[str, Any]]
 
 
@@ -209,7 +209,8 @@ class Format(ABC, Generic[Options]):
             PipelineError: when there is none.
         """
         try:
-            return Export(**json.loads(self.record_file.read_text()))
+            record = Export(**json.loads(self.record_file.read_text()))
+            return replace(record, files=dict(record.files))
         except (OSError, ValueError, TypeError) as error:
             raise PipelineError(
                 f"no finished dataset ({error})", where=self.record_file, remedy=f"dvc repro export_{self.name}"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
+from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
 from pipeline.formats.base import Episodes, Export, Format, Load
 from pipeline.seeding import digest
 
@@ -85,7 +85,9 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
         places = target.assemble(work, pieces)
         dataset = work / "dataset"
         sync(dataset)
-        files = sorted(file.relative_to(dataset).as_posix() for file in dataset.rglob("*") if file.is_file())
+        paths = sorted(file for file in dataset.rglob("*") if file.is_file())
+        checksums = run(checksum, paths, f"{target.title} checksums")
+        files = {path.relative_to(dataset).as_posix(): sha256 for path, sha256 in zip(paths, checksums, strict=True)}
         with replaced(finished) as temporary:
             temporary.write_text(json.dumps(asdict(Export(work.name, files, places)), indent=0) + "\n")
     target.record_file.unlink(missing_ok=True)  # It is about the dataset before.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import re
 import shutil
 from collections import Counter
@@ -19,7 +18,7 @@ from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import checksum, read_json, replaced
 from pipeline.formats.base import Format
 from pipeline.publish.attribution import attributions
 from pipeline.publish.yields import LEVELS
@@ -27,6 +26,9 @@ from pipeline.run import manifest
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """What the card is made from, besides the manifest; in the run's folder."""
+
+CHECKSUMS = "SHA256SUMS"
+"""Of a repository's files, for ``sha256sum --check``."""
 
 REPOSITORY = "OWNER/NAME"
 """Stands in a card for the repository, which is not known before the upload."""
@@ -55,7 +57,7 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
     rows = manifest.read(data / "manifest.parquet")
     if not any(row["kept"] for row in rows):
         raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
-    reports = {name: json.loads((data / name).read_text()) for name in REPORTS}
+    reports = {name: read_json(data / name) for name in REPORTS}
     clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)
     sheets = [axis for axis in axes if (data / "sheets" / f"{axis}.png").is_file()]
@@ -67,6 +69,10 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
             others = [other.title for other in formats if other is not one]
             text = render(one, others, rows, reports, clients, sheets=sheets, name=name)
             (folder / one.name / "README.md").write_text(text)
+            sums = {one.repository_path(path): sha256 for path, sha256 in one.record().files.items()}
+            sums["manifest.parquet"] = checksum(data / "manifest.parquet")
+            lines = [f"{sha256}  {path}\n" for path, sha256 in sorted(sums.items())]
+            (folder / one.name / CHECKSUMS).write_text("".join(lines))
 
 
 def render(

@@ -7,7 +7,6 @@ leaves notes among the files, shows half a dataset meanwhile, and tries for ever
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -20,6 +19,7 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, co
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError, XetError
 
 from pipeline.errors import PipelineError
+from pipeline.files import checksum, read_json
 from pipeline.formats.base import Format
 from pipeline.publish.card import REPORTS, REPOSITORY
 
@@ -65,6 +65,7 @@ def prepare(target: Format[Any]) -> Upload:
     dataset = _exactly(target.folder, set(target.record().files))
     files = {target.repository_path(path): file for path, file in dataset.items()}
     _refuse_unvalidated(data, files, target.name)
+    _refuse_changed(target)
     card = data / "card" / target.name
     files |= {file.relative_to(card).as_posix(): file for file in card.rglob("*") if file.is_file()}
     files |= {name: data / name for name in ("manifest.parquet", *REPORTS)}
@@ -158,7 +159,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
 def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> None:
     """Stop unless these very files passed validation, and the card tells of it."""
     report = _there(data / "validation.json")
-    checks = json.loads(report.read_text())
+    checks = read_json(report)
     failed = [f"{check} ({found['findings'][0]})" for check, found in checks.items() if found["findings"]]
     if failed or not checks:
         raise PipelineError(
@@ -179,6 +180,18 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
                 where=after,
                 # Forced: where a file was written anew with the same content, DVC sees nothing to do.
                 remedy="dvc repro --force --single-item validate card",
+            )
+
+
+def _refuse_changed(target: Format[Any]) -> None:
+    """Stop where a file is not what was written, although its time says so."""
+    for name, sha256 in target.record().files.items():
+        if checksum(target.folder / name) != sha256:
+            raise PipelineError(
+                "was changed since it was written",
+                where=target.folder / name,
+                expected=f"its checksum in {target.record_file}",
+                remedy="delete it, and `dvc repro` makes it again",
             )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 from collections.abc import Mapping, Sequence
@@ -16,7 +15,7 @@ import yaml
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import replaced, schema_file
+from pipeline.files import checksum, replaced, schema_file
 from pipeline.formats.rlds_layout import dataset_of
 from pipeline.run import motion_statistics
 
@@ -96,7 +95,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, 
     recipe = {
         "name": name,
         "dataset": {
-            "sha256": sourced(hashlib.sha256(manifest_file.read_bytes()).hexdigest(), "hash of " + MANIFEST),
+            "sha256": sourced(checksum(manifest_file), "hash of " + MANIFEST),
             "episodes": sourced(len(kept), MANIFEST),
             "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
             "episodes_by_suite_and_axis": sourced(counts, MANIFEST),

@@ -15,6 +15,7 @@ from pipeline.axes import from_json
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.files import read_json
 from pipeline.libero.tasks import find_task
 from pipeline.publish import clips, coverage, figures, pages, yields
 from pipeline.publish.clips import Clip
@@ -50,13 +51,8 @@ def page(config: Config, test: TestSet) -> str:
         PipelineError: when the run's folder lacks what an earlier stage makes, or nothing was kept.
     """
     data = config.data
-    try:
-        rows: Rows = manifest.read(data / "manifest.parquet")
-        leakage = json.loads((data / "leakage.json").read_text())
-    except OSError as error:
-        raise PipelineError(
-            f"the run is not finished ({error})", where=data, remedy="run `dvc repro`, which makes it"
-        ) from error
+    rows: Rows = manifest.read(data / "manifest.parquet")
+    leakage = read_json(data / "leakage.json")
     load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
     asked = manifest.asked(rows)
     kept = [row for row in asked if row["kept"]]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from queue import Empty, Queue
 from typing import Any, Protocol, TypeVar
 
 from rich.console import Console
@@ -13,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
+from pipeline.exit_status import GO_ON
 from pipeline.run.cluster import InPlace, Workplace, joined
 
 Item = TypeVar("Item")
@@ -20,6 +24,12 @@ Result = TypeVar("Result")
 
 CONNECT_S = 30
 """How long to wait for a scheduler's answer."""
+
+ALONE_S = 30
+"""How long to wait for a worker where none is left."""
+
+LOOK_S = 5
+"""How often to look whether there are workers, while nothing gets done."""
 
 
 class Run(Protocol):
@@ -67,8 +77,11 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
             processes=True,
             dashboard_address=":0",
             memory_limit=None,
+            # An error reaches the user once, from here.
+            silence_logs=logging.CRITICAL,
         )
         with cluster, Client(cluster) as client:
+            client.run(_leave_interrupts_to_the_run)
             yield _on(client)
     else:
         try:
@@ -81,22 +94,69 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
             yield _on(client, workplace)
 
 
+def _leave_interrupts_to_the_run() -> None:
+    """In a worker: Ctrl-C reaches all processes of a terminal, and the run ends its workers itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def _on(client: Any, workplace: Workplace | None = None) -> Run:
-    from distributed import as_completed
+    from distributed import Future, KilledWorker
 
     def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         # Not pure: equal items are still separate work, and the scheduler must not remember earlier runs.
         futures = client.map(fn if workplace is None else InPlace(fn, workplace), items, pure=False)
+        done: Queue[Future] = Queue()
+        for future in futures:
+            future.add_done_callback(done.put)
         with _progress(description, len(items)) as advance:
-            for future in as_completed(futures):
+            for _ in futures:
+                future = _next(done, client)
                 if future.status == "error":
                     error = future.exception()
                     client.cancel(futures)
-                    raise error
+                    raise _killed(error) if isinstance(error, KilledWorker) else error
+                if future.status != "finished":
+                    raise _lost(client, "the Dask scheduler went away")
                 advance()
         return list(client.gather(futures))
 
     return run
+
+
+def _next(done: Queue[Any], client: Any) -> Any:
+    """The next future that is done.
+
+    Raises:
+        PipelineError: when nobody is left who could do one.
+    """
+    alone_s = 0
+    while True:
+        try:
+            return done.get(timeout=LOOK_S)
+        except Empty:
+            # A new worker may be on its way, in place of one that died.
+            alone_s = 0 if _has_workers(client) else alone_s + LOOK_S
+            if alone_s >= ALONE_S:
+                raise _lost(client, f"no worker is left, and none came in {ALONE_S} s") from None
+
+
+def _has_workers(client: Any) -> bool:
+    try:
+        return bool(client.nthreads())
+    except (OSError, TimeoutError):  # no scheduler
+        return False
+
+
+def _lost(client: Any, what: str) -> PipelineError:
+    return PipelineError(what, where=client.scheduler.address, remedy=f"start it again, and {GO_ON}")
+
+
+def _killed(error: Any) -> PipelineError:
+    return PipelineError(
+        f"one piece of work ended {error.allowed_failures + 1} workers, the last on {error.last_worker.address}",
+        expected="workers that live: the system may have ended them because memory ran out",
+        remedy=f"see the system's log, use fewer workers, and {GO_ON}",
+    )
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.identity import fingerprint
+from pipeline.run.sealed_file import SealedFile
 from pipeline.run.store import Store
 from pipeline.types import Geometry
 
@@ -81,9 +82,13 @@ class FrameStore(Store):
             rendered: the frames.
             device: what rendered them, as OpenGL names it.
         """
-        with self.created(trajectory_id) as file:
-            file.attrs["device"] = device
-            file.attrs["replay_mode"] = rendered.replay_mode
+        attributes = {
+            "device": device,
+            "replay_mode": rendered.replay_mode,
+            "instances": list(rendered.instances),
+            "rejected": json.dumps(dict(rendered.rejected), sort_keys=True),
+        }
+        with self.created(trajectory_id, attributes) as file:
             for name in ("state", "joint_state", "action"):
                 file[name] = getattr(rendered, name)
             streams = file.create_group("streams")
@@ -98,8 +103,6 @@ class FrameStore(Store):
                     _pack(view.create_group(name), files)
             if rendered.object_poses is not None:
                 file["object_poses"] = rendered.object_poses
-            file.attrs["instances"] = list(rendered.instances)
-            file.attrs["rejected"] = json.dumps(dict(rendered.rejected), sort_keys=True)
 
     def load(self, trajectory_id: str, streams: Sequence[str], geometry: Collection[str] = ()) -> Rendered:
         """Read the named streams of a trajectory.
@@ -113,7 +116,7 @@ class FrameStore(Store):
             PipelineError: when the file, one of the streams or its geometry is not there.
         """
         with self.opened(trajectory_id) as file:
-            missing = {*streams, *geometry} - {*file["streams"], *file["geometry"]}
+            missing = {*streams, *geometry} - {*file.groups("streams"), *file.groups("geometry")}
             if missing:
                 raise PipelineError(
                     f"streams {sorted(missing)} were not rendered",
@@ -121,21 +124,21 @@ class FrameStore(Store):
                     remedy="run the render stage again",
                 )
             return Rendered(
-                replay_mode=str(file.attrs["replay_mode"]),
-                state=file["state"][()],
-                joint_state=file["joint_state"][()],
-                action=file["action"][()],
-                streams={name: _frames(file[f"streams/{name}"]) for name in streams},
-                rejected=json.loads(file.attrs["rejected"]),
-                geometry={name: _geometry(file[f"geometry/{name}"]) for name in geometry},
-                object_poses=file["object_poses"][()] if "object_poses" in file else None,
-                instances=file.attrs["instances"].tolist(),
+                replay_mode=file.attributes["replay_mode"],
+                state=file.array("state"),
+                joint_state=file.array("joint_state"),
+                action=file.array("action"),
+                streams={name: _frames(file, f"streams/{name}") for name in streams},
+                rejected=json.loads(file.attributes["rejected"]),
+                geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
+                object_poses=file.array("object_poses") if "object_poses" in file else None,
+                instances=file.attributes["instances"],
             )
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Action (K, 7) and state (K, 8) of a trajectory, without its frames."""
         with self.opened(trajectory_id) as file:
-            return file["action"][()], file["state"][()]
+            return file.array("action"), file.array("state")
 
 
 def stream_ids(row: Mapping[str, Any]) -> set[str]:
@@ -148,24 +151,23 @@ def _pack(group: h5py.Group, files: Sequence[bytes]) -> None:
     group["ends"] = np.cumsum([len(one) for one in files])
 
 
-def _geometry(view: h5py.Group) -> Geometry:
-    matrices = {name: view[name][()] for name in MATRICES}
-    return Geometry(**matrices, maps={name: _frames(view[name]) for name in MAPS if name in view})
+def _geometry(file: SealedFile, view: str) -> Geometry:
+    matrices = {name: file.array(f"{view}/{name}") for name in MATRICES}
+    maps = {name: _frames(file, f"{view}/{name}") for name in MAPS if f"{view}/{name}/bytes" in file}
+    return Geometry(**matrices, maps=maps)
 
 
-def _frames(stream: h5py.Group) -> list[bytes]:
-    packed = stream["bytes"][()].tobytes()
-    ends = stream["ends"][()].tolist()
+def _frames(file: SealedFile, stream: str) -> list[bytes]:
+    packed = file.array(f"{stream}/bytes").tobytes()
+    ends = file.array(f"{stream}/ends").tolist()
     return [packed[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
-def _describe(file: h5py.File) -> dict[str, Any]:
-    # Every part is looked up, so that a file that lacks one is made again.
-    lengths = {name: len(file[name]) for name in ("state", "joint_state", "action", "geometry")}
+def _describe(file: SealedFile) -> dict[str, Any]:
     return {
-        "device": str(file.attrs["device"]),
-        "replay_mode": str(file.attrs["replay_mode"]),
-        "steps": lengths["action"],
-        "streams": sorted(file["streams"]),
-        "rejected": str(file.attrs["rejected"]),
+        "device": file.attributes["device"],
+        "replay_mode": file.attributes["replay_mode"],
+        "steps": file.length("action"),
+        "streams": file.groups("streams"),
+        "rejected": file.attributes["rejected"],
     }

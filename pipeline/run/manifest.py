@@ -17,9 +17,10 @@ from rich.table import Table
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.files import replaced, schema_file
+from pipeline.files import schema_file
 from pipeline.identity import versions
 from pipeline.run.outcome import Outcome
+from pipeline.tables import read_table, write_table
 
 SCHEMA_FILE = schema_file("manifest.json")
 """Column names, types and meanings."""
@@ -84,12 +85,16 @@ def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
 
 
 def write(table: pa.Table, path: Path, settings: Settings) -> None:
-    with replaced(path) as temporary:
-        pq.write_table(table.replace_schema_metadata({_SETTINGS: settings.model_dump_json()}), temporary)
+    write_table(table.replace_schema_metadata({_SETTINGS: settings.model_dump_json()}), path)
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    return list(pq.read_table(path).to_pylist())
+    """The rows of a manifest.
+
+    Raises:
+        PipelineError: when it is missing, damaged or not a manifest of this version.
+    """
+    return list(read_table(path, schema().names, "dvc repro manifest").to_pylist())
 
 
 def settings(path: Path) -> Settings:

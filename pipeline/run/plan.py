@@ -11,7 +11,6 @@ from math import ceil
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from pipeline.axes import (
     AnyAxis,
@@ -26,9 +25,9 @@ from pipeline.axes import (
 from pipeline.axes.base import Layer
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
+from pipeline.tables import read_table, write_table
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Task, Verdict
 
@@ -217,21 +216,18 @@ def _identity(kind: str, demo_sha256: str, replay: ReplayConfig, perturbations: 
 
 def write(rows: Sequence[Row], path: Path) -> None:
     table = pa.table({column.name: [getattr(row, column.name) for row in rows] for column in fields(Row)})
-    with replaced(path) as temporary:
-        pq.write_table(table, temporary)
+    write_table(table, path)
 
 
 def read(path: Path) -> list[Row]:
     """Read a plan back.
 
     Raises:
-        PipelineError: when the file is not a plan of this version.
+        PipelineError: when it is missing, damaged or not a plan of this version.
     """
-    try:
-        columns = pq.read_table(path).select([column.name for column in fields(Row)]).to_pydict()
-        return [Row(*row) for row in zip(*columns.values(), strict=True)]
-    except (OSError, pa.ArrowException, KeyError, TypeError) as error:
-        raise PipelineError("not a readable plan", where=path, remedy="run the plan stage again") from error
+    names = [column.name for column in fields(Row)]
+    columns = read_table(path, names, "dvc repro plan").select(names).to_pydict()
+    return [Row(*row) for row in zip(*columns.values(), strict=True)]
 
 
 def pending(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> list[str]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
+from pipeline.exit_status import exit_status
 
 OWNER = "configuration.json"
 """File of a run's folder that says which configuration file the folder belongs to."""
@@ -21,10 +22,12 @@ def main(stage: Callable[[Config], None], description: str) -> None:
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
     arguments = parser.parse_args()
-    try:
+
+    def run() -> int:
         stage(claimed(arguments.config))
-    except PipelineError as error:
-        sys.exit(f"error: {error}")
+        return 0
+
+    sys.exit(exit_status(run))
 
 
 def claimed(file: Path) -> Config:

@@ -17,12 +17,16 @@ from typing import Any
 
 import h5py
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from pipeline.errors import PipelineError
 from pipeline.files import keep_only, replaced
+from pipeline.run.sealed_file import SealedFile, sealed
+from pipeline.tables import read_table, write_table
 
 TABLE = "index.parquet"
+
+_UNREADABLE = (OSError, LookupError, ValueError, TypeError, RuntimeError, ArithmeticError, MemoryError)
+"""What h5py raises for a file that is missing or has wrong bytes in it, and what a reader does with these."""
 
 
 class Store:
@@ -42,7 +46,7 @@ class Store:
         made_by: str,
         stage: str,
         columns: Mapping[str, pa.DataType],
-        describe: Callable[[h5py.File], dict[str, Any]],
+        describe: Callable[[SealedFile], dict[str, Any]],
     ):
         self.root = root
         self.made_by = made_by
@@ -55,14 +59,21 @@ class Store:
         return self.root / f"{trajectory_id}.h5"
 
     @contextmanager
-    def created(self, trajectory_id: str) -> Iterator[h5py.File]:
-        """A new file to fill; it takes its place when the block ends."""
-        with replaced(self.path(trajectory_id)) as temporary, h5py.File(temporary, "w") as file:
-            file.attrs["made_by"] = self.made_by
+    def created(self, trajectory_id: str, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
+        """A new file to fill with arrays; it takes its place when the block ends.
+
+        Args:
+            trajectory_id: names it.
+            attributes: JSON-serialisable, what it says beside its arrays.
+        """
+        with (
+            replaced(self.path(trajectory_id)) as temporary,
+            sealed(temporary, {**attributes, "made_by": self.made_by}) as file,
+        ):
             yield file
 
     @contextmanager
-    def opened(self, trajectory_id: str) -> Iterator[h5py.File]:
+    def opened(self, trajectory_id: str) -> Iterator[SealedFile]:
         """A file to read.
 
         Raises:
@@ -70,13 +81,25 @@ class Store:
         """
         path, remedy = self.path(trajectory_id), f"run the {self._stage} stage again"
         try:
-            with h5py.File(path, "r") as file:
-                if file.attrs.get("made_by") != self.made_by:
+            with h5py.File(path, "r") as opened:
+                file = SealedFile(opened)
+                if file.attributes["made_by"] != self.made_by:
                     raise PipelineError("made by another version or with other settings", where=path, remedy=remedy)
                 yield file
-        except (OSError, KeyError) as error:
-            what = "damaged" if path.exists() else "missing"
-            raise PipelineError(f"{what} ({error})", where=path, remedy=remedy) from error
+        except _UNREADABLE as error:
+            if not path.exists():
+                raise PipelineError("missing", where=path, remedy=remedy) from error
+            # The stage believes its table, and does not read every file again.
+            raise PipelineError(f"damaged ({error})", where=path, remedy=f"delete the file and {remedy}") from error
+
+    def check_all(self, trajectory_id: str) -> None:
+        """Compare all of a file with its checksums.
+
+        Raises:
+            PipelineError: when it is missing, damaged, or not current.
+        """
+        with self.opened(trajectory_id) as file:
+            file.check_all()
 
     def rows(self) -> dict[str, dict[str, Any]]:
         """Trajectory id to its row, for every current file that can be read."""
@@ -104,9 +127,9 @@ class Store:
         """The rows that were written last, and when; none when the table is missing or damaged."""
         path = self.root / TABLE
         try:
-            table = pq.read_table(path, schema=self._schema)
+            table = read_table(path, self._schema.names, "")
             return {row["trajectory_id"]: row for row in table.to_pylist()}, path.stat().st_mtime_ns
-        except (OSError, pa.ArrowException):
+        except PipelineError:
             return {}, 0
 
     def _read(self, trajectory_id: str, size: int) -> dict[str, Any] | None:
@@ -121,9 +144,8 @@ class Store:
         """``rows``, written as the table; only for the stage that makes the files."""
         rows, written = self._rows()
         if not written:
-            with replaced(self.root / TABLE) as temporary:
-                listed = [row for _, row in sorted(rows.items())]
-                pq.write_table(pa.Table.from_pylist(listed, schema=self._schema), temporary)
+            listed = [row for _, row in sorted(rows.items())]
+            write_table(pa.Table.from_pylist(listed, schema=self._schema), self.root / TABLE)
         return rows
 
     def keep(self, trajectory_ids: Iterable[str]) -> None:

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pyarrow as pa
 
 from pipeline.identity import fingerprint
+from pipeline.run.sealed_file import SealedFile
 from pipeline.run.store import Store
 from pipeline.types import Trajectory, Verdict
 
@@ -34,11 +34,13 @@ class TrajectoryStore(Store):
         super().__init__(root, fingerprint("physics"), "replay", _COLUMNS, _describe)
 
     def save(self, trajectory: Trajectory) -> None:
-        with self.created(trajectory.trajectory_id) as file:
-            file.attrs["mode"] = trajectory.mode
-            file.attrs["kept"] = trajectory.verdict.kept
-            file.attrs["reason"] = trajectory.verdict.reason
-            file.attrs["resolved"] = trajectory.resolved
+        attributes = {
+            "mode": trajectory.mode,
+            "kept": bool(trajectory.verdict.kept),
+            "reason": trajectory.verdict.reason,
+            "resolved": trajectory.resolved,
+        }
+        with self.created(trajectory.trajectory_id, attributes) as file:
             file["model_xml"] = np.frombuffer(trajectory.model_xml.encode(), np.uint8)
             file["states"] = trajectory.states
             file["actions"] = trajectory.actions
@@ -54,14 +56,14 @@ class TrajectoryStore(Store):
         with self.opened(trajectory_id) as file:
             return Trajectory(
                 trajectory_id=trajectory_id,
-                mode=str(file.attrs["mode"]),
-                model_xml=file["model_xml"][()].tobytes().decode(),
-                states=file["states"][()],
-                actions=file["actions"][()],
-                kept_mask=file["kept_mask"][()],
-                site_alpha=file["site_alpha"][()],
-                resolved=str(file.attrs["resolved"]),
-                verdict=Verdict(bool(file.attrs["kept"]), str(file.attrs["reason"])),
+                mode=file.attributes["mode"],
+                model_xml=file.array("model_xml").tobytes().decode(),
+                states=file.array("states"),
+                actions=file.array("actions"),
+                kept_mask=file.array("kept_mask"),
+                site_alpha=file.array("site_alpha"),
+                resolved=file.attributes["resolved"],
+                verdict=Verdict(file.attributes["kept"], file.attributes["reason"]),
             )
 
 
@@ -70,13 +72,11 @@ def verdicts_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Verdict]:
     return {trajectory_id: Verdict(row["kept"], row["reason"]) for trajectory_id, row in rows.items()}
 
 
-def _describe(file: h5py.File) -> dict[str, Any]:
-    # Every dataset is looked up, so that a file that lacks one is made again.
-    lengths = {name: len(file[name]) for name in ("model_xml", "states", "actions", "kept_mask", "site_alpha")}
+def _describe(file: SealedFile) -> dict[str, Any]:
     return {
-        "kept": bool(file.attrs["kept"]),
-        "reason": str(file.attrs["reason"]),
-        "mode": str(file.attrs["mode"]),
-        "steps": lengths["actions"],
-        "resolved": str(file.attrs["resolved"]),
+        "kept": file.attributes["kept"],
+        "reason": file.attributes["reason"],
+        "mode": file.attributes["mode"],
+        "steps": file.length("actions"),
+        "resolved": file.attributes["resolved"],
     }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.files import read_json
 from pipeline.run import motion_statistics
 from pipeline.validation import oft
 
@@ -76,10 +76,7 @@ def check_run(data: Path) -> dict[str, dict[str, Any]]:
     """
     file = data / "dataset_statistics.json"
     folders = {folder.parent.name: folder for folder in oft.datasets(data / "rlds")}
-    try:
-        known = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise PipelineError(f"cannot be read: {error}", where=file, remedy="run `dvc repro manifest`") from error
+    known = read_json(file, "dvc repro manifest")
     if missing := sorted(set(folders) - set(known)):
         raise PipelineError(f"has nothing on {missing}", where=file, remedy="run `dvc repro manifest`")
     return {name: check(folder, known[name]) for name, folder in folders.items()}

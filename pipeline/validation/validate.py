@@ -5,7 +5,6 @@ The datasets are compared with the stores that they were made from; those in tur
 
 from __future__ import annotations
 
-import json
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -15,7 +14,7 @@ from typing import Any
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
-from pipeline.files import scratch
+from pipeline.files import read_json, scratch
 from pipeline.formats.base import Fault, Format, Row
 from pipeline.formats.registry import formats_of
 from pipeline.run import manifest
@@ -69,15 +68,21 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
     with scratch(data / ".work" / "validate") as cache:
         opened = []
         for one in formats_of(data, config.export, config.render.extras):
+            files = run_checks.written(one)
+            for faults in run(run_checks.unchanged, files, f"{one.title} checksums"):
+                total.note("checksums", faults)
+            if any(fault.dataset == one.name for fault in total.findings["checksums"]):
+                # What damaged files seem to hold is of no interest, and may be anything.
+                continue
             try:
-                faults = list(one.check(kept, cache))
+                found = list(one.check(kept, cache))
             except PipelineError as error:
                 total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
                 continue
             opened.append(one)
-            total.note("format", [fault for check, fault in faults if check == "format"])
-            total.note("ids", [fault for check, fault in faults if check == "ids"], len(kept))
-            total.note("readable", [fault for check, fault in faults if check == "readable"], 0)
+            total.note("format", [fault for check, fault in found if check == "format"])
+            total.note("ids", [fault for check, fault in found if check == "ids"], len(kept))
+            total.note("readable", [fault for check, fault in found if check == "readable"], 0)
         job = EpisodesJob(config, data, opened, cache, frozenset(witnesses(rows)))
         # Episodes that lie together are read together.
         columns = [column.name for one in opened for column in one.columns]
@@ -85,10 +90,10 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
         slices = [ordered[start : start + SLICE] for start in range(0, len(ordered), SLICE)]
         for results in run(job, slices, "validate"):
             total.add(results)
-    if not any(finding.dataset == "rlds" for finding in total.findings["readable"]):
+    if not any(fault.dataset == "rlds" for check in ("readable", "checksums") for fault in total.findings[check]):
         # OFT's reader stops at what is damaged.
         sets = oft.datasets(data / "rlds")
-        statistics = json.loads((data / "dataset_statistics.json").read_text())
+        statistics = read_json(data / "dataset_statistics.json")
         trained = run(partial(run_checks.openvla_oft, statistics), sets, "read as OpenVLA-OFT")
         total.note("openvla_oft", [finding for found in trained for finding in found], len(sets))
     return {
@@ -135,10 +140,17 @@ class EpisodesJob:
         results.note("ids", missing, 0)
         results.note("readable", unreadable)
         language = self.config.plan.axes.language
+        try:
+            made = EpisodeLoader(self.data / "plan.parquet", self.data / "frames", self.config.render)(episode_id)
+            trajectory = TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"])
+        except PipelineError as error:
+            results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])
+            return
+        results.note("stored", [])
         case = Case(
             row=row,
-            made=EpisodeLoader(self.data / "plan.parquet", self.data / "frames", self.config.render)(episode_id),
-            trajectory=TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"]),
+            made=made,
+            trajectory=trajectory,
             copies=copies,
             bank=language.bank if language else None,
         )

@@ -1,0 +1,77 @@
+"""How a command ends: with a status, and with words that a person can act on in place of a traceback."""
+
+from __future__ import annotations
+
+import errno
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from pipeline.errors import PipelineError
+
+GO_ON = "run the same command again: what is finished is kept"
+
+SURROUNDINGS = {
+    errno.ENOSPC: ("the disk is full", f"make room (`python -m pipeline doctor` says how much is needed), and {GO_ON}"),
+    errno.EDQUOT: ("your share of the disk is used up", f"make room, and {GO_ON}"),
+    errno.EROFS: ("this file system cannot be written to", f"mount it for writing, and {GO_ON}"),
+    errno.EACCES: ("you may not read or write this", f"change its permissions or its owner, and {GO_ON}"),
+    errno.EPERM: ("you may not change this", f"change its permissions or its owner, and {GO_ON}"),
+    errno.ENOENT: ("not there", "`dvc repro` makes everything that a stage needs, in order"),
+    errno.ENOTDIR: ("a file is where a folder should be", f"move it away, and {GO_ON}"),
+    errno.EEXIST: ("something else is where a folder should be", f"move it away, and {GO_ON}"),
+    errno.EISDIR: ("a folder is where a file should be", f"move it away, and {GO_ON}"),
+    errno.ELOOP: ("symbolic links lead in a circle", f"remove them, and {GO_ON}"),
+    errno.EIO: ("the disk has an error", "`python -m pipeline verify` says which files are whole"),
+}
+"""What the machine refuses, and what to do about it. Any other fault is one of this project, with its traceback."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: the machine shuts down, or a scheduler's time is over."""
+
+
+def exit_status(command: Callable[[], int]) -> int:
+    """Call a command, and say on the standard error why it ended early.
+
+    Returns:
+        Its own status; 1 for an error; 130 and 143 where it was stopped by SIGINT (Ctrl-C) and SIGTERM.
+    """
+    try:
+        with _terminated():
+            return command()
+    except PipelineError as error:
+        return _told(str(error), 1)
+    except Terminated:
+        return _told(f"stopped; {GO_ON}", 143)
+    except KeyboardInterrupt:
+        return _told(f"stopped; {GO_ON}", 130)
+    except MemoryError:
+        return _told(f"not enough memory\n  try: fewer workers, and {GO_ON}", 1)
+    except OSError as error:
+        if error.errno not in SURROUNDINGS:
+            raise
+        what, remedy = SURROUNDINGS[error.errno]
+        where = error.filename2 or error.filename
+        return _told(str(PipelineError(f"{what} ({error.strerror})", where=where, remedy=remedy)), 1)
+
+
+def _told(message: str, status: int) -> int:
+    print(f"error: {message}" if status == 1 else message, file=sys.stderr)
+    return status
+
+
+@contextmanager
+def _terminated() -> Iterator[None]:
+    def stop(number: int, frame: FrameType | None) -> None:
+        # Only once: what is closed on the way out may take its time.
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise Terminated
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

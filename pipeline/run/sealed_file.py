@@ -1,0 +1,121 @@
+"""An HDF5 file of arrays with checksums: made when it is written, checked when something of it is read.
+
+Every array has its own, so that a reader of some arrays need not read the others. The file has one over the names and
+checksums of all arrays, so that what is missing is seen when the file is opened.
+
+HDF5's own structure has checksums since version 1.10 of the format, all but strings of variable length. On damaged ones
+the library crashes, so all texts are in one array.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+FORMAT = ("v110", "v110")
+"""The oldest and the newest version of HDF5's format that a file may use."""
+
+SEAL = "sha256"
+"""The attribute that holds a checksum, of an array and of the file."""
+
+ATTRIBUTES = "attributes"
+"""The array that holds a file's attributes, as JSON."""
+
+
+class BrokenSealError(OSError):
+    """What was read is not what was written."""
+
+
+class SealedFile:
+    """A file that is open for reading.
+
+    Attributes:
+        attributes: what the file says beside its arrays.
+
+    Raises:
+        BrokenSealError: when its attributes, or the list of its arrays, are not what was written.
+    """
+
+    def __init__(self, file: h5py.File):
+        self._file = file
+        self._arrays = _arrays(file)
+        if _seal_of(file) != _outline(self._arrays):
+            raise BrokenSealError("the list of its arrays is not what was written")
+        self.attributes: Mapping[str, Any] = json.loads(self.array(ATTRIBUTES).tobytes())
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._arrays
+
+    def array(self, name: str) -> NDArray[Any]:
+        """An array, whole.
+
+        Raises:
+            KeyError: when there is none of this name.
+            BrokenSealError: when it is not what was written.
+        """
+        values: NDArray[Any] = self._arrays[name][()]
+        if _seal_of(self._arrays[name]) != _digest(values):
+            raise BrokenSealError(f"{name} is not what was written")
+        return values
+
+    def length(self, name: str) -> int:
+        """Of an array, which is not read."""
+        return len(self._arrays[name])
+
+    def groups(self, name: str) -> list[str]:
+        """Names of the groups in a group."""
+        return sorted(self._file[name])
+
+    def check_all(self) -> None:
+        """Read and check every array.
+
+        Raises:
+            BrokenSealError: when one is not what was written.
+        """
+        for name in self._arrays:
+            self.array(name)
+
+
+@contextmanager
+def sealed(path: Path, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
+    """A new file to fill with arrays; it gets its checksums when the block ends.
+
+    Args:
+        path: where it will lie.
+        attributes: JSON-serialisable, what it says beside its arrays.
+    """
+    with h5py.File(path, "w", libver=FORMAT) as file:
+        yield file
+        file[ATTRIBUTES] = np.frombuffer(json.dumps(dict(attributes), sort_keys=True).encode(), np.uint8)
+        arrays = _arrays(file)
+        for array in arrays.values():
+            array.attrs[SEAL] = np.bytes_(_digest(array[()]))
+        file.attrs[SEAL] = np.bytes_(_outline(arrays))
+
+
+def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
+    arrays: dict[str, h5py.Dataset] = {}
+    # Leaves out what lies in other files.
+    file.visititems(lambda name, item: arrays.update({name: item}) if isinstance(item, h5py.Dataset) else None)
+    return arrays
+
+
+def _seal_of(item: h5py.HLObject) -> str:
+    return bytes(item.attrs.get(SEAL, b"")).decode(errors="replace")
+
+
+def _digest(values: NDArray[Any]) -> str:
+    described = f"{values.dtype.str} {values.shape} ".encode()
+    return sha256(described + np.ascontiguousarray(values).tobytes()).hexdigest()
+
+
+def _outline(arrays: Mapping[str, h5py.Dataset]) -> str:
+    return sha256(json.dumps({name: _seal_of(array) for name, array in arrays.items()}).encode()).hexdigest()

@@ -1,0 +1,59 @@
+"""Compare everything that a run stored with the checksums that it was stored with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.config import Config
+from pipeline.errors import PipelineError
+from pipeline.formats.registry import formats_of
+from pipeline.run.compute import Run
+from pipeline.run.frame_store import FrameStore
+from pipeline.run.store import Store
+from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.validation import run_checks
+
+
+def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:
+    """Read every stored file of a run: trajectories, frames and both datasets.
+
+    Returns:
+        JSON-serialisable: what was read to how many files were ``checked``, and which are ``damaged``, each with what
+        to do about it.
+    """
+    results: dict[str, dict[str, Any]] = {}
+    stores = {
+        "trajectories": TrajectoryStore(config.data / "trajectories"),
+        "frames": FrameStore(config.data / "frames", config.render),
+    }
+    for name, store in stores.items():
+        ids = sorted(path.stem for path in store.root.glob("*.h5"))
+        results[name] = _result(run(_Reader(store), ids, name))
+    for one in formats_of(config.data, config.export, config.render.extras):
+        try:
+            files = run_checks.written(one)
+        except PipelineError as error:
+            results[one.name] = {"checked": 0, "damaged": [str(error)]}
+            continue
+        faults = run(run_checks.unchanged, files, one.title)
+        results[one.name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
+    return results
+
+
+@dataclass(frozen=True)
+class _Reader:
+    store: Store
+
+    def __call__(self, trajectory_id: str) -> list[str]:
+        try:
+            self.store.check_all(trajectory_id)
+        except PipelineError as error:
+            return [str(error)]
+        return []
+
+
+def _result(findings: Iterable[Sequence[str]]) -> dict[str, Any]:
+    listed = list(findings)
+    return {"checked": len(listed), "damaged": [finding for found in listed for finding in found]}
