@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 import yaml
 from conftest import MILK, STOVE
@@ -25,9 +24,11 @@ from pipeline.axes.layout import LayoutAxis
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
-from pipeline.formats.registry import FORMATS, formats_of
+from pipeline.formats.registry import FORMATS, columns, formats_of
 from pipeline.publish import card
+from pipeline.run import manifest
 from pipeline.seeding import rng
+from pipeline.tables import write_table
 from pipeline.types import Task
 
 NAME = "libero_tiny"
@@ -79,7 +80,7 @@ VALIDATION: dict[str, dict[str, Any]] = {"gripper": {"checked": 7, "findings": [
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
     """The folder of a run, as far as the card reads it."""
-    pq.write_table(pa.Table.from_pylist(ROWS), tmp_path / "manifest.parquet")
+    write_rows(tmp_path, ROWS)
     column = list(range(1, 8))
     for name, report in {
         "leakage.json": {
@@ -102,6 +103,10 @@ def data(tmp_path: Path) -> Path:
     clients = {name: {"where": "there", "command": f"train --with {name}"} for name in ("openvla_oft", "openpi")}
     (tmp_path / "finetune" / "finetune.yaml").write_text(yaml.safe_dump({"clients": clients}))
     return tmp_path
+
+
+def write_rows(data: Path, rows: list[dict[str, Any]]) -> None:
+    write_table(pa.Table.from_pylist(rows, schema=manifest.schema(columns())), data / "manifest.parquet")
 
 
 def write(data: Path) -> None:
@@ -222,7 +227,7 @@ def test_everything_shown_is_attributed(data: Path) -> None:
 def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, free: bool) -> None:
     coverings = tuple(covering.model_copy(update={"licence": licence}) for covering in BACKGROUND.coverings)
     rows = [*ROWS[:2], row("background", BACKGROUND.model_copy(update={"coverings": coverings}))]
-    pq.write_table(pa.Table.from_pylist(rows), data / "manifest.parquet")
+    write_rows(data, rows)
     text = written(data, "rlds")
     assert metadata_of(text)["license"] == ("cc-by-4.0" if free else "other")
     assert ("licensed under [CC BY 4.0]" in text) == free
@@ -236,6 +241,6 @@ def test_says_what_is_missing(data: Path, name: str) -> None:
 
 
 def test_nothing_kept_is_refused(data: Path) -> None:
-    pq.write_table(pa.Table.from_pylist([ROWS[6]]), data / "manifest.parquet")
+    write_rows(data, [ROWS[6]])
     with pytest.raises(PipelineError, match="no episode was kept"):
         write(data)

@@ -19,6 +19,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.run import plan
+from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Verdict
 
@@ -85,8 +86,25 @@ def test_round_trip(tmp_path: Path) -> None:
     plan.write(rows, tmp_path / "again.parquet")
     assert (tmp_path / "plan.parquet").read_bytes() == (tmp_path / "again.parquet").read_bytes()
     (tmp_path / "plan.parquet").write_bytes(b"PAR1 cut short")
-    with pytest.raises(PipelineError, match=r"plan\.parquet: not a readable plan"):
+    with pytest.raises(PipelineError, match=r"plan\.parquet: damaged"):
         plan.read(tmp_path / "plan.parquet")
+
+
+def test_no_flipped_bit_is_read(tmp_path: Path) -> None:
+    """Either the plan is refused, or it is the one that was written."""
+    rows, file = plan.make(entries(), config(), REPLAY, NO_TESTS), tmp_path / "plan.parquet"
+    plan.write(rows, file)
+    content, refused = file.read_bytes(), 0
+    footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    for place in rng("test_plan").integers([0, footer], len(content), size=(100, 2)).ravel():
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(place) % 8
+        file.write_bytes(damaged)
+        try:
+            assert plan.read(file) == rows
+        except PipelineError:
+            refused += 1
+    assert refused > 100
 
 
 def test_a_replay_setting_is_part_of_the_identity() -> None:

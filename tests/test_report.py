@@ -30,6 +30,7 @@ from pipeline.rendering.jpeg import encode
 from pipeline.rendering.mp4 import VIDEO_BYTES
 from pipeline.run import manifest
 from pipeline.seeding import rng
+from pipeline.tables import write_table
 from pipeline.testset import benchmark
 
 LIMIT_BYTES = 15_000_000
@@ -176,7 +177,7 @@ def test_a_run_that_kept_nothing_is_refused(
     table = pq.read_table(finished / "manifest.parquet")
     lost = pa.array([False] * len(table))
     column = table.schema.get_field_index("kept")
-    pq.write_table(table.set_column(column, "kept", lost), tmp_path / config.data / "manifest.parquet")
+    write_table(table.set_column(column, "kept", lost), tmp_path / config.data / "manifest.parquet")
     shutil.copy(finished / "leakage.json", tmp_path / config.data)
     monkeypatch.chdir(tmp_path)
     with pytest.raises(PipelineError, match="no episode was kept"):
