@@ -10,9 +10,11 @@ from typing import Any
 
 import yaml
 
+from pipeline.arguments import positive
 from pipeline.axes import Axes
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.evaluation import analyses
+from pipeline.evaluation import command as evaluation_command
 from pipeline.exit_status import exit_status
 from pipeline.files import replaced
 from pipeline.formats.registry import FORMATS, formats_of
@@ -89,45 +91,6 @@ def _expand(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
-    # The simulator takes seconds to import, which the other commands can do without.
-    from pipeline.evaluation.evaluate import PolicyConfig, evaluate
-    from pipeline.evaluation.settings import Settings
-    from pipeline.evaluation.tasks import Selection
-
-    selection = Selection(
-        source=arguments.source,
-        file=arguments.tasks_from,
-        suites=tuple(arguments.suite),
-        axes=tuple(arguments.axis),
-        components=tuple(arguments.component),
-        levels=tuple(arguments.level),
-        tasks=tuple(arguments.task),
-        episodes=arguments.episodes,
-        subset=arguments.subset,
-        seed=arguments.seed,
-    )
-    settings = Settings(
-        prompt=arguments.prompt,
-        seed=arguments.seed,
-        initial_states=arguments.initial_states,
-        black=arguments.black,
-        plan=arguments.plan,
-    )
-    policy = PolicyConfig(
-        kind=arguments.replay or ("checkpoint" if arguments.checkpoint else "server"),
-        address=str(arguments.checkpoint or arguments.server or ""),
-        label=arguments.label,
-        look_every=arguments.look_every,
-        timeout_s=arguments.timeout,
-    )
-    compute = ComputeConfig(cluster="loop" if arguments.workers == 1 else "local", workers=arguments.workers)
-    with runner(compute, arguments.out) as run:
-        found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets)
-    print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
-    return 0
-
-
 def _evaluation_report(arguments: argparse.Namespace) -> int:
     # The benchmark's code takes seconds to import, which the other commands can do without.
     from pipeline.evaluation.merging import read
@@ -192,13 +155,6 @@ def _schema(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number} is less than 1")
-    return number
-
-
 def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="python -m pipeline",
@@ -259,7 +215,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("bddl_file", type=Path, metavar="BDDL_FILE", help="the task, <suite>/<task>.bddl")
     command.add_argument("--out", type=Path, required=True, help="bank to extend or to begin, such as bank.yaml")
     command.add_argument(
-        "--per-class", type=_positive, default=9, metavar="N", help="rewrites of each class wanted (default: 9)"
+        "--per-class", type=positive, default=9, metavar="N", help="rewrites of each class wanted (default: 9)"
     )
     command.add_argument(
         "--endpoint",
@@ -293,7 +249,7 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("out", type=Path, help="folder to use as demos.root afterwards")
     command.add_argument(
-        "--per-task", type=_positive, default=10, metavar="N", help="demonstrations of each task (default: 10)"
+        "--per-task", type=positive, default=10, metavar="N", help="demonstrations of each task (default: 10)"
     )
     command.add_argument(
         "--tasks",
@@ -305,94 +261,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
     command.set_defaults(run=_expand)
 
-    command = commands.add_parser(
-        "evaluate",
-        help="run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes",
-        description="Writes one file for each episode, and summary.json with success rates and their 95 % intervals. "
-        "Run again after a kill, it goes on. The policy is a model server of vla-eval (started by you), or a "
-        "checkpoint of lerobot on disk.",
-    )
-    command.add_argument("out", type=Path, metavar="DIR", help="folder of the results")
-    acting = command.add_mutually_exclusive_group(required=True)
-    acting.add_argument("--server", metavar="URL", help="address of a model server, such as ws://localhost:8000")
-    acting.add_argument("--checkpoint", type=Path, metavar="DIR", help="a policy that lerobot saved")
-    acting.add_argument(
-        "--replay",
-        nargs="?",
-        choices=("open_loop", "tracked"),
-        const="open_loop",
-        help="the demonstrations, as a check: their own actions (open_loop, as without a value), or their paths, "
-        "followed by feedback (tracked)",
-    )
-    command.add_argument(
-        "--source",
-        choices=("libero", "libero_plus", "own", "pairs", "goals"),
-        default="libero",
-        help="of the tasks (default: libero)",
-    )
-    command.add_argument(
-        "--tasks-from", type=Path, metavar="FILE", help="in place of a source, a list that `analyse construct` wrote"
-    )
-    command.add_argument(
-        "--plan", type=Path, metavar="FILE", help="draw held-out draws anew that overlap with this training plan"
-    )
-    command.add_argument("--suite", nargs="+", default=benchmark.SUITES, metavar="SUITE", help="of these suites only")
-    command.add_argument("--axis", nargs="+", default=(), metavar="AXIS", help="of these axes only")
-    command.add_argument("--component", nargs="+", default=(), metavar="NAME", help="of these components only")
-    command.add_argument("--level", nargs="+", type=int, default=(), metavar="N", help="of these levels only")
-    command.add_argument(
-        "--task", nargs="+", default=(), metavar="PATTERN", help="named so, or perturbing one so named"
-    )
-    command.add_argument("--subset", type=_positive, metavar="N", help="so many, spread evenly over all of these")
-    command.add_argument(
-        "--episodes", type=_positive, default=1, metavar="N", help="initial states or draws of each task (default: 1)"
-    )
-    command.add_argument(
-        "--prompt",
-        choices=("clean", "benchmark", "blank"),
-        default="clean",
-        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name; "
-        "or say nothing at all",
-    )
-    command.add_argument(
-        "--black",
-        choices=("none", "agentview", "all"),
-        default="none",
-        help="show the policy black frames in place of the agent view, or of all views (default: none)",
-    )
-    command.add_argument(
-        "--initial-states",
-        choices=("libero", "demonstration"),
-        default="libero",
-        help="LIBERO's own (default), or the first state of the starter set's demonstration",
-    )
-    command.add_argument("--seed", type=int, default=0, help="of the subset and of every draw (default: 0)")
-    command.add_argument("--label", default="", help="name of the policy in the results (default: its address)")
-    command.add_argument(
-        "--look-every", type=_positive, default=1, metavar="N", help="the server uses one observation in N (default: 1)"
-    )
-    command.add_argument(
-        "--assets",
-        type=Path,
-        metavar="DIR",
-        help="LIBERO-Plus's unpacked asset archive, which its light, layout and most of its background tasks need",
-    )
-    command.add_argument(
-        "--timeout",
-        type=_positive,
-        default=120,
-        metavar="S",
-        help="seconds that a server's answer may take (default: 120)",
-    )
-    command.add_argument("--workers", type=_positive, metavar="N", help="processes (default: one for each core)")
-    command.add_argument(
-        "--videos",
-        choices=("none", "failures", "all"),
-        default="none",
-        help="of which episodes to keep a video, of the frames that the policy looked at and the last (default: none)",
-    )
-    command.set_defaults(run=_evaluate)
-
+    evaluation_command.add_commands(commands)
     analyses.add_commands(commands)
 
     command = commands.add_parser(

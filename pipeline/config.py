@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -57,7 +58,7 @@ class PlanConfig(Frozen):
         reserve: share of further candidates to draw of each task, rounded up, used in order where an episode fails.
     """
 
-    seed: int
+    seed: int = Field(ge=-(2**63), lt=2**63)
     axes: Axes
     episodes: dict[str, Count]
     reserve: float = Field(default=0.0, ge=0.0, le=10.0)
@@ -166,18 +167,20 @@ def load(path: Path) -> Config:
         PipelineError: naming the file, every field that is wrong, and what would have worked.
     """
     try:
-        text = path.read_text()
-    except OSError as error:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
         raise PipelineError(
-            "cannot read the configuration", where=path, remedy=f"one of {sorted(map(str, Path('configs').glob('*')))}"
+            f"cannot read the configuration ({error})",
+            where=path,
+            remedy=f"one of {sorted(map(str, Path('configs').glob('*')))}",
         ) from error
     try:
         return Config.model_validate(yaml.safe_load(text))
-    except yaml.YAMLError as error:
-        raise PipelineError(f"not valid YAML: {error}", where=path) from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise PipelineError(f"not valid YAML: {error}", where=path, expected="a file like those of configs/") from error
     except ValidationError as error:
         faults = [
-            f"{'.'.join(map(str, fault['loc'])) or 'top level'}: {fault['msg']} (got {fault['input']!r:.80})"
+            f"{'.'.join(map(str, fault['loc'])) or 'top level'}: {fault['msg']} (got {reprlib.repr(fault['input'])})"
             for fault in error.errors()
         ]
         raise PipelineError(

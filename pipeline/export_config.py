@@ -6,7 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[int, Field(ge=1, le=1_000_000)]
+"""More than anybody has a use for would fill memory before anything is said."""
 Share = Annotated[float, Field(ge=0.0, le=0.5)]
 
 

@@ -32,6 +32,9 @@ from pipeline.testset.benchmark import fetch_testset
 from pipeline.types import Demo, Task, Trajectory
 
 REPOSITORY = Path(__file__).parent.parent
+SCRIPTS = Path(sys.executable).parent
+IN_SCRIPTS = {**os.environ, "PATH": f"{SCRIPTS}{os.pathsep}{os.environ['PATH']}"}
+"""For DVC, whose stages call `python`."""
 
 LIBC = ctypes.CDLL("libc.so.6")
 M_MMAP_THRESHOLD = -3
@@ -217,21 +220,28 @@ def finished(short_demos: Path, once: Once) -> Path:
 
 
 def _run_in_clone(short_demos: Path, clone: Path) -> None:
-    for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml", "requirements.lock", ".dvcignore"):
-        source = REPOSITORY / name
-        (shutil.copytree if source.is_dir() else shutil.copy)(source, clone / name)
-    (clone / "configs").mkdir()
-    (clone / "configs" / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(short_demos)))
-    (clone / "params.yaml").write_text("run: tiny\n")
-    shutil.copytree(REPOSITORY / ".dvc", clone / ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
-    link_testset(clone)
-    subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
+    in_a_clone(tiny_config(short_demos), clone)
     done = dvc(clone, "repro")
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def in_a_clone(config: dict[str, object], clone: Path) -> None:
+    """A copy of the repository, as far as a run needs it, with a configuration to be run."""
+    for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml", "requirements.lock", ".dvcignore"):
+        source, target = REPOSITORY / name, clone / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, target)
+    (clone / "configs").mkdir()
+    (clone / "configs" / "tiny.yaml").write_text(yaml.safe_dump(config))
+    (clone / "params.yaml").write_text("run: tiny\n")
+    shutil.copytree(REPOSITORY / ".dvc", clone / ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
+    link_testset(clone)
+    subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)
+
+
 def dvc(clone: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    scripts = Path(sys.executable).parent
-    environment = {**os.environ, "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}"}
-    command = [str(scripts / "dvc"), *arguments]
-    return subprocess.run(command, cwd=clone, capture_output=True, text=True, check=False, env=environment)
+    command = [str(SCRIPTS / "dvc"), *arguments]
+    return subprocess.run(command, cwd=clone, capture_output=True, text=True, check=False, env=IN_SCRIPTS)

@@ -15,7 +15,6 @@ from conftest import MILK, STOVE, starter_demo
 
 from pipeline.axes import Axes
 from pipeline.axes.layout import LayoutAxis
-from pipeline.axes.robot import RobotAxis
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import hdf5
 from pipeline.physics.environment import Environment, UnusableSceneError
@@ -113,9 +112,9 @@ def test_each_bad_demonstration_is_a_verdict(
     demos = DemosConfig(source="hdf5", root=root, tasks=(NAME,))
     index = demos.index()
     assert not index.problems
-    axes = Axes(robot=RobotAxis(levels=(1,)), layout=LayoutAxis(levels=(1,)))
     count = len(index.entries)
-    wanted = PlanConfig(seed=0, axes=axes, episodes={"robot": count, "layout": count})
+    axes = Axes(layout=LayoutAxis(levels=(1,)))
+    wanted = PlanConfig(seed=0, axes=axes, episodes={"layout": count})
     rows = plan.make(index.entries, wanted, REPLAY, TestSet(()))
     folder = tmp_path / "trajectories"
     verdicts = replay_plan(rows, demos, REPLAY, folder, loop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -66,6 +67,11 @@ def test_schema_file_is_that_of_the_code() -> None:
             "language with added objects needs distraction or paraphrase",
         ),
         ({"camera": {"distance": {"distance_scale": [[[2, 1]]] * 5}}}, ("plan", "axes"), "with low <= high"),
+        ({"camera": {"distance": {"distance_scale": [[[0, 1]]] * 5}}}, ("plan", "axes"), "a positive multiple"),
+        ({"camera": {"spherical": {"elevation_deg": [[0, math.nan]]}}}, ("plan", "axes"), "finite number"),
+        ({"robot": {"norm_rad": [0.1, 0.2, 0.3, 0.4, math.inf]}}, ("plan", "axes"), "finite number"),
+        (2**63, ("plan", "seed"), "plan.seed: Input should be less than"),
+        ({"camera": 10**9}, ("plan", "episodes"), "plan.episodes.camera: Input should be less than"),
         ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: Extra inputs"),
         ("/tmp", ("demos", "root"), "root goes with source: hdf5"),
         ("carrier pigeon", ("compute",), "compute"),
@@ -82,9 +88,22 @@ def test_faults_name_file_and_field(tmp_path: Path, value: Any, keys: tuple[str,
 def test_missing_and_broken_files(tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="cannot read the configuration"):
         load(tmp_path / "no.yaml")
-    (tmp_path / "broken.yaml").write_text("plan: [1,\n")
-    with pytest.raises(PipelineError, match="not valid YAML"):
-        load(tmp_path / "broken.yaml")
+
+    for text in ("plan: [1,\n", "[" * 5000 + "]" * 5000):
+        (tmp_path / "broken.yaml").write_text(text)
+        with pytest.raises(PipelineError, match="not valid YAML"):
+            load(tmp_path / "broken.yaml")
+    (tmp_path / "latin.yaml").write_bytes("name: übung\n".encode("latin-1"))
+    with pytest.raises(PipelineError, match="cannot read the configuration"):
+        load(tmp_path / "latin.yaml")
+
+
+def test_aliases_that_unfold_without_end_are_refused_at_once(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]
+    (tmp_path / "bomb.yaml").write_text("\n".join([*lines, "name: *a11\n"]))
+    with pytest.raises(PipelineError, match="name: Input should be a valid string"):
+        load(tmp_path / "bomb.yaml")
 
 
 def test_unknown_task_pattern_names_the_closest(tmp_path: Path) -> None:

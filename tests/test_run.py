@@ -1,15 +1,12 @@
-"""Whole runs on real demonstrations: both datasets and the manifest agree; a killed run resumes to the same bytes."""
+"""Whole runs on real demonstrations: both datasets and the manifest agree, and nothing is made twice."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +15,7 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 import yaml
-from conftest import REPOSITORY, STOVE, dvc, run_stages, tiny_config
+from conftest import STOVE, dvc, run_stages, tiny_config
 from PIL import Image
 from synthetic import records
 
@@ -188,47 +185,6 @@ def test_lerobots_own_training_runs_on_it(finished: Path, tmp_path: Path) -> Non
     assert done.returncode == 0, done.stderr
     assert "step:2" in done.stderr
     assert "loss:nan" not in done.stderr
-
-
-def hashes(data: Path) -> dict[str, str]:
-    files = (path for path in sorted(data.rglob("*")) if path.is_file() and path.name != ".gitignore")
-    return {str(path.relative_to(data)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def test_killed_and_resumed_with_another_number_of_workers(finished: Path, short_demos: Path, tmp_path: Path) -> None:
-    config = tiny_config(short_demos)
-    data = tmp_path / "data" / "tiny"
-    data.mkdir(parents=True)
-    for name in ("configuration.json", "plan.parquet"):
-        shutil.copy(finished / name, data)
-    file = tmp_path / "configs" / "tiny.yaml"
-    file.parent.mkdir()
-    for stage, store in (("replay", "trajectories"), ("render", "frames")):
-        folder, whole = data / store, hashes(finished / store)
-        # Two files are left to make: it is killed after the first of them.
-        shutil.copytree(finished / store, folder)
-        *_, one, other = sorted(folder.glob("*.h5"), key=lambda path: path.stat().st_size, reverse=True)
-        for path in (one, other, folder / "index.parquet"):
-            path.unlink()
-        kept = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
-        file.write_text(yaml.safe_dump(config | {"compute": {"cluster": "local", "workers": 1}}))
-        command = [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(file)]
-        killed = subprocess.Popen(
-            command, cwd=tmp_path, start_new_session=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        deadline = time.monotonic() + 120
-        while len(list(folder.glob("*.h5"))) == len(kept) and time.monotonic() < deadline:
-            time.sleep(0.02)
-            assert killed.poll() is None, f"{stage} ended before it could be killed"
-        os.killpg(killed.pid, signal.SIGKILL)
-        killed.wait()
-        finished_before = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
-        assert kept.items() < finished_before.items()
-        assert len(finished_before) == len(kept) + 1, "killed in the middle"
-        run_stages(tmp_path, config, [stage])
-        after = {path.name: path.stat().st_mtime_ns for path in folder.glob("*.h5")}
-        assert finished_before.items() <= after.items(), "what was finished is not made again"
-        assert hashes(folder) == whole
 
 
 def test_damaged_shards_are_made_again(finished: Path, short_demos: Path, tmp_path: Path) -> None:

@@ -33,6 +33,7 @@ FLOORS = (
     "tables",
     "files",
     "types",
+    "arguments",
     "exit_status",
     "errors",
 )

@@ -292,8 +292,11 @@ def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -
     assert not any(result["damaged"] for result in results.values())
 
 
-def test_a_changed_dataset_is_not_read_any_further(finished: Path, tmp_path: Path) -> None:
+def test_a_changed_dataset_is_not_read_any_further(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     data = tmp_path / "data" / "tiny"
+    monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])
     shutil.copytree(finished, data)
     for name in ("rlds", "lerobot"):
         flip_a_bit(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))

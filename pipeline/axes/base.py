@@ -36,9 +36,9 @@ class Layer(IntEnum):
 
 
 class Frozen(BaseModel):
-    """A record that cannot change and refuses fields it does not know."""
+    """A record that cannot change and refuses fields it does not know, and numbers that are not finite."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 Level = Literal[1, 2, 3, 4, 5]

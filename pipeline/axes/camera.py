@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.axes.base import Axis, Frozen, Intervals, RenderPerturbation, draw
 from pipeline.types import Floats, Task
@@ -130,6 +130,14 @@ def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
     return _embed(*distinct.T), which.reshape(-1)
 
 
+def _positive(intervals: Intervals) -> Intervals:
+    if any(low <= 0 for low, _ in intervals):
+        raise ValueError("a distance is a positive multiple of the nominal one")
+    return intervals
+
+
+Scales = Annotated[Intervals, AfterValidator(_positive)]
+
 ByLevel = tuple[Intervals, Intervals, Intervals, Intervals, Intervals]
 """What to draw from at each level, weakest first."""
 
@@ -141,7 +149,7 @@ def _both_ways(low: float, high: float) -> Intervals:
 class DistanceRange(Frozen):
     """The test set's scales are 1.15 and 1.19 to 2.00."""
 
-    distance_scale: ByLevel = (
+    distance_scale: tuple[Scales, Scales, Scales, Scales, Scales] = (
         ((1.08, 1.2),),
         ((1.2, 1.4),),
         ((1.4, 1.6),),
@@ -195,7 +203,7 @@ class AsideRange(Frozen):
     """
 
     elevation_deg: Intervals = ((-8.0, -5.1), (5.1, 9.9))
-    distance_scale: Intervals = ((0.87, 0.914), (1.094, 1.18))
+    distance_scale: Scales = ((0.87, 0.914), (1.094, 1.18))
     turn_deg: Intervals = ((5.1, 8.0),)
 
     def draw(self, rng: np.random.Generator, kind: Aside) -> dict[str, float]:

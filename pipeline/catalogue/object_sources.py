@@ -193,7 +193,14 @@ def _copy(mjcf: Path, out: Path) -> None:
     try:
         tree = ET.parse(mjcf)
         for number, asset in enumerate(tree.iterfind("asset/*[@file]")):
-            file = mjcf.parent / asset.attrib["file"]
+            file = (mjcf.parent / asset.attrib["file"]).resolve()
+            if not file.is_relative_to(mjcf.parent.resolve()):
+                raise PipelineError(
+                    f"the file {asset.attrib['file']} lies elsewhere",
+                    where=mjcf,
+                    expected="files beside the model",
+                    remedy="copy it beside the model, and name it from there",
+                )
             asset.set("file", f"{number}{file.suffix}")
             shutil.copyfile(file, out / asset.attrib["file"])
     except (OSError, ET.ParseError) as error:

@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -17,6 +18,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from pipeline import seeding
 from pipeline.catalogue import procedural, wheels
@@ -58,6 +60,11 @@ _LICENCES = {
     "metaworld": "MIT (metaworld)",
     "gymnasium-robotics": "MIT, parts Apache-2.0 (gymnasium-robotics)",
 }
+LARGEST_PX = 64_000_000
+"""Of an image, 8,000 pixels square."""
+
+REPLACE = "replace it or take it away"
+
 _IMAGES = (".png", ".jpg", ".jpeg")
 
 
@@ -172,7 +179,20 @@ def _images(root: Path) -> tuple[Path, ...]:
 
 
 def _decode(content: bytes, where: object) -> Frame:
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    try:
+        # Reads the header only: a small file may hold more pixels than fit into memory.
+        with Image.open(io.BytesIO(content)) as header:
+            width_px, height_px = header.size
+        if width_px * height_px > LARGEST_PX:
+            raise PipelineError(
+                f"{width_px} x {height_px} pixels",
+                where=where,
+                expected=f"at most {LARGEST_PX}",
+                remedy="make it smaller",
+            )
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, cv2.error) as error:
+        raise PipelineError(f"not a readable image ({error})", where=where, remedy=REPLACE) from error
     if image is None:
-        raise PipelineError("not a readable image", where=where, remedy="replace it or take it away")
+        raise PipelineError("not a readable image", where=where, remedy=REPLACE)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)

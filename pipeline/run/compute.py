@@ -86,9 +86,11 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
     else:
         try:
             client = Client(config.cluster, timeout=CONNECT_S)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             raise PipelineError(
-                "no Dask scheduler answers", where=config.cluster, remedy="start one, or set compute.cluster: local"
+                f"no Dask scheduler answers ({error})",
+                where=config.cluster,
+                remedy="start one, or set compute.cluster: local",
             ) from error
         with client, joined(client, folder) as workplace:
             yield _on(client, workplace)

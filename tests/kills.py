@@ -1,0 +1,213 @@
+"""Kills a run at pseudo-random moments, and asks whether it ends like one that was left alone.
+
+    python tests/kills.py [--kills 50] [--seed 0]
+
+Two folders get the same configuration. In one `dvc repro` runs undisturbed. In the other it is killed by SIGKILL again
+and again, after a time that is drawn: everything at once, the stage's process alone, or one of its workers, which the
+run has to survive. In the end both must hold the same files with the same bytes, and no file that was whole at a kill
+may have been made again. The last line is JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import psutil
+from conftest import IN_SCRIPTS, SCRIPTS, in_a_clone
+
+LONGEST_S = 20.0
+"""A run is killed this long after it was started, or earlier."""
+ALONE_S = 60.0
+"""So long processes may live on after what started them was killed."""
+
+Victim = Literal["everything", "stage", "worker"]
+
+STARTER: dict[str, object] = {
+    "name": "tiny",
+    "demos": {"source": "starter", "tasks": ["libero_goal/turn_on_the_stove"]},
+    "plan": {"seed": 7, "axes": {"light": {}, "robot": {}}, "episodes": {"light": 1, "robot": 1}},
+    "replay": {"mode": "auto"},
+    "export": {"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "parts": 3}},
+    "compute": {"cluster": "local", "workers": 2},
+}
+
+
+@dataclass
+class Killed:
+    """What became of the kills.
+
+    Attributes:
+        kills: victim, and the stage that ran, to how often.
+        runs: how often the run came to its end and was begun again, as there were kills left.
+        faults: what should not be.
+    """
+
+    kills: Counter[str] = field(default_factory=Counter)
+    runs: int = 0
+    faults: list[str] = field(default_factory=list)
+
+
+def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
+    """Kill the run of a clone so often, then let it end."""
+    rng, result = random.Random(seed), Killed()
+    whole: dict[Path, int] = {}
+    while result.kills.total() < kills:
+        run = _started(clone)
+        victim: Victim = rng.choice(("everything", "stage", "worker"))
+        _wait(run, rng.uniform(0.0, LONGEST_S))
+        if run.poll() is not None:
+            result.runs += 1
+            result.faults += [] if run.returncode == 0 else [f"the run ended with {run.returncode}"]
+            # From the beginning, but for the plan and the tables of the first run.
+            for folder in ("trajectories", "frames", "rlds", "lerobot"):
+                shutil.rmtree(clone / "data" / "tiny" / folder)
+            whole = {}
+            continue
+        killed = _kill(run, victim)
+        result.kills[killed] += 1
+        if killed.startswith("worker"):
+            _wait(run, LONGEST_S)
+        result.faults += _end(run)
+        stamps = {file: file.stat().st_mtime_ns for file in _stored(clone)}
+        result.faults += [f"{file.name} was made again" for file, stamp in whole.items() if stamps.get(file) != stamp]
+        whole = stamps
+    run = _started(clone)
+    if run.wait() != 0:
+        result.faults.append(f"the last run ended with {run.returncode}")
+    remade = [file.name for file, stamp in whole.items() if not file.exists() or file.stat().st_mtime_ns != stamp]
+    result.faults += [f"{name} was made again" for name in remade]
+    return result
+
+
+def _started(clone: Path) -> subprocess.Popen[bytes]:
+    with (clone.parent / f"{clone.name}.log").open("ab") as log:
+        command = [str(SCRIPTS / "dvc"), "repro"]
+        return subprocess.Popen(command, cwd=clone, env=IN_SCRIPTS, start_new_session=True, stdout=log, stderr=log)
+
+
+def _wait(run: subprocess.Popen[bytes], seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while run.poll() is None and time.monotonic() < end:
+        time.sleep(0.02)
+
+
+def _kill(run: subprocess.Popen[bytes], victim: Victim) -> str:
+    """Kill a victim, or everything where there is no such one at the moment; says what, and in which stage."""
+    below = psutil.Process(run.pid).children(recursive=True)
+    with_commands = [(process, _command(process)) for process in below]
+    stages = [(process, words) for process, words in with_commands if len(words) > 1 and words[1].startswith("stages/")]
+    stage = Path(stages[0][1][1]).stem if stages else "dvc"
+    workers = [process for process, words in with_commands if any("spawn_main" in word for word in words)]
+    chosen = {"everything": [], "stage": [process for process, _ in stages], "worker": workers}[victim]
+    if not chosen:
+        os.killpg(run.pid, signal.SIGKILL)
+        return f"everything in {stage}"
+    chosen[-1].kill()
+    return f"{victim} in {stage}"
+
+
+def _command(process: psutil.Process) -> list[str]:
+    try:
+        command: list[str] = process.cmdline()
+        return command
+    except psutil.Error:
+        return []
+
+
+def _end(run: subprocess.Popen[bytes]) -> list[str]:
+    """Wait until no process of the run is left, or kill it where it still runs after the death of a worker."""
+    if run.poll() is None and _alive(run.pid):
+        os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    end = time.monotonic() + ALONE_S
+    while _alive(run.pid) and time.monotonic() < end:
+        time.sleep(0.05)
+    left = _alive(run.pid)
+    for process in left:
+        process.kill()
+    return [f"{len(left)} processes lived on"] if left else []
+
+
+def _alive(session: int) -> list[psutil.Process]:
+    processes = []
+    for process in psutil.process_iter():
+        try:
+            if os.getsid(process.pid) == session and process.status() != psutil.STATUS_ZOMBIE:
+                processes.append(process)
+        except (ProcessLookupError, psutil.Error):
+            continue
+    return processes
+
+
+def _stored(clone: Path) -> Iterator[Path]:
+    for folder in ("trajectories", "frames"):
+        yield from (clone / "data" / "tiny" / folder).glob("*.h5")
+
+
+def contents(clone: Path) -> dict[str, str]:
+    """Every file of a clone, but for DVC's own records."""
+    files = (file for file in clone.rglob("*") if file.is_file() and not file.is_symlink())
+    return {
+        path: hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in files
+        if not (path := file.relative_to(clone).as_posix()).startswith((".dvc/", ".git/")) and "__pycache__" not in path
+    }
+
+
+def compared(undisturbed: Path, disturbed: Path) -> list[str]:
+    """What differs between the files of two clones."""
+    one, other = contents(undisturbed), contents(disturbed)
+    return [
+        f"{path} is {'missing' if path not in other else 'left over' if path not in one else 'another'}"
+        for path in sorted(one.keys() | other.keys())
+        if one.get(path) != other.get(path)
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--folder", type=Path, help="where the clones go (default: a temporary folder)")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = arguments.folder or Path(temporary)
+        undisturbed, disturbed = (folder / name for name in ("undisturbed", "disturbed"))
+        for clone in (undisturbed, disturbed):
+            in_a_clone(STARTER, clone)
+        start = time.monotonic()
+        if _started(undisturbed).wait() != 0:
+            raise SystemExit((folder / "undisturbed.log").read_text())
+        alone_s = time.monotonic() - start
+        result = kill_and_resume(disturbed, arguments.kills, arguments.seed)
+        faults = result.faults + compared(undisturbed, disturbed)
+        for fault in faults:
+            print(fault)
+        figures: dict[str, Any] = {
+            "kills": result.kills.total(),
+            "by_victim_and_stage": dict(sorted(result.kills.items())),
+            "runs_begun_again": result.runs,
+            "undisturbed_s": round(alone_s, 1),
+            "with_kills_s": round(time.monotonic() - start - alone_s, 1),
+            "faults": len(faults),
+        }
+        print(json.dumps(figures))
+        raise SystemExit(bool(faults))
+
+
+if __name__ == "__main__":
+    main()

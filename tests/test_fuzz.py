@@ -1,0 +1,20 @@
+"""Damaged and hostile files are refused with words; `python tests/fuzz.py` tries a thousand."""
+
+from __future__ import annotations
+
+import random
+from datetime import date
+
+import pytest
+from fuzz import KINDS, check
+
+KINDS_A_DAY, CASES = 4, 40
+
+
+@pytest.mark.slow
+def test_damaged_files_are_refused_or_harmless() -> None:
+    seed = date.today().toordinal()
+    kinds = random.Random(seed).sample(sorted(KINDS), KINDS_A_DAY)
+    outcomes, faults = check(kinds, CASES, seed)
+    assert faults == [], f"python tests/fuzz.py --seed {seed} --cases {CASES} --kinds {' '.join(kinds)}"
+    assert outcomes.total() >= CASES

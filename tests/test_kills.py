@@ -1,0 +1,31 @@
+"""A run that is killed anywhere ends as if it was not; `python tests/kills.py` does this fifty times."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import date
+from pathlib import Path
+
+import pytest
+import yaml
+from kills import compared, kill_and_resume
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_anywhere_ends_like_one_that_is_not(finished: Path, tmp_path: Path) -> None:
+    undisturbed, clone = finished.parent.parent, tmp_path / "clone"
+    shutil.copytree(undisturbed, clone, symlinks=True)
+    file = clone / "configs" / "tiny.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"compute": {"cluster": "local", "workers": 2}}))
+    for folder in ("trajectories", "frames"):
+        store = clone / "data" / "tiny" / folder
+        (store / "index.parquet").unlink()
+        for made_last in sorted(store.glob("*.h5"), key=lambda path: path.stat().st_size)[:2]:
+            made_last.unlink()
+    for name in ("rlds", "lerobot"):
+        shutil.rmtree(clone / "data" / "tiny" / name)
+    seed = date.today().toordinal()
+    killed = kill_and_resume(clone, kills=2, seed=seed)
+    assert killed.faults == [], f"repeat with seed {seed}"
+    assert killed.kills.total() == 2
+    assert compared(undisturbed, clone) == ["configs/tiny.yaml is another"], f"repeat with seed {seed}"
