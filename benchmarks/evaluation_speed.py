@@ -3,10 +3,11 @@
     nice -n 10 python benchmarks/evaluation_speed.py [--tasks 'libero_goal/turn_on_the_stove' ...] [--states 2]
         [--steps 120]
 
-The server replays demonstrations, an action at a time. The same episodes run in turn as the harness runs them, by ours
-with a look at every step, and by ours with a look in eight, as when the policy's chunk is known; each with the agent
-view alone, which is all that the harness sends by default though it renders both, and with both views. Episodes end
-after so many steps in all ways. The last line is the result as JSON, in wall time and in CPU time of this process.
+The server replays demonstrations. The same episodes run in turn as the harness runs them, an action for each
+observation; by ours in the same way; and by ours with answers in chunks of eight, so that it looks and asks once in
+eight steps. Each with the agent view alone, which is all that the harness sends by default though it renders both, and
+with both views. Episodes end after so many steps in all ways. The last line is the result as JSON, in wall time and in
+CPU time of this process.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import json
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from pipeline import gl
@@ -96,8 +97,8 @@ class Harness:
 class Ours:
     """One of this project's environments and its client of the server."""
 
-    def __init__(self, address: str, both_views: bool, look_every: int, times: Times):
-        self._environment, self._server = EpisodeEnvironment(), Server(address, look_every=look_every)
+    def __init__(self, address: str, both_views: bool, times: Times):
+        self._environment, self._server = EpisodeEnvironment(), Server(address)
         self._server._wanted = Wanted(wrist=both_views, state=both_views)
         self._times = times
 
@@ -107,9 +108,11 @@ class Ours:
             progress = environment.reset(task)
         self._server.begin(task)
         while not progress.over and progress.steps < steps:
-            action, *_ = checked_actions(self._server.act(times.timed("render", environment.observation)), "server")
-            with times.of("physics"):
-                progress = environment.step(action)
+            actions = checked_actions(self._server.act(times.timed("render", environment.observation)), "server")
+            for action in actions[: steps - progress.steps]:
+                if not progress.over:
+                    with times.of("physics"):
+                        progress = environment.step(action)
         self._server.end(progress.success)
         return progress.steps
 
@@ -126,20 +129,26 @@ def main() -> None:
     arguments = parser.parse_args()
     episodes = select(Selection(tasks=tuple(arguments.tasks), episodes=arguments.states))
     results: dict[str, Any] = {"device": CHOICE.device, "episodes": len(episodes)}
-    with replay_server.running("-m", replay_server.__name__) as address:
+    with server(1) as address, server(CHUNK) as in_chunks:
         for views, both_views in (("agent_view", False), ("both_views", True)):
-            results[views] = compared(episodes, arguments.steps, address, both_views)
+            results[views] = compared(episodes, arguments.steps, address, in_chunks, both_views)
             print(f"{views}: {json.dumps(results[views])}")
     print(json.dumps(results))
 
 
-def compared(episodes: list[EvaluationTask], steps: int, address: str, both_views: bool) -> dict[str, Any]:
+def server(chunk: int) -> AbstractContextManager[str]:
+    return replay_server.running("-m", replay_server.__name__, "--args.chunk", str(chunk))
+
+
+def compared(
+    episodes: list[EvaluationTask], steps: int, address: str, in_chunks: str, both_views: bool
+) -> dict[str, Any]:
     """Run the episodes in all ways in turn; what each way took, and by how much ours is faster."""
     times = {name: Times() for name in ("harness", "ours", f"ours_look_in_{CHUNK}")}
     harnesses: dict[str, Harness] = {}
     ours = {
-        name: Ours(address, both_views, look_every, times[name])
-        for name, look_every in (("ours", 1), (f"ours_look_in_{CHUNK}", CHUNK))
+        name: Ours(at, both_views, times[name])
+        for name, at in (("ours", address), (f"ours_look_in_{CHUNK}", in_chunks))
     }
     render, taken = MjSim.render, dict.fromkeys(times, 0)
     MjSim.render = times["harness"].timed("render", render)

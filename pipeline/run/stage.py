@@ -27,7 +27,8 @@ def main(stage: Callable[[Config], None], description: str) -> None:
         stage(claimed(arguments.config))
         return 0
 
-    sys.exit(exit_status(run))
+    if status := exit_status(run):
+        sys.exit(status)
 
 
 def claimed(file: Path) -> Config:
