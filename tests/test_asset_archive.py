@@ -115,6 +115,7 @@ def named(test: TestTask) -> EvaluationTask:
     return EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, 0, 0)
 
 
+@pytest.mark.slow
 def test_tasks_are_counted_by_the_files_that_are_there(
     archive: Path, tasks: dict[str, TestTask], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -122,6 +122,7 @@ def test_two_runs_on_one_cluster_are_what_they_are_without_it(
     assert sorted(path.name for path in (tmp_path / "elsewhere").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(cluster: Start, tmp_path: Path) -> None:
     edited = tmp_path / "edited"
     for name in ("pipeline", "schemas"):

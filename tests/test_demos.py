@@ -152,6 +152,7 @@ def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatc
         StarterSource().index([TASK])
 
 
+@pytest.mark.slow
 def test_hdf5_round_trip(root: Path, model_file: str, scene: str) -> None:
     source = HDF5Source(root)
     index = source.index([TASK])
@@ -390,6 +391,7 @@ def test_missing_folder_names_the_layout(tmp_path: Path) -> None:
         HDF5Source(tmp_path).index([TASK])
 
 
+@pytest.mark.slow
 def test_relocated_model_compiles_to_the_original(tmp_path: Path, scene: str, model_file: str) -> None:
     assert "/home/author/" in model_file
     assert "/scenes/../textures/" in model_file

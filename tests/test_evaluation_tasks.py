@@ -26,6 +26,7 @@ def test_libero_has_an_episode_for_each_task_and_initial_state() -> None:
     assert libero_states(STOVE).shape[0] == 50
 
 
+@pytest.mark.slow
 def test_test_tasks_that_need_no_archive_are_all_there(capsys: pytest.CaptureFixture[str]) -> None:
     tasks = select(Selection(source="libero_plus"))
     counts = Counter(task.axis for task in tasks)

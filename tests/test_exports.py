@@ -129,6 +129,7 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
     assert not (tmp_path / ".work").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["rlds", "lerobot"])
 def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_path: Path) -> None:
     made, source = target(name, tmp_path), episodes()

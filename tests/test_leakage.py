@@ -124,6 +124,7 @@ def test_every_test_scene_is_found_when_it_is_drawn(test: TestSet) -> None:
     assert finding.coverage["pose"].compared == 696
 
 
+@pytest.mark.slow
 def test_scenes_are_drawn_clear_of_every_test_scene_and_cover_them_all(test: TestSet) -> None:
     axis, rows = PoseAxis(components=("scene",)), []
     for suite in SUITES[:4]:

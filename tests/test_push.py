@@ -271,6 +271,7 @@ def test_dry_run_says_what_would_go(made: Path) -> None:
     assert f"tag: {CODEBASE_VERSION}" in prepare(made, "lerobot").summary()
 
 
+@pytest.mark.slow
 def test_a_set_with_images_has_no_videos(data: Path) -> None:
     write_lerobot(data, name=NAME, frames="images")
     for later in (data / "validation.json", data / "card" / "lerobot" / "README.md"):

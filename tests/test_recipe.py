@@ -109,6 +109,7 @@ def test_schema_refuses(section: str, field: str, value: object, tmp_path: Path)
         check(recipe, "finetune.yaml")
 
 
+@pytest.mark.slow
 def test_written_recipe_is_read_back_and_its_commands_can_be_copied(data: Path) -> None:
     text = (data / "finetune" / "finetune.yaml").read_text()
     recipe = yaml.safe_load(text)

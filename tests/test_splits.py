@@ -59,6 +59,7 @@ def episode_ids(dataset: LeRobotDataset) -> list[str]:
     return [ids[index] for index in sorted(ids)]
 
 
+@pytest.mark.slow
 def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, tmp_path: Path) -> None:
     target = LeRobot(tmp_path, LeRobotConfig(name=NAME, parts=3, validation=0.34))
     export(target, episodes, loop)

@@ -139,6 +139,7 @@ def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
         assert texts == {"file_path": source.provenance["demo_source"], **source.provenance}
 
 
+@pytest.mark.slow
 def test_rlds_features_are_openvlas(written: Written) -> None:
     builder = tfds.builder_from_directory(written.version)
     features = builder.info.features
@@ -447,6 +448,7 @@ def test_rlds_refuses_a_bad_episode(fault: str, tmp_path: Path) -> None:
     assert not (tmp_path / "rlds.json").exists()
 
 
+@pytest.mark.slow
 def test_lerobot_refuses_a_bad_episode_and_keeps_what_was_there(tmp_path: Path) -> None:
     (tmp_path / "lerobot").mkdir()
     (tmp_path / "lerobot" / "earlier").write_text("set")
