@@ -89,6 +89,7 @@ def test_mcnemars_test_is_exact() -> None:
     assert mcnemar(0, 0) == mcnemar(3, 3) == 1
 
 
+@pytest.mark.slow
 def test_policies_are_compared_on_the_episodes_that_both_ran(subset: list[EvaluationTask]) -> None:
     first = [result(task, "first", True) for task in subset[:10]]
     second = [result(task, "second", at % 2 == 0) for at, task in enumerate(subset[4:])]

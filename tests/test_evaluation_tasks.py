@@ -56,6 +56,7 @@ def test_tasks_are_chosen_by_axis_component_level_suite_and_name() -> None:
     assert severities <= {9, 10}
 
 
+@pytest.mark.slow
 def test_a_subset_is_balanced_and_holds_the_smaller_ones() -> None:
     tasks = select(Selection(source="libero_plus"))
     chosen = balanced(tasks, 50, seed=0)

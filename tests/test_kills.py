@@ -22,8 +22,6 @@ def test_a_run_that_is_killed_anywhere_ends_like_one_that_is_not(finished: Path,
         (store / "index.parquet").unlink()
         for made_last in sorted(store.glob("*.h5"), key=lambda path: path.stat().st_size)[:2]:
             made_last.unlink()
-    for name in ("rlds", "lerobot"):
-        shutil.rmtree(clone / "data" / "tiny" / name)
     seed = date.today().toordinal()
     killed = kill_and_resume(clone, kills=2, seed=seed)
     assert killed.faults == [], f"repeat with seed {seed}"

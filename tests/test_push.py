@@ -254,6 +254,7 @@ def large(upload: Upload) -> set[str]:
     }
 
 
+@pytest.mark.slow
 def test_dry_run_says_what_would_go(made: Path) -> None:
     upload = prepare(made, "rlds")
     folder = f"rlds/{SET}/1.0.0"

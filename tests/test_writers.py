@@ -247,6 +247,7 @@ def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
                     assert psnr_db(shown, pixels(frame)) > MIN_PSNR_DB
 
 
+@pytest.mark.slow
 def test_lerobot_holds_the_episodes(written: Written) -> None:
     assert_lerobot_episodes(written.lerobot.root)
     assert lerobot_index(written.lerobot) == {episode_id: index for index, episode_id in enumerate(IDS)}
