@@ -9,18 +9,20 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from http.server import ThreadingHTTPServer
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 import yaml
 from filelock import FileLock
 
 from pipeline.config import ReplayConfig
+from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
@@ -30,6 +32,8 @@ from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import fetch_testset
 from pipeline.types import Demo, Task, Trajectory
+
+Result = TypeVar("Result")
 
 REPOSITORY = Path(__file__).parent.parent
 SCRIPTS = Path(sys.executable).parent
@@ -225,15 +229,40 @@ def _run_in_clone(short_demos: Path, clone: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def copy_of(name: str, source: Path, target: Path) -> None:
+    """Copy a file or a folder to the same place below another folder."""
+    (target / name).parent.mkdir(parents=True, exist_ok=True)
+    if (source / name).is_dir():
+        shutil.copytree(source / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+    else:
+        shutil.copy(source / name, target / name)
+
+
+def rot(file: Path) -> None:
+    """Flip a bit in the middle of a file as a bad disk does: its time stays."""
+    content, stamp = bytearray(file.read_bytes()), file.stat().st_mtime_ns
+    content[len(content) // 2] ^= 1
+    file.write_bytes(content)
+    os.utime(file, ns=(stamp, stamp))
+
+
+def read_with_flipped_bits(file: Path, places: Iterable[int], read: Callable[[], Result]) -> list[Result]:
+    """What is read of a file with one bit flipped at each of some places, where it is not refused."""
+    content, results = file.read_bytes(), []
+    for place in places:
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << int(place) % 8
+        file.write_bytes(damaged)
+        with suppress(PipelineError):
+            results.append(read())
+    file.write_bytes(content)
+    return results
+
+
 def in_a_clone(config: dict[str, object], clone: Path) -> None:
     """A copy of the repository, as far as a run needs it, with a configuration to be run."""
     for name in ("pipeline", "stages", "schemas", "dvc.yaml", "pyproject.toml", "requirements.lock", ".dvcignore"):
-        source, target = REPOSITORY / name, clone / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(source, target)
+        copy_of(name, REPOSITORY, clone)
     (clone / "configs").mkdir()
     (clone / "configs" / "tiny.yaml").write_text(yaml.safe_dump(config))
     (clone / "params.yaml").write_text("run: tiny\n")

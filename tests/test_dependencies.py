@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import REPOSITORY, link_testset
+from conftest import REPOSITORY, copy_of, link_testset
 from file_access import opened_files
 
 STAGES: dict[str, dict[str, Any]] = yaml.safe_load((REPOSITORY / "dvc.yaml").read_text())["stages"]
@@ -42,12 +42,7 @@ MADE_BUT_FOR_ONE = {"replay": "data/tiny/trajectories", "render": "data/tiny/fra
 def test_a_stage_opens_all_that_it_declares_and_needs_nothing_else(stage: str, finished: Path, tmp_path: Path) -> None:
     clone = finished.parent.parent
     for name in (*declared(stage), "configs/tiny.yaml"):
-        source, target = clone / name, tmp_path / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(source, target)
+        copy_of(name, clone, tmp_path)
     if store := MADE_BUT_FOR_ONE.get(stage):
         shutil.copytree(clone / store, tmp_path / store)
         (tmp_path / store / "index.parquet").unlink()

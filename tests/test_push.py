@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from conftest import REPOSITORY as REPOSITORY_FOLDER
-from conftest import served
+from conftest import rot, served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from synthetic import SET, write_lerobot, write_rlds
 
@@ -396,10 +396,7 @@ def incomplete(data: Path) -> None:
 
 
 def rotten(data: Path) -> None:
-    file = next((data / "lerobot" / NAME / "videos").rglob("*.mp4"))
-    stamp = file.stat().st_mtime_ns
-    file.write_bytes(file.read_bytes()[:-1] + b"?")
-    os.utime(file, ns=(stamp, stamp))
+    rot(next((data / "lerobot" / NAME / "videos").rglob("*.mp4")))
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import BOWL, MILK, STOVE, run_stages, tiny_config
+from conftest import BOWL, MILK, STOVE, rot, run_stages, tiny_config
 
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
@@ -267,14 +266,6 @@ def record_as_written(data: Path) -> None:
         file.write_text(json.dumps(json.loads(file.read_text()) | {"files": files}))
 
 
-def flip_a_bit(file: Path) -> None:
-    """As a bad disk does: the file's time stays."""
-    content, stamp = bytearray(file.read_bytes()), file.stat().st_mtime_ns
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-    os.utime(file, ns=(stamp, stamp))
-
-
 @pytest.mark.parametrize("part", ["trajectories", "frames", "rlds", "lerobot"])
 def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -> None:
     data = tmp_path / "data" / "tiny"
@@ -284,7 +275,7 @@ def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -
         assert all(result["checked"] and not result["damaged"] for result in verify(config, loop).values())
         # The largest: a file that holds data.
         file = max((path for path in (data / part).rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
-        flip_a_bit(file)
+        rot(file)
         results = verify(config, loop)
     (told,) = results.pop(part)["damaged"]
     assert str(file.relative_to(data)) in told
@@ -299,7 +290,7 @@ def test_a_changed_dataset_is_not_read_any_further(
     monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])
     shutil.copytree(finished, data)
     for name in ("rlds", "lerobot"):
-        flip_a_bit(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))
+        rot(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))
     with chdir(tmp_path):
         report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
     assert {finding["dataset"] for finding in report["checksums"]["findings"]} == {"rlds", "lerobot"}
@@ -319,7 +310,7 @@ def test_what_is_missing_or_cannot_be_read_is_a_finding(
     record_as_written(data)
     rows = [row for row in manifest.read(data / "manifest.parquet") if row["kept"]]
     rotten = data / "frames" / f"{rows[0]['trajectory_id']}.h5"
-    flip_a_bit(rotten)
+    rot(rotten)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])  # Tested above, and slow.
     report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from pipeline.errors import PipelineError
+from pipeline.files import checksum
 from pipeline.seeding import digest
 from pipeline.types import Episode, Extra, Frame, Geometry
 
@@ -144,6 +145,30 @@ class Copy:
 
 
 @dataclass(frozen=True)
+class Written:
+    """A file as the record of its dataset has it.
+
+    Attributes:
+        dataset: the format's name.
+        file: where it lies.
+        sha256: of what was written.
+    """
+
+    dataset: str
+    file: Path
+    sha256: str
+
+    def faults(self) -> list[Fault]:
+        """What is off with it, by reading all of it: nothing, or that it is not what was written."""
+        expected = f"what its checksum in {self.dataset}.json is of; delete it, and `dvc repro` makes it again"
+        try:
+            same = checksum(self.file) == self.sha256
+        except OSError as error:
+            return [Fault(self.dataset, None, f"{self.file}: cannot be read ({error})", expected)]
+        return [] if same else [Fault(self.dataset, None, f"{self.file}: was changed since it was written", expected)]
+
+
+@dataclass(frozen=True)
 class Export:
     """The record of a finished dataset, in ``data/<run>/<format>.json``.
 
@@ -215,6 +240,14 @@ class Format(ABC, Generic[Options]):
             raise PipelineError(
                 f"no finished dataset ({error})", where=self.record_file, remedy=f"dvc repro export_{self.name}"
             ) from error
+
+    def written(self) -> list[Written]:
+        """The files of the finished dataset.
+
+        Raises:
+            PipelineError: when there is none.
+        """
+        return [Written(self.name, self.folder / name, sha256) for name, sha256 in self.record().files.items()]
 
     # Writing: pieces in parallel, each whole or not there, then what joins them.
 

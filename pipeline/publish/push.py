@@ -19,7 +19,7 @@ from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, co
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError, XetError
 
 from pipeline.errors import PipelineError
-from pipeline.files import checksum, read_json
+from pipeline.files import read_json
 from pipeline.formats.base import Format
 from pipeline.publish.card import REPORTS, REPOSITORY
 
@@ -185,14 +185,9 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
 
 def _refuse_changed(target: Format[Any]) -> None:
     """Stop where a file is not what was written, although its time says so."""
-    for name, sha256 in target.record().files.items():
-        if checksum(target.folder / name) != sha256:
-            raise PipelineError(
-                "was changed since it was written",
-                where=target.folder / name,
-                expected=f"its checksum in {target.record_file}",
-                remedy="delete it, and `dvc repro` makes it again",
-            )
+    for file in target.written():
+        for fault in file.faults():
+            raise PipelineError(fault.what, expected=fault.expected)
 
 
 def _written(file: Path) -> int:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.files import checksum, read_json
-from pipeline.formats.base import Fault, Format, Row
+from pipeline.files import read_json
+from pipeline.formats.base import Fault, Row
 from pipeline.run import manifest, plan
 from pipeline.validation import oft_check
 
@@ -29,40 +28,6 @@ def counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
     if read_json(data / "counts.json") != manifest.counts(rows):
         yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
-
-
-@dataclass(frozen=True)
-class Written:
-    """A file as the record of its dataset has it.
-
-    Attributes:
-        dataset: the format's name.
-        file: where it lies.
-        sha256: of what was written.
-    """
-
-    dataset: str
-    file: Path
-    sha256: str
-
-
-def written(target: Format[Any]) -> list[Written]:
-    """The files of a dataset.
-
-    Raises:
-        PipelineError: when it is not finished.
-    """
-    return [Written(target.name, target.folder / name, sha256) for name, sha256 in target.record().files.items()]
-
-
-def unchanged(recorded: Written) -> list[Fault]:
-    """Whether a file of a dataset still is what was written."""
-    expected = f"what its checksum in {recorded.dataset}.json is of; delete it, and `dvc repro` makes it again"
-    try:
-        same = checksum(recorded.file) == recorded.sha256
-    except OSError as error:
-        return [Fault(recorded.dataset, None, f"{recorded.file} cannot be read ({error})", expected)]
-    return [] if same else [Fault(recorded.dataset, None, f"{recorded.file} was changed", expected)]
 
 
 def openvla_oft(statistics: Mapping[str, Any], folder: Path) -> list[Fault]:

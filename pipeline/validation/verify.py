@@ -8,12 +8,12 @@ from typing import Any
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.formats.base import Written
 from pipeline.formats.registry import formats_of
 from pipeline.run.compute import Run
 from pipeline.run.frame_store import FrameStore
 from pipeline.run.store import Store
 from pipeline.run.trajectory_store import TrajectoryStore
-from pipeline.validation import run_checks
 
 
 def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:
@@ -33,11 +33,11 @@ def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:
         results[name] = _result(run(_Reader(store), ids, name))
     for one in formats_of(config.data, config.export, config.render.extras):
         try:
-            files = run_checks.written(one)
+            files = one.written()
         except PipelineError as error:
             results[one.name] = {"checked": 0, "damaged": [str(error)]}
             continue
-        faults = run(run_checks.unchanged, files, one.title)
+        faults = run(Written.faults, files, one.title)
         results[one.name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
     return results
 
