@@ -95,11 +95,14 @@ run)
 quick | test)
     ruff check
     ruff format --check
-    mypy
+    # Beside the tests, whose two processes are not always busy.
+    mypy &
+    types=$!
     # Two processes, a module at a time; the longest first, as tests/conftest.py orders them.
     together=(-n 2 --dist loadfile --no-loadscope-reorder)
     # Each on one core, as a run's workers are.
     export LP_NUM_THREADS=1 OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
     if [[ $VERB == quick ]]; then pytest "${together[@]}" -m "not slow"; else pytest "${together[@]}"; fi
+    wait "$types"
     ;;
 esac

@@ -39,6 +39,7 @@ def test_only_what_is_put_somewhere_is_a_target() -> None:
 def test_every_task_is_read(suite: str) -> None:
     for task in tasks(suite):
         read = bddl.read(task.bddl_file)
+        assert bddl.heading(task.bddl_file.read_text(), task.name) == (read.problem, read.language)
         # Facts are of things, of their parts such as drawers, and of regions on them.
         things = (*read.objects, *read.fixtures)
         named = {name for _, *names in (*read.start, *read.goal) for name in names}

@@ -205,7 +205,7 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
     )
     environment.close()
     shown = stage.frames(VIEWS)
-    stage.close()
+    stage.opened.close()
     streams = streams_of("[]")
     rendered = render(begun, STOVE, list(streams.values()), STARTER.render)
     for view, frame in zip(VIEWS, shown, strict=True):

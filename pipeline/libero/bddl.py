@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from bddl.parsing import scan_tokens
 
@@ -14,6 +15,16 @@ from pipeline.errors import PipelineError
 
 Fact = tuple[str, ...]
 """A predicate and its arguments, such as ``("on", "plate_1", "main_table_plate_region")``."""
+
+_PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
+_LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
+
+
+class Heading(NamedTuple):
+    """What :func:`heading` reads; see :class:`Bddl`."""
+
+    problem: str
+    language: str
 
 
 @dataclass(frozen=True)
@@ -129,6 +140,23 @@ def parse(text: str, where: object) -> Bddl:
         raise PipelineError(f"has no {error.args[0]}", where=where, expected=expected) from error
     except Exception as error:  # the tokeniser raises nothing more specific
         raise PipelineError(f"not a BDDL file ({error})", where=where, expected=expected) from error
+
+
+def heading(text: str, where: object) -> Heading:
+    """The problem and the instruction of a definition; of 10,030 test tasks, most need no more, and parsing is slow.
+
+    Args:
+        text: of a BDDL file.
+        where: what an error names.
+
+    Raises:
+        PipelineError: when it has no problem or no instruction.
+    """
+    text = text.lower()
+    problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
+    if problem is None or language is None:
+        raise PipelineError("not a BDDL file", where=where, expected="a BDDL problem with :language")
+    return Heading(problem[1], " ".join(language[1].split()))
 
 
 def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:

@@ -36,7 +36,7 @@ from pipeline.physics.environment import Environment
 from pipeline.physics.roll_out import roll_out
 from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
 from pipeline.rendering.jpeg import to_policy
-from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.renderer import LastScene
 from pipeline.run.compute import Run
 from pipeline.run.plan import draws_of
 from pipeline.testset import benchmark
@@ -55,21 +55,19 @@ REFUSED_GREY = 160
 
 @dataclass
 class Stage:
-    """A task set up to be looked at: one demonstration's first state, and the renderer of the scene shown last.
-
-    Only one GL context is open at a time; it is kept for as long as perturbations leave the scene's model alone.
+    """A task set up to be looked at.
 
     Attributes:
-        demo: the demonstration.
-        scene: its first state.
+        demo: one of its demonstrations.
+        scene: the demonstration's first state.
+        opened: where scenes are rendered.
         noops: how a run treats the demonstration's no-ops; see ``kept_actions``.
     """
 
     demo: Demo
     scene: Scene
+    opened: LastScene
     noops: str = "drop"
-    _renderer: Renderer | None = None
-    _rendered_xml: str | None = None
 
     def frames(self, views: Sequence[str], perturbation: AnyPerturbation | None = None) -> list[Frame]:
         """What the views show, (H, W, 3) each, as a policy sees them.
@@ -81,7 +79,7 @@ class Stage:
         scene = self.scene
         for physics in of_layer(changes, PhysicsPerturbation):
             scene = physics.apply(scene, self.demo, partial(roll_out, noops=self.noops))
-        renderer = self._of(scene.model_xml)
+        renderer = self.opened.renderer(scene.model_xml)
         shown = []
         with renderer.perturbed(of_layer(changes, RenderPerturbation)):
             renderer.restore(scene.state, renderer.model.site_rgba[:, 3].copy())
@@ -91,17 +89,6 @@ class Stage:
                     frame = noise.apply(frame, 0) if view in noise.views else frame
                 shown.append(to_policy(frame))
         return shown
-
-    def _of(self, model_xml: str) -> Renderer:
-        if self._renderer is None or self._rendered_xml != model_xml:
-            self.close()
-            self._renderer, self._rendered_xml = Renderer(model_xml), model_xml
-        return self._renderer
-
-    def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
 
 @contextmanager
@@ -130,11 +117,11 @@ def staged(tasks: Iterable[Task], config: Config) -> Iterator[Stage]:
         environment = Environment(demo.task)
         model_xml = environment.place_fixtures(config.replay.fixture_seed)
         environment.close()
-    stage = Stage(demo, Scene(model_xml, demo.init_state), config.replay.noops)
+    opened = LastScene()
     try:
-        yield stage
+        yield Stage(demo, Scene(model_xml, demo.init_state), opened, config.replay.noops)
     finally:
-        stage.close()
+        opened.close()
 
 
 def configured(name: str, config: Config) -> AnyAxis:

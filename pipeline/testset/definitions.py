@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
-from pipeline.libero.bddl import Bddl
+from pipeline.libero.bddl import Bddl, Heading
 from pipeline.libero.tasks import tasks
 
 Value = str | int | float
@@ -112,27 +112,27 @@ class Reader:
             parameters = {"severity": severity + 1, **self._severities[component][severity]}
             return TestChange(base.name, "noise", component, parameters)
         if number := match["language"]:
-            text = self._scene(suite, f"{base.name}_language_{number}").language
+            text = self._heading(suite, f"{base.name}_language_{number}").language
             return TestChange(base.name, "language", "rewrite", {"text": text})
         if (number := match["robot"]) and int(number):
             return TestChange(base.name, "robot", "initial_joints", {"id": int(number)})
         if view := match["view"]:
             return TestChange(base.name, "camera", *_camera(*map(int, view.split("_"))))
-        scene = self._scene(suite, name)
-        if light := _LIGHT.fullmatch(scene.problem):
+        problem = self._heading(suite, name).problem
+        if light := _LIGHT.fullmatch(problem):
             return TestChange(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
         if match["layout"]:
-            return TestChange(base.name, "layout", "objects", _added(scene))
+            return TestChange(base.name, "layout", "objects", _added(self._scene(suite, name)))
         if match["level"]:
-            moved = _displacement(scene, bddl.read(base.bddl_file))
+            moved = _displacement(self._scene(suite, name), bddl.read(base.bddl_file))
             drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
             return TestChange(base.name, "pose", "pose", {**drawn, **moved})
         component = "theme" if match["theme"] else "surface"
-        return TestChange(base.name, "background", component, self._textures(scene, component == "theme"))
+        return TestChange(base.name, "background", component, self._textures(problem, component == "theme"))
 
     def scene_files(self, suite: str, name: str) -> SceneFiles:
         """What a task's arena is made from; a class that does not say leaves it to the class of its arena."""
-        problem = self._scene(suite, name).problem
+        problem = self._heading(suite, name).problem
         settings = self._classes[_BASE_CLASS.match(problem)[0]] | self._classes[problem]  # type: ignore[index]
         floor, wall = self._floors[settings["floor_style"]], self._walls[settings["wall_style"]]
         return SceneFiles(settings["scene_xml"], f"textures/{floor}", f"textures/{wall}")
@@ -148,22 +148,30 @@ class Reader:
         return {"_".join(re.sub("([A-Z0-9])", r" \1", name).split()).lower(): path for name, path in listed}
 
     def _scene(self, suite: str, name: str) -> Bddl:
-        file = f"bddl_files/{suite}/{name}.bddl"
+        file = _file(suite, name)
         return bddl.parse(self._text(file), file)
 
-    def _textures(self, scene: Bddl, theme: bool) -> dict[str, Value]:
+    def _heading(self, suite: str, name: str) -> Heading:
+        file = _file(suite, name)
+        return bddl.heading(self._text(file), file)
+
+    def _textures(self, problem: str, theme: bool) -> dict[str, Value]:
         """Image files by what they cover: the working surface, and in a theme the wall too.
 
         Tables get their image from a scene file that is named after it. In the floor arena the working surface is
         the floor itself. In the kitchen and the living room, only their scene files say what ``wall`` covers.
         """
-        settings = self._classes[scene.problem]
+        settings = self._classes[problem]
         if file := _SCENE_FILE.fullmatch(settings.get("scene_xml", "")):
             surface, wall = f"{file['surface']}.png", file["wall"] and f"{file['wall']}.png"
         else:
             surface, wall = self._floors[settings["floor_style"]], None
-        files: dict[str, Value] = {"arena": _arena(scene.problem), "surface": surface}
+        files: dict[str, Value] = {"arena": _arena(problem), "surface": surface}
         return files | {"wall": wall or self._walls[settings["wall_style"]]} if theme else files
+
+
+def _file(suite: str, name: str) -> str:
+    return f"bddl_files/{suite}/{name}.bddl"
 
 
 def _camera(azimuth: int, elevation: int, percent: int, yaw: int, pitch: int) -> tuple[str, dict[str, Value]]:

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Fault
-from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.renderer import LastScene
 from pipeline.run.streams import streams_of
 from pipeline.types import Frame, Trajectory
 from pipeline.validation.checks import Case, psnr_db
@@ -29,10 +29,10 @@ def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(chosen.values())
 
 
-def rendered(case: Case) -> Iterator[Fault]:
+def rendered(case: Case, opened: LastScene) -> Iterator[Fault]:
     """The first frame of every view, against a fresh rendering turned by numpy: not the way frames are turned there."""
     turns = SCHEMA.image_rotation_deg // 90
-    raw = _raw(case.trajectory, case.row["perturbations"])
+    raw = _raw(case.trajectory, case.row["perturbations"], opened)
     for view in SCHEMA.views:
         right = f"{view} turned by {SCHEMA.image_rotation_deg} degrees"
         could_be = {
@@ -50,18 +50,15 @@ def rendered(case: Case) -> Iterator[Fault]:
                 yield case.finding(copy.dataset, f"{view} is nearest to {nearest}, {near[nearest]:.1f} dB", right)
 
 
-def _raw(trajectory: Trajectory, perturbations: str) -> dict[str, Frame]:
+def _raw(trajectory: Trajectory, perturbations: str, opened: LastScene) -> dict[str, Frame]:
     """View to its first frame in the orientation of LIBERO's raw observations."""
     frames = {}
-    renderer = Renderer(trajectory.model_xml)
-    try:
-        for view, stream in streams_of(perturbations).items():
-            with renderer.perturbed(of_layer(stream.perturbations, RenderPerturbation)):
-                renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
-                frame = renderer.frame(SCHEMA.views[view].camera)
-            for noise in of_layer(stream.perturbations, PixelPerturbation):
-                frame = noise.apply(frame, 0)
-            frames[view] = frame
-    finally:
-        renderer.close()
+    renderer = opened.renderer(trajectory.model_xml)
+    for view, stream in streams_of(perturbations).items():
+        with renderer.perturbed(of_layer(stream.perturbations, RenderPerturbation)):
+            renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+            frame = renderer.frame(SCHEMA.views[view].camera)
+        for noise in of_layer(stream.perturbations, PixelPerturbation):
+            frame = noise.apply(frame, 0)
+        frames[view] = frame
     return frames

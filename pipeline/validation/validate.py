@@ -6,7 +6,7 @@ The datasets are compared with the stores that they were made from; those in tur
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,6 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import read_json, scratch
 from pipeline.formats.base import Fault, Format, Row, Written
 from pipeline.formats.registry import formats_of
+from pipeline.rendering.renderer import LastScene
 from pipeline.run import manifest
 from pipeline.run.compute import Run
 from pipeline.run.episode_loader import EpisodeLoader
@@ -26,7 +27,7 @@ from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import rendered, witnesses
 
 SLICE = 4
-"""So many episodes are checked in one call."""
+"""So many episodes are checked in one call, where no scene has to be opened for them."""
 
 
 @dataclass
@@ -82,12 +83,9 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
             total.note("format", [fault for check, fault in found if check == "format"])
             total.note("ids", [fault for check, fault in found if check == "ids"], len(kept))
             total.note("readable", [fault for check, fault in found if check == "readable"], 0)
-        job = EpisodesJob(config, data, opened, cache, frozenset(witnesses(rows)))
-        # Episodes that lie together are read together.
-        columns = [column.name for one in opened for column in one.columns]
-        ordered = sorted(kept.values(), key=lambda row: [str(row[column]) for column in columns])
-        slices = [ordered[start : start + SLICE] for start in range(0, len(ordered), SLICE)]
-        for results in run(job, slices, "validate"):
+        again = frozenset(witnesses(rows))
+        job = EpisodesJob(config, data, opened, cache, again)
+        for results in run(job, _slices(kept, again, opened), "validate"):
             total.add(results)
     if not any(fault.dataset == "rlds" for check in ("readable", "checksums") for fault in total.findings[check]):
         # OFT's reader stops at what is damaged.
@@ -99,6 +97,20 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
         check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
         for check, checked in total.checked.items()
     }
+
+
+def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[Format[Any]]) -> list[list[Row]]:
+    """All episodes, those that are checked in one call together.
+
+    Those to render anew come by trajectory, as each has one scene to open; the others as they lie in the datasets.
+    """
+    by_trajectory: dict[str, list[Row]] = defaultdict(list)
+    others: list[Row] = []
+    for episode_id, row in kept.items():
+        (by_trajectory[row["trajectory_id"]] if episode_id in again else others).append(row)
+    columns = [column.name for one in formats for column in one.columns]
+    others.sort(key=lambda row: [str(row[column]) for column in columns])
+    return [*by_trajectory.values(), *(others[start : start + SLICE] for start in range(0, len(others), SLICE))]
 
 
 @dataclass(frozen=True)
@@ -120,12 +132,15 @@ class EpisodesJob:
     witnesses: frozenset[str]
 
     def __call__(self, rows: Sequence[Row]) -> Results:
-        results = Results()
-        for row in rows:
-            self._check(row, results)
+        results, scene = Results(), LastScene()
+        try:
+            for row in rows:
+                self._check(row, results, scene)
+        finally:
+            scene.close()
         return results
 
-    def _check(self, row: Row, results: Results) -> None:
+    def _check(self, row: Row, results: Results, scene: LastScene) -> None:
         episode_id = row["episode_id"]
         copies, missing, unreadable = [], [], []
         for one in self.formats:
@@ -156,4 +171,4 @@ class EpisodesJob:
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:
-            results.note("rendered", rendered(case))
+            results.note("rendered", rendered(case, scene))

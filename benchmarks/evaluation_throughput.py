@@ -1,0 +1,132 @@
+"""Episodes an hour of whole commands: `vla-eval run` with its own LIBERO class, and `python -m pipeline evaluate`.
+
+    python benchmarks/evaluation_throughput.py [--tasks libero_goal/turn_on_the_stove ...] [--states 2]
+
+A model server replays demonstrations for all of them. The same episodes, each to its end, are run by the harness as
+it starts, which is in one process, and by one of its shards on each core; by ours in one process, by one on each
+core, which is how it starts, and so with answers in chunks of eight, where it looks once in eight steps. Imports,
+environments and results are counted. The last line is the result as JSON: wall and CPU seconds, without those of the
+server. `benchmarks/evaluation_speed.py` says where one process spends them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.evaluation import replay_server
+from pipeline.libero.tasks import find_task
+
+TASKS = (
+    "libero_goal/turn_on_the_stove",
+    "libero_spatial/pick_up_the_black_bowl_on_the_cookie_box_and_place_it_on_the_plate",
+    "libero_object/pick_up_the_salad_dressing_and_place_it_in_the_basket",
+    "libero_object/pick_up_the_tomato_sauce_and_place_it_in_the_basket",
+)
+CHUNK = 8
+CORES = len(os.sched_getaffinity(0))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--tasks", nargs="+", default=list(TASKS), metavar="SUITE/TASK")
+    parser.add_argument("--states", type=int, default=2, help="initial states of each task")
+    arguments = parser.parse_args()
+    tasks = [tuple(task.split("/")) for task in arguments.tasks]
+    figures: dict[str, Any] = {"cores": CORES, "tasks": arguments.tasks, "states": arguments.states}
+    with tempfile.TemporaryDirectory() as folder, served(1) as one_by_one, served(CHUNK) as in_chunks:
+        out = Path(folder)
+        for name, commands in {
+            "harness": harness(tasks, arguments.states, one_by_one, out / "harness", 1),
+            f"harness_in_{CORES}_shards": harness(tasks, arguments.states, one_by_one, out / "shards", CORES),
+            "ours_in_1_worker": [ours(tasks, arguments.states, one_by_one, out / "ours_in_1_worker", "--workers", "1")],
+            "ours": [ours(tasks, arguments.states, one_by_one, out / "ours")],
+            f"ours_look_in_{CHUNK}": [ours(tasks, arguments.states, in_chunks, out / "ours_in_chunks")],
+        }.items():
+            figures[name] = timed(commands, len(tasks) * arguments.states)
+            for kind in ("wall", "cpu"):
+                ratio = figures["harness"][f"{kind}_s"] / figures[name][f"{kind}_s"]
+                figures[name][f"times_faster_{kind}"] = round(ratio, 2)
+            print(name, figures[name], flush=True)
+        harness_results = [json.loads(file.read_text()) for file in (out / "harness").rglob("*.json")]
+        figures["harness"]["successes"] = sum(
+            episode["metrics"]["success"]
+            for result in harness_results
+            for task in result["tasks"]
+            for episode in task["episodes"]
+        )
+        for name, results in (("ours", "ours"), (f"ours_look_in_{CHUNK}", "ours_in_chunks")):
+            rows = [json.loads(file.read_text()) for file in (out / results / "episodes").glob("*.json")]
+            figures[name]["successes"] = sum(row["success"] for row in rows)
+            figures[name]["steps"] = sum(row["steps"] for row in rows)
+    print(json.dumps(figures))
+
+
+def served(chunk: int) -> Any:
+    return replay_server.running("-m", replay_server.__name__, "--args.chunk", str(chunk))
+
+
+def harness(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Path, shards: int) -> list[list[str]]:
+    """A command of the harness for each shard; its tasks are called by their instructions."""
+    out.mkdir()
+    suites = dict.fromkeys(suite for suite, _ in tasks)
+    entries = [
+        {
+            "benchmark": "vla_eval.benchmarks.libero.benchmark:LIBEROBenchmark",
+            "subname": suite,
+            "episodes_per_task": states,
+            "tasks": [find_task(*task).instruction for task in tasks if task[0] == suite],
+            "params": {"suite": suite, "env_seed": 0},
+        }
+        for suite in suites
+    ]
+    config = out / "run.yaml"  # YAML holds JSON.
+    config.write_text(json.dumps({"server": {"url": address}, "output_dir": str(out), "benchmarks": entries}))
+    program = [sys.executable, "-m", "vla_eval.cli.main", "run", "--no-docker", "--render", "cpu", "-c", str(config)]
+    if shards == 1:
+        return [program]
+    return [
+        [*program, "--eval-id", "throughput", "--num-shards", str(shards), "--shard-id", str(shard)]
+        for shard in range(shards)
+    ]
+
+
+def ours(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Path, *options: str) -> list[str]:
+    suites, names = (list(dict.fromkeys(column)) for column in zip(*tasks, strict=True))
+    program = [sys.executable, "-m", "pipeline", "evaluate", str(out), "--server", address, *options]
+    return [*program, "--suite", *suites, "--task", *names, "--episodes", str(states)]
+
+
+def timed(commands: Sequence[Sequence[str]], episodes: int) -> dict[str, Any]:
+    """Run commands beside each other to their ends."""
+    cpu_s, start = children_s(), time.perf_counter()
+    running = [subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) for command in commands]
+    for process in running:
+        _, errors = process.communicate()
+        if process.returncode:
+            sys.exit(f"ended with {process.returncode}: {errors.decode()}")
+    wall_s = time.perf_counter() - start
+    return {
+        "wall_s": round(wall_s, 1),
+        "cpu_s": round(children_s() - cpu_s, 1),
+        "episodes_an_hour": round(3600 * episodes / wall_s, 1),
+    }
+
+
+def children_s() -> float:
+    """CPU seconds of the processes that have ended."""
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+if __name__ == "__main__":
+    main()
