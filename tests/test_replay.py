@@ -137,7 +137,7 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
     actions[[0, 1, 5, 6], :6], actions[[0, 1, 5, 6], 6] = 0.0, actions[4, 6]
     demo = replace(demo, actions=actions)
     trajectory = replay(Environment(STOVE), demo, "t", ReplayConfig(noops=noops), (PathSeen(level=1),))
-    assert len(trajectory.actions) == {"drop": 10, "trim_ends": 12, "keep": 14}[noops]
+    assert len(trajectory.actions) == {"drop": 6, "trim_ends": 8, "keep": 10}[noops]
     assert np.array_equal(json.loads(trajectory.resolved)["path"], trajectory.states)
 
 

@@ -138,14 +138,22 @@ def test_with_root_it_installs_what_is_missing(tree: Tree) -> None:
 
 
 @pytest.mark.parametrize(("verb", "selection"), [("quick", "-m not slow"), ("test", "")])
-def test_checks_style_and_types_before_behaviour(tree: Tree, verb: str, selection: str) -> None:
+def test_checks_style_types_and_behaviour(tree: Tree, verb: str, selection: str) -> None:
     if verb == "test":
         tree.stub(BROWSER, "")
     done = tree.setup(verb)
     assert done.returncode == 0, done.stderr
-    *_, check, form, types, behaviour = tree.calls()
-    assert (check, form, types) == ("ruff check", "ruff format --check", "mypy")
-    assert behaviour == f"pytest -n 2 --dist loadfile --no-loadscope-reorder {selection}".rstrip()
+    *_, check, form, one, other = tree.calls()
+    assert (check, form) == ("ruff check", "ruff format --check")
+    # Beside each other, in any order.
+    assert {one, other} == {"mypy", f"pytest -n 2 --dist loadfile --no-loadscope-reorder {selection}".rstrip()}
+
+
+@pytest.mark.parametrize("failing", ["ruff", "mypy", "pytest"])
+def test_each_check_can_fail_the_verb(tree: Tree, failing: str) -> None:
+    assert tree.setup().returncode == 0
+    (tree.root / ".venv" / "bin" / failing).write_text("#!/bin/bash\nexit 1\n")
+    assert tree.setup("quick").returncode == 1
 
 
 def test_no_python_of_the_right_version(tree: Tree) -> None:
