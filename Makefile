@@ -1,6 +1,6 @@
 # Short names for setup.sh, which works where make is not installed.
 
-.PHONY: setup run quick test doctor lock
+.PHONY: setup run quick test doctor lock sbom
 
 setup:
 	bash setup.sh
@@ -22,3 +22,11 @@ lock: setup
 	UV_CUSTOM_COMPILE_COMMAND="make lock" .venv/bin/uv pip compile --quiet --python-version 3.11 \
 		pyproject.toml --group dev --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
 		--no-emit-package pynput --no-emit-package evdev -o requirements.lock
+
+# Every installed package with version and licence, without the links of each. The tool runs in an environment of its own.
+sbom: setup
+	.venv/bin/uv tool run --from cyclonedx-bom==7.5.0 cyclonedx-py environment --output-reproducible --of JSON \
+		--pyproject pyproject.toml -o sbom.json .venv
+	.venv/bin/python -c "import json; bill = json.load(open('sbom.json')); \
+		[part.pop('externalReferences', None) for part in bill['components']]; bill['metadata'].pop('tools'); \
+		json.dump(bill, open('sbom.json', 'w'), indent=1, sort_keys=True)"

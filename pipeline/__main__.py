@@ -23,10 +23,10 @@ from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish import attribution
 from pipeline.rewriting.language_model import LanguageModel
 from pipeline.rewriting.rewrite import extend
-from pipeline.run import doctor
 from pipeline.run.compute import runner
 from pipeline.run.stage import owned
 from pipeline.testset import benchmark
+from pipeline.validation import doctor
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
 

@@ -79,6 +79,13 @@ def _recipe(layer: Layer) -> list[object]:
 
 
 @cache
+def machine() -> dict[str, str]:
+    """What a run should keep to from start to end, but for the recipes: package versions and machine code, by name."""
+    names = [name for packages in PACKAGES.values() for name in packages]
+    return {**{name: version(name) for name in names}, "machine code": machine_code()}
+
+
+@cache
 def machine_code() -> str:
     """Which kernels OpenBLAS and NumPy compute with in this process, such as ``Haswell AVX2``."""
     features = import_module("numpy._core._multiarray_umath").__cpu_features__

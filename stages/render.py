@@ -6,11 +6,13 @@ from pipeline.rendering.render import render_plan
 from pipeline.run import plan
 from pipeline.run.compute import runner
 from pipeline.run.frame_store import FrameStore
+from pipeline.run.machine import same_machine
 from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
     print(gl.choose())
+    same_machine(config.data, {"OpenGL device": gl.choose().device})
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "frames"
     with runner(config.compute, config.data) as workers:

@@ -6,11 +6,13 @@ from pipeline.config import Config
 from pipeline.physics.replay import replay_plan
 from pipeline.run import plan
 from pipeline.run.compute import runner
+from pipeline.run.machine import same_machine
 from pipeline.run.stage import main
 from pipeline.run.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:
+    same_machine(config.data)
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:

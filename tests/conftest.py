@@ -58,8 +58,9 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 
 LONG = (
-    *("test_dependencies", "test_evaluation", "test_run", "test_evaluation_policies", "test_preview", "test_effect"),
-    *("test_exports", "test_cluster", "test_writers", "test_validate", "test_render", "test_pose", "test_tracking"),
+    *("test_dependencies", "test_evaluation", "test_effect", "test_run", "test_kills", "test_evaluation_policies"),
+    *("test_preview", "test_writers", "test_exports", "test_cluster", "test_validate", "test_render", "test_pose"),
+    *("test_light", "test_background", "test_bad_demonstrations", "test_tracking"),
 )
 """Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
 

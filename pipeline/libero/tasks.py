@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import difflib
 import fnmatch
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from pathlib import Path
-
-from libero.libero import get_libero_path
-from libero.libero.benchmark import task_maps
+from runpy import run_path
 
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import libero_folder
 from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
@@ -26,10 +25,22 @@ def tasks(suite: str) -> tuple[Task, ...]:
     """
     if suite not in SUITES:
         raise PipelineError(f"unknown suite {suite!r}", expected=" or ".join(SUITES))
-    folder = Path(get_libero_path("bddl_files")).resolve() / suite
-    return tuple(
-        Task(suite, known.name, known.language, folder / known.bddl_file) for known in task_maps[suite].values()
-    )
+    folder = libero_folder() / "bddl_files" / suite
+    return tuple(Task(suite, name, _instruction(name), folder / f"{name}.bddl") for name in _names()[suite])
+
+
+@cache
+def _names() -> Mapping[str, Sequence[str]]:
+    """Suite to LIBERO's list; only the file that holds it is run."""
+    listed: Mapping[str, Sequence[str]] = run_path(str(libero_folder() / "benchmark" / "libero_suite_task_map.py"))[
+        "libero_task_map"
+    ]
+    return listed
+
+
+def _instruction(name: str) -> str:
+    """As LIBERO words it: the task's name without its scene."""
+    return re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ")
 
 
 def find_task(suite: str, name: str) -> Task:

@@ -21,7 +21,7 @@ from pipeline.physics.reference import Reference
 from pipeline.physics.roll_out import roll_out
 from pipeline.physics.success import verdict
 from pipeline.physics.tracking import Route, follow
-from pipeline.run.compute import Run
+from pipeline.run.compute import LOST, Expendable, Run
 from pipeline.run.plan import Row, pending
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.scenes.noops import kept_actions
@@ -173,6 +173,26 @@ class ReplayJob:
         TrajectoryStore(self.folder).save(trajectory)
         return trajectory.verdict
 
+    def limit_s(self) -> float:
+        """So long it may take before it counts as hanging; the longest take about a minute."""
+        return 1800.0
+
+    def lost(self) -> Verdict:
+        """Store that no worker survived this replay, or finished it; it is not tried again while the file is there."""
+        trajectory = Trajectory(
+            trajectory_id=self.trajectory_id,
+            mode="open_loop",
+            model_xml="",
+            states=np.zeros((1, 1)),
+            actions=np.empty((0, 7)),
+            kept_mask=np.empty(0, bool),
+            site_alpha=np.empty((1, 0), np.float32),
+            resolved=json.dumps({"fault": "workers ended in it, or it took too long"}),
+            verdict=Verdict(False, LOST),
+        )
+        TrajectoryStore(self.folder).save(trajectory)
+        return trajectory.verdict
+
 
 def replay_plan(
     rows: Sequence[Row], demos: DemosConfig, config: ReplayConfig, folder: Path, run: Run
@@ -221,7 +241,7 @@ def _replay(
             if trajectory_id not in stored
         ]
         if jobs:
-            judged = run(ReplayJob.__call__, jobs, "replay")
+            judged = run(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
             verdicts |= {job.trajectory_id: verdict for job, verdict in zip(jobs, judged, strict=True)}
     return verdicts
 

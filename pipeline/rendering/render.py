@@ -22,7 +22,7 @@ from pipeline.rendering.instances import Instances
 from pipeline.rendering.jpeg import encode, to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import CAMERA, Sight
-from pipeline.run.compute import Run
+from pipeline.run.compute import LOST, Expendable, Run
 from pipeline.run.frame_store import FrameStore, Rendered, stream_ids
 from pipeline.run.outcome import rejections, replayed
 from pipeline.run.plan import Row, select
@@ -104,6 +104,7 @@ class RenderJob:
 
     Attributes:
         trajectory_id, task, streams: what to render.
+        steps: of the trajectory, at most.
         trajectories, frames: folders of the stores.
         config: how frames are encoded.
         device: what renders the run, as OpenGL names it.
@@ -112,6 +113,7 @@ class RenderJob:
     trajectory_id: str
     task: Task
     streams: tuple[Stream, ...]
+    steps: int
     trajectories: Path
     frames: Path
     config: RenderConfig
@@ -145,6 +147,26 @@ class RenderJob:
                 geometry={**rendered.geometry, **earlier.geometry},
             )
         store.save(self.trajectory_id, rendered, device)
+
+    def limit_s(self) -> float:
+        """So long it may take before it counts as hanging: about twenty times what a frame takes without a GPU."""
+        return 1800.0 + 2.0 * self.steps * len(self.streams)
+
+    def lost(self) -> None:
+        """Store that no worker survived the streams that are missing, or finished them, beside those that are there.
+
+        They are not tried again while the file is there.
+        """
+        store = FrameStore(self.frames, self.config)
+        earlier = self._earlier(store, self.device)
+        if earlier is None:
+            trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
+            action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
+            state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)
+            earlier = Rendered(trajectory.mode, state, joint_state, action)
+        missing = {stream.stream_id for stream in self.streams} - {*earlier.streams, *earlier.rejected}
+        rejected = {**earlier.rejected, **dict.fromkeys(missing, LOST)}
+        store.save(self.trajectory_id, replace(earlier, rejected=rejected), self.device)
 
     def _earlier(self, store: FrameStore, device: str) -> Rendered | None:
         """What is stored of the wanted streams, from the same device."""
@@ -189,6 +211,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
                 trajectory_id,
                 find_task(*tasks[trajectory_id]),
                 tuple(streams.values()),
+                steps[trajectory_id],
                 trajectories,
                 folder,
                 config.render,
@@ -208,5 +231,5 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
             )
         undone = jobs
         # The longest first, so that no worker is left alone with one at the end.
-        longest_first = sorted(jobs, key=lambda job: -steps[job.trajectory_id] * len(job.streams))
-        run(RenderJob.__call__, longest_first, "render")
+        longest_first = sorted(jobs, key=lambda job: -job.steps * len(job.streams))
+        run(Expendable(RenderJob.__call__, RenderJob.limit_s, RenderJob.lost), longest_first, "render")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, Queue
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -31,15 +33,43 @@ ALONE_S = 30
 LOOK_S = 5
 """How often to look whether there are workers, while nothing gets done."""
 
+LOST = "worker_lost"
+"""Why an item was dropped that no worker survives, or that none finishes."""
+
+TRIES = 2
+"""After so many workers that ended over it, a piece of work is taken for their cause, and then tried as often alone."""
+
+
+@dataclass(frozen=True)
+class Expendable(Generic[Item, Result]):
+    """A function of which one item may be given up, where no worker survives it or finishes it.
+
+    Attributes:
+        fn: the function.
+        limit_s: so long an item may take; then it hangs, and its worker is ended. Far above what any takes.
+        lost: called in the run's own process; what it returns takes the place of the item's result.
+    """
+
+    fn: Callable[[Item], Result]
+    limit_s: Callable[[Item], float]
+    lost: Callable[[Item], Result]
+
+    def __call__(self, item: Item) -> Result:
+        return self.fn(item)
+
 
 class Run(Protocol):
-    """Apply ``fn`` to every item, in any order and place; the results come back in the order of the items."""
+    """Apply ``fn`` to every item, in any order and place; the results come back in the order of the items.
+
+    A worker that dies is replaced, and its item is done again. An item over which workers die again and again ends the
+    run, unless ``fn`` is ``Expendable``.
+    """
 
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]: ...
 
 
 def loop(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
-    """Everything in this process, one after the other: for debugging and small jobs."""
+    """Everything in this process, one after the other: for debugging and small jobs. What ends it ends the run."""
     with _progress(description, len(items)) as advance:
         results = []
         for item in items:
@@ -70,7 +100,13 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
     from distributed import Client, LocalCluster
 
     if config.cluster == "local":
-        dask.config.set({"distributed.worker.multiprocessing-method": "spawn", "distributed.admin.tick.limit": "60s"})
+        dask.config.set(
+            {
+                "distributed.worker.multiprocessing-method": "spawn",
+                "distributed.admin.tick.limit": "60s",
+                "distributed.scheduler.allowed-failures": TRIES - 1,
+            }
+        )
         cluster = LocalCluster(
             n_workers=config.workers or CPU_COUNT,
             threads_per_worker=1,
@@ -101,28 +137,87 @@ def _leave_interrupts_to_the_run() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _on(client: Any, workplace: Workplace | None = None) -> Run:
-    from distributed import Future, KilledWorker
+@dataclass(frozen=True)
+class _Limited(Generic[Item, Result]):
+    """In a worker: a function whose process is ended when an item takes too long, also where it hangs in a library."""
 
-    def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
+    fn: Expendable[Item, Result]
+
+    def __call__(self, item: Item) -> Result:
+        faulthandler.dump_traceback_later(self.fn.limit_s(item), exit=True)
+        try:
+            return self.fn(item)
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+
+
+def _on(client: Any, workplace: Workplace | None = None) -> Run:
+    from distributed import CancelledError, Future, KilledWorker
+
+    def ended(work: Callable[[Item], Result], items: Sequence[Item]) -> Generator[tuple[int, Result | Exception]]:
+        """The number of each item and its result or error, as they end."""
         # Not pure: equal items are still separate work, and the scheduler must not remember earlier runs.
-        futures = client.map(fn if workplace is None else InPlace(fn, workplace), items, pure=False)
+        futures = client.map(work, items, pure=False)
+        numbers = {future.key: number for number, future in enumerate(futures)}
         done: Queue[Future] = Queue()
         for future in futures:
             future.add_done_callback(done.put)
-        with _progress(description, len(items)) as advance:
-            for _ in futures:
+        try:
+            while numbers:
                 future = _next(done, client)
                 if future.status == "error":
-                    error = future.exception()
-                    client.cancel(futures)
-                    raise _killed(error) if isinstance(error, KilledWorker) else error
-                if future.status != "finished":
-                    raise _lost(client, "the Dask scheduler went away")
+                    yield numbers.pop(future.key), future.exception()
+                    continue
+                try:
+                    result = future.result(timeout=ALONE_S)
+                except TimeoutError:
+                    # The worker that held it died, over another item, and so it is made again.
+                    future.add_done_callback(done.put)
+                    continue
+                except KilledWorker as error:
+                    yield numbers.pop(future.key), error
+                    continue
+                except (CancelledError, ConnectionError) as error:
+                    raise _lost(client, "the Dask scheduler went away") from error
+                yield numbers.pop(future.key), result
+        finally:
+            if client.status == "running":
+                client.cancel([future for future in futures if future.key in numbers])
+
+    def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
+        limited = _Limited(fn) if isinstance(fn, Expendable) else fn
+        work = limited if workplace is None else InPlace(limited, workplace)
+        results: dict[int, Result] = {}
+        deadly: list[int] = []
+        with _progress(description, len(items)) as advance, closing(ended(work, items)) as outcomes:
+            for number, outcome in outcomes:
+                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
+                    deadly.append(number)
+                    continue
+                results[number] = _result(outcome)
                 advance()
-        return list(client.gather(futures))
+            for number in deadly:
+                # Alone now: another item may have ended the workers that this one waited on.
+                ((_, outcome),) = ended(work, [items[number]])
+                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
+                    results[number] = fn.lost(items[number])
+                else:
+                    results[number] = _result(outcome)
+                advance()
+        return [results[number] for number in range(len(items))]
 
     return run
+
+
+def _result(outcome: Result | Exception) -> Result:
+    """A result, or else the error raised, in words where workers died over an item."""
+    from distributed import KilledWorker
+
+    if isinstance(outcome, KilledWorker):
+        raise _killed(outcome)
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
 
 
 def _next(done: Queue[Any], client: Any) -> Any:
@@ -131,22 +226,26 @@ def _next(done: Queue[Any], client: Any) -> Any:
     Raises:
         PipelineError: when nobody is left who could do one.
     """
-    alone_s = 0
+    alone_s, last_came_s = 0, 0.0
     while True:
         try:
             return done.get(timeout=LOOK_S)
         except Empty:
-            # A new worker may be on its way, in place of one that died.
-            alone_s = 0 if _has_workers(client) else alone_s + LOOK_S
+            workers, came_s = _workers(client)
+            # A new worker may be on its way, or have come and died over its work.
+            alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
+            last_came_s = came_s
             if alone_s >= ALONE_S:
                 raise _lost(client, f"no worker is left, and none came in {ALONE_S} s") from None
 
 
-def _has_workers(client: Any) -> bool:
+def _workers(client: Any) -> tuple[int, float]:
+    """How many there are, and when the last of all came, by the scheduler's clock."""
     try:
-        return bool(client.nthreads())
+        came_s = [stamp for stamp, event in client.get_events("all") if event.get("action") == "add-worker"]
+        return len(client.nthreads()), max(came_s, default=0.0)
     except (OSError, TimeoutError):  # no scheduler
-        return False
+        return 0, 0.0
 
 
 def _lost(client: Any, what: str) -> PipelineError:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import fcntl
 import json
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pipeline.config import Config, load
@@ -16,6 +17,9 @@ from pipeline.exit_status import exit_status
 OWNER = "configuration.json"
 """File of a run's folder that says which configuration file the folder belongs to."""
 
+LOCK = ".lock"
+"""Empty file of a run's folder that a stage holds while it runs."""
+
 
 def main(stage: Callable[[Config], None], description: str) -> None:
     """Run ``stage`` on the configuration named on the command line."""
@@ -24,7 +28,9 @@ def main(stage: Callable[[Config], None], description: str) -> None:
     arguments = parser.parse_args()
 
     def run() -> int:
-        stage(claimed(arguments.config))
+        config = claimed(arguments.config)
+        with locked(config.data):
+            stage(config)
         return 0
 
     if status := exit_status(run):
@@ -46,7 +52,28 @@ def claimed(file: Path) -> Config:
     with suppress(FileExistsError), (config.data / OWNER).open("x") as mark:
         mark.write(json.dumps({"configuration": _named(file), "name": config.name}, indent=1) + "\n")
     _refuse_foreign(config, file)
+    _refuse_links(config.data)
     return config
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other stages out of a run's folder. The system ends the lock with this process, however it ends.
+
+    Raises:
+        PipelineError: when a stage runs there.
+    """
+    with (folder / LOCK).open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise PipelineError(
+                "another stage of this run is running, here or on another machine",
+                where=folder,
+                expected="one stage at a time, as each reads what the one before it has finished",
+                remedy="wait for it, or stop it; `dvc repro` runs all stages in order",
+            ) from error
+        yield
 
 
 def owned(file: Path) -> Config:
@@ -78,6 +105,16 @@ def _refuse_foreign(config: Config, file: Path) -> None:
             expected="a folder for each configuration file, as a run deletes what it did not plan",
             remedy=f"change `name:` in {own}, or rename or delete the folder; if you renamed {owner} to {own}, delete "
             f"{mark}, and the folder goes with the new name",
+        )
+
+
+def _refuse_links(folder: Path) -> None:
+    if links := [entry for entry in folder.iterdir() if entry.is_symlink()]:
+        raise PipelineError(
+            "is a symbolic link",
+            where=links[0],
+            expected="the run's own files and folders, as a stage deletes what it did not plan",
+            remedy=f"put what it leads to in its place; {folder} as a whole may be a link to another disk",
         )
 
 

@@ -137,7 +137,7 @@ def _rebuild(
     if not verdict.kept:
         return None, verdict.reason
     task = find_task(row["suite"], row["task"])
-    RenderJob(trajectory_id, task, streams, trajectories, frames, settings.render, gl.choose().device)()
+    RenderJob(trajectory_id, task, streams, row["steps"], trajectories, frames, settings.render, gl.choose().device)()
     if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)

@@ -1,4 +1,7 @@
-"""Some episodes' first frames rendered anew: is what the datasets have the right camera's, and the right way up?"""
+"""Some episodes rendered anew: is what the store and the datasets have the right picture, and the right way up?
+
+The process is another than the one that rendered the frames, and the pictures are made from the trajectory's states.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,22 @@ from typing import Any
 
 import numpy as np
 
+from pipeline import gl
 from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Fault
+from pipeline.rendering.jpeg import decode, encode
 from pipeline.rendering.renderer import LastScene
 from pipeline.run.streams import streams_of
 from pipeline.types import Frame, Trajectory
 from pipeline.validation.checks import Case, psnr_db
 
 PSNR_DB = 25.0
-"""Least PSNR of a first frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""
+"""Least PSNR of a frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""
+
+BEFORE = 5
+"""A frame that came late would show what is so many steps before; in fewer, little moves."""
 
 
 def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -29,36 +38,65 @@ def witnesses(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return list(chosen.values())
 
 
-def rendered(case: Case, opened: LastScene) -> Iterator[Fault]:
-    """The first frame of every view, against a fresh rendering turned by numpy: not the way frames are turned there."""
-    turns = SCHEMA.image_rotation_deg // 90
-    raw = _raw(case.trajectory, case.row["perturbations"], opened)
-    for view in SCHEMA.views:
-        right = f"{view} turned by {SCHEMA.image_rotation_deg} degrees"
-        could_be = {
-            right: np.rot90(raw[view], turns),
-            f"{view} not turned": raw[view],
-            f"{view} upside down": raw[view][::-1],
-            f"{view} mirrored": raw[view][:, ::-1],
-            **{f"{other}, turned": np.rot90(frame, turns) for other, frame in raw.items() if other != view},
-        }
-        for copy in case.whole:
-            shown = copy.frames[view, 0]
-            near = {name: psnr_db(shown, np.ascontiguousarray(frame)) for name, frame in could_be.items()}
-            nearest = max(near, key=near.__getitem__)
-            if nearest != right or near[right] < PSNR_DB:
-                yield case.finding(copy.dataset, f"{view} is nearest to {nearest}, {near[nearest]:.1f} dB", right)
+def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fault]:
+    """The first and the middle frame of every view, against fresh renderings turned by numpy, as they are not there.
+
+    Where the same device renders, the stored frame must be the same file. On another, and in the datasets, the fresh
+    rendering must be the nearest of all pictures that may have taken its place.
+    """
+    exact = case.row["gl_device"] == gl.choose().device
+    for step in dict.fromkeys((0, len(case.made) // 2)):
+        fresh = _raw(case.trajectory, case.row["perturbations"], opened, step)
+        former = _raw(case.trajectory, case.row["perturbations"], opened, step - BEFORE) if step > BEFORE else {}
+        for view in SCHEMA.views:
+            name = f"{view} of step {step}"
+            stored = case.made.frames[view][step]
+            again = encode(_turned(fresh[view]), config)
+            shown = [("frames", decode(stored))] if stored != again or not exact else []
+            for dataset, frame in [*shown, *((copy.dataset, copy.frames[view, step]) for copy in case.whole)]:
+                right = f"{name} turned by {SCHEMA.image_rotation_deg} degrees"
+                nearest, reached_db = _nearest(frame, right, view, fresh, former)
+                if nearest != right or reached_db < PSNR_DB:
+                    what = f"{name} is nearest to {nearest}, {reached_db:.1f} dB"
+                    yield case.finding(dataset, what, right)
+                elif exact and dataset == "frames":
+                    what = f"{name} is another file than a fresh rendering, {reached_db:.1f} dB apart"
+                    yield case.finding(
+                        dataset, what, f"the same file, as both were rendered by {case.row['gl_device']}"
+                    )
 
 
-def _raw(trajectory: Trajectory, perturbations: str, opened: LastScene) -> dict[str, Frame]:
-    """View to its first frame in the orientation of LIBERO's raw observations."""
+def _nearest(
+    frame: Frame, right: str, view: str, fresh: Mapping[str, Frame], former: Mapping[str, Frame]
+) -> tuple[str, float]:
+    """What a stored frame shows, of all that it could, and the PSNR to it in dB."""
+    could_be = {
+        right: _turned(fresh[view]),
+        f"{view} not turned": fresh[view],
+        f"{view} upside down": fresh[view][::-1],
+        f"{view} mirrored": fresh[view][:, ::-1],
+        "a black frame": np.zeros_like(frame),
+        **{f"{other}, turned": _turned(raw) for other, raw in fresh.items() if other != view},
+        **{f"{other} of {BEFORE} steps before": _turned(raw) for other, raw in former.items() if other == view},
+    }
+    reached = {name: psnr_db(frame, np.ascontiguousarray(one)) for name, one in could_be.items()}
+    nearest = max(reached, key=reached.__getitem__)
+    return nearest, reached[nearest]
+
+
+def _turned(raw: Frame) -> Frame:
+    return np.ascontiguousarray(np.rot90(raw, SCHEMA.image_rotation_deg // 90))
+
+
+def _raw(trajectory: Trajectory, perturbations: str, opened: LastScene, step: int) -> dict[str, Frame]:
+    """View to its frame before a step, in the orientation of LIBERO's raw observations."""
     frames = {}
     renderer = opened.renderer(trajectory.model_xml)
     for view, stream in streams_of(perturbations).items():
         with renderer.perturbed(of_layer(stream.perturbations, RenderPerturbation)):
-            renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+            renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             frame = renderer.frame(SCHEMA.views[view].camera)
         for noise in of_layer(stream.perturbations, PixelPerturbation):
-            frame = noise.apply(frame, 0)
+            frame = noise.apply(frame, step)
         frames[view] = frame
     return frames

