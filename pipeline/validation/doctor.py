@@ -232,16 +232,17 @@ def _starter_demos() -> Diagnosis:
         files = [file for file in distribution("robouse").files or [] if file.match(STARTER_FILES)]
     except PackageNotFoundError:
         return Diagnosis("starter demos", "fail", "robouse is not installed", REINSTALL)
-    whole = [file for file in files if Path(str(file.locate())).is_file() and _as_packed(file)]
+    whole = [file for file in files if _as_packed(file)]
     if len(whole) != STARTER_DEMOS:
         return Diagnosis("starter demos", "fail", f"{len(whole)} of {STARTER_DEMOS} are whole", REINSTALL)
     return Diagnosis("starter demos", "ok", f"{STARTER_DEMOS}, with the hashes of their package")
 
 
 def _as_packed(file: PackagePath) -> bool:
-    if file.hash is None:
-        return True
-    digest = hashlib.new(file.hash.mode, file.read_binary()).digest()
+    path = Path(str(file.locate()))
+    if not path.is_file() or file.hash is None:
+        return path.is_file()
+    digest = hashlib.new(file.hash.mode, path.read_bytes()).digest()
     return base64.urlsafe_b64encode(digest).rstrip(b"=").decode() == file.hash.value
 
 
