@@ -17,7 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.initial_states import libero_states, moved_state, pickled_array
 from pipeline.evaluation.results import summary, wilson
-from pipeline.evaluation.tasks import Selection, balanced, draw, select
+from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, draw, select
 
 
 def test_libero_has_an_episode_for_each_task_and_initial_state() -> None:
@@ -126,3 +126,11 @@ def test_intervals_are_wilsons() -> None:
     assert found["all"]["episodes"] == 4
     assert found["by_axis_and_level"].keys() == {"camera/1", "camera/2", "noise/1", "noise/2"}
     assert sum(group["successes"] for group in found["by_axis"].values()) == found["all"]["successes"]
+
+
+def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
+    (test, *_) = select(Selection(source="libero_plus", suites=("libero_goal",)))
+    assert EvaluationTask.of_harness(test.for_harness()) == test
+    (clean,) = select(Selection(suites=("libero_goal",), tasks=("turn_on_the_stove",)))
+    own_class = {"name": "turn on the stove", "suite": "libero_goal", "task_id": 7, "episode_idx": 0}
+    assert EvaluationTask.of_harness(own_class) == clean

@@ -62,7 +62,10 @@ class EvaluationTask:
 
     @classmethod
     def of_harness(cls, task: Mapping[str, Any]) -> EvaluationTask:
-        """The task that ``for_harness`` gave."""
+        """The task that ``for_harness`` gave, or one of the harness's own LIBERO class, which words it."""
+        if "source" not in task:
+            known = next(known for known in tasks(task["suite"]) if known.instruction == task["name"])
+            return _clean(known, int(task.get("episode_idx", 0)))
         return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
 
 

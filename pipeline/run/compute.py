@@ -9,6 +9,7 @@ import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
@@ -105,10 +106,12 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
                 "distributed.worker.multiprocessing-method": "spawn",
                 "distributed.admin.tick.limit": "60s",
                 "distributed.scheduler.allowed-failures": TRIES - 1,
+                "distributed.deploy.lost-worker-timeout": "5s",
             }
         )
+        workers = config.workers or CPU_COUNT
         cluster = LocalCluster(
-            n_workers=config.workers or CPU_COUNT,
+            n_workers=workers,
             threads_per_worker=1,
             processes=True,
             dashboard_address=":0",
@@ -118,7 +121,8 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
         )
         with cluster, Client(cluster) as client:
             client.run(_leave_interrupts_to_the_run)
-            yield _on(client)
+            # A worker that dies while it starts is not replaced by Dask alone.
+            yield _on(client, refill=partial(cluster.scale, workers))
     else:
         try:
             client = Client(config.cluster, timeout=CONNECT_S)
@@ -151,7 +155,7 @@ class _Limited(Generic[Item, Result]):
             faulthandler.cancel_dump_traceback_later()
 
 
-def _on(client: Any, workplace: Workplace | None = None) -> Run:
+def _on(client: Any, workplace: Workplace | None = None, refill: Callable[[], None] = lambda: None) -> Run:
     from distributed import CancelledError, Future, KilledWorker
 
     def ended(work: Callable[[Item], Result], items: Sequence[Item]) -> Generator[tuple[int, Result | Exception]]:
@@ -164,7 +168,7 @@ def _on(client: Any, workplace: Workplace | None = None) -> Run:
             future.add_done_callback(done.put)
         try:
             while numbers:
-                future = _next(done, client)
+                future = _next(done, client, refill)
                 if future.status == "error":
                     yield numbers.pop(future.key), future.exception()
                     continue
@@ -220,8 +224,8 @@ def _result(outcome: Result | Exception) -> Result:
     return outcome
 
 
-def _next(done: Queue[Any], client: Any) -> Any:
-    """The next future that is done.
+def _next(done: Queue[Any], client: Any, refill: Callable[[], None]) -> Any:
+    """The next future that is done; while nothing is, ``refill`` brings back workers that are missing.
 
     Raises:
         PipelineError: when nobody is left who could do one.
@@ -231,6 +235,7 @@ def _next(done: Queue[Any], client: Any) -> Any:
         try:
             return done.get(timeout=LOOK_S)
         except Empty:
+            refill()
             workers, came_s = _workers(client)
             # A new worker may be on its way, or have come and died over its work.
             alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
