@@ -8,7 +8,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from kills import compared, kill_and_resume
+from kills import STARTER, compared, kill_and_resume
+
+from pipeline.config import Config
+
+
+def test_the_command_has_a_configuration() -> None:
+    assert Config.model_validate(STARTER).name == "tiny"
 
 
 @pytest.mark.slow
