@@ -55,7 +55,8 @@ def main() -> None:
                 refused["read_only"] += 1
                 remount(disk, "rw")
                 while (done := stage(disturbed, name)).returncode:
-                    faults += unlike_a_message(name, done, "disk is full")
+                    if fault := unlike_a_message(name, done, "disk is full"):
+                        raise SystemExit("\n".join([*faults, *fault]))
                     refused[f"full_in_{name}"] += 1
                     grow(disk)
             faults += compared(undisturbed, disturbed)

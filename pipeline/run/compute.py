@@ -93,9 +93,9 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
     if config.cluster == "loop":
         yield loop
         return
-    # One thread a worker process: GL contexts and the simulator are not shared, and software GL and OpenCV would
-    # otherwise each start a thread for every core in every worker. The environment is inherited by spawned workers.
-    os.environ.update(LP_NUM_THREADS="1", OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    # One thread a worker process: GL contexts and the simulator are not shared, and OpenCV and NumPy would otherwise
+    # each start a thread for every core in every worker. The environment is inherited by spawned workers.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     import dask
     from dask.system import CPU_COUNT
     from distributed import Client, LocalCluster
@@ -110,6 +110,8 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
             }
         )
         workers = config.workers or CPU_COUNT
+        # So would software GL; where workers are fewer than cores, it uses the others.
+        os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
         cluster = LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
