@@ -55,8 +55,8 @@ def main() -> None:
                 refused["read_only"] += 1
                 remount(disk, "rw")
                 while (done := stage(disturbed, name)).returncode:
-                    if fault := unlike_a_message(name, done, "disk is full"):
-                        raise SystemExit("\n".join([*faults, *fault]))
+                    if unlike := unlike_a_message(name, done, "disk is full"):
+                        raise SystemExit("\n".join([*faults, *unlike]))
                     refused[f"full_in_{name}"] += 1
                     grow(disk)
             faults += compared(undisturbed, disturbed)
