@@ -14,7 +14,7 @@ from conftest import REPOSITORY, STOVE, tiny_config
 
 from pipeline import __main__ as command_line
 from pipeline.errors import PipelineError
-from pipeline.run.stage import OWNER, claimed, owned
+from pipeline.run.stage import OWNER, claimed, locked, owned
 
 
 @pytest.fixture
@@ -83,4 +83,19 @@ def test_a_mark_that_cannot_be_read_is_named(clone: Path) -> None:
     mark = Path("data/tiny") / OWNER
     mark.write_text("")
     with pytest.raises(PipelineError, match=f"{mark}: cannot read which configuration"):
+        claimed(Path("configs/tiny.yaml"))
+
+
+def test_one_stage_of_a_run_works_at_a_time(tmp_path: Path) -> None:
+    with locked(tmp_path), pytest.raises(PipelineError, match="another stage of this run is running"), locked(tmp_path):
+        pass
+    with locked(tmp_path):
+        pass
+
+
+def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
+    """A stage deletes what it did not plan: what the link leads to may be somebody else's."""
+    data = claimed(Path("configs/tiny.yaml")).data
+    (data / "frames").symlink_to(clone / "configs")
+    with pytest.raises(PipelineError, match="data/tiny/frames: is a symbolic link"):
         claimed(Path("configs/tiny.yaml"))
