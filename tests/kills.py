@@ -54,11 +54,13 @@ class Killed:
     Attributes:
         kills: victim, and the stage that ran, to how often.
         runs: how often the run came to its end and was begun again, as there were kills left.
+        locks: how often DVC was killed while it wrote dvc.lock, and refused to start until the file was deleted.
         faults: what should not be.
     """
 
     kills: Counter[str] = field(default_factory=Counter)
     runs: int = 0
+    locks: int = 0
     faults: list[str] = field(default_factory=list)
 
 
@@ -67,12 +69,15 @@ def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
     rng, result = random.Random(seed), Killed()
     whole: dict[Path, int] = {}
     while result.kills.total() < kills:
+        result.locks += _without_broken_lock(clone)
         run = _started(clone)
         victim: Victim = rng.choice(("everything", "stage", "worker"))
         _wait(run, rng.uniform(0.0, LONGEST_S))
         if run.poll() is not None:
             result.runs += 1
-            result.faults += [] if run.returncode == 0 else [f"the run ended with {run.returncode}"]
+            if run.returncode:
+                result.faults.append(f"the run ended with {run.returncode}")
+                return result
             # From the beginning, but for the plan and the tables of the first run.
             for folder in ("trajectories", "frames", "rlds", "lerobot"):
                 shutil.rmtree(clone / "data" / "tiny" / folder)
@@ -86,12 +91,21 @@ def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
         stamps = {file: file.stat().st_mtime_ns for file in _stored(clone)}
         result.faults += [f"{file.name} was made again" for file, stamp in whole.items() if stamps.get(file) != stamp]
         whole = stamps
+    result.locks += _without_broken_lock(clone)
     run = _started(clone)
     if run.wait() != 0:
         result.faults.append(f"the last run ended with {run.returncode}")
     remade = [file.name for file, stamp in whole.items() if not file.exists() or file.stat().st_mtime_ns != stamp]
     result.faults += [f"{name} was made again" for name in remade]
     return result
+
+
+def _without_broken_lock(clone: Path) -> bool:
+    """Delete dvc.lock where DVC cannot read it, as setup.sh does; whether that was so."""
+    readable = subprocess.run([SCRIPTS / "dvc", "stage", "list", "--quiet"], cwd=clone, env=IN_SCRIPTS, check=False)
+    if readable.returncode:
+        (clone / "dvc.lock").unlink()
+    return readable.returncode != 0
 
 
 def _started(clone: Path) -> subprocess.Popen[bytes]:
@@ -202,6 +216,7 @@ def main() -> None:
             "kills": result.kills.total(),
             "by_victim_and_stage": dict(sorted(result.kills.items())),
             "runs_begun_again": result.runs,
+            "dvc_locks_deleted": result.locks,
             "undisturbed_s": round(alone_s, 1),
             "with_kills_s": round(time.monotonic() - start - alone_s, 1),
             "faults": len(faults),

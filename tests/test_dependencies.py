@@ -18,6 +18,7 @@ STAGES: dict[str, dict[str, Any]] = yaml.safe_load((REPOSITORY / "dvc.yaml").rea
 
 NOT_OPENED = {
     "requirements.lock": "stands for the installed packages, whose versions stages ask for",
+    "data/tiny/machine.json": "the machine is checked before any work",
     "data/tiny/inputs.json": "stands for the user's own files, which lie anywhere",
     "data/tiny/leakage.json": "an overlap with the test set stops the run before any physics",
 }

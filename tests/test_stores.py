@@ -225,6 +225,42 @@ def test_rendering_that_leaves_the_same_work_undone_is_an_error(
         render_plan(rows[:1], config, replayed, tmp_path, elsewhere)
 
 
+def given_up(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
+    """What a cluster does with work that no worker survives; see tests/test_compute.py for workers that die."""
+    return [fn.lost(item) for item in items]
+
+
+def nothing_to_do(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
+    raise AssertionError(f"{description}: {len(items)} items are made again")
+
+
+def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_again(
+    config: Config, rows: list[plan.Row], tmp_path: Path
+) -> None:
+    judged = replay_plan(rows, config.demos, config.replay, tmp_path, given_up)
+    assert judged == {rows[0].trajectory_id: Verdict(False, "worker_lost")}
+    assert replay_plan(rows, config.demos, config.replay, tmp_path, nothing_to_do) == judged
+    assert {verdict.reason for verdict in plan.select(rows, judged).values()} == {"worker_lost"}
+    assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
+    assert outcome.replayed(rows, tmp_path)
+
+
+def test_a_rendering_that_is_given_up_is_dropped_with_its_reason_and_keeps_what_was_there(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
+) -> None:
+    render_plan(rows, config, replayed, tmp_path / "at_once", given_up)
+    stored = FrameStore(tmp_path / "at_once", config.render).rows()
+    assert set(outcome.rejections(rows, stored).values()) == {"worker_lost"}
+    render_plan(rows, config, replayed, tmp_path / "at_once", nothing_to_do)
+
+    twin, lights = rows[:1], without_twins(rows)
+    render_plan(twin, config, replayed, tmp_path / "later", loop)
+    render_plan(rows, config, replayed, tmp_path / "later", given_up)
+    stored = FrameStore(tmp_path / "later", config.render).rows()
+    assert outcome.rejections(rows, stored) == dict.fromkeys((row.episode_id for row in lights), "worker_lost")
+    assert len(stored[twin[0].trajectory_id]["streams"]) == 2, "the twin's own frames stay"
+
+
 def test_reserves_are_replayed_where_frames_may_be_rejected_after_all_physics(rows: list[plan.Row]) -> None:
     start = RobotPerturbation(component="initial_joints", level=1, joint_offsets_rad=(0.01,) * 7)
     both = [

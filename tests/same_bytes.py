@@ -1,0 +1,58 @@
+"""Makes one configuration with no worker process, with 1, 2 and 4, and with 2 again, and compares all that they wrote.
+
+    python tests/same_bytes.py
+
+Each run is a `dvc repro` in a folder of its own. Only the configuration may differ. The last line is JSON.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+from conftest import dvc, in_a_clone
+from kills import STARTER, compared
+
+COMPUTE: dict[str, dict[str, object]] = {
+    "two": {"cluster": "local", "workers": 2},
+    "two again": {"cluster": "local", "workers": 2},
+    "one": {"cluster": "local", "workers": 1},
+    "four": {"cluster": "local", "workers": 4},
+    "none": {"cluster": "loop"},
+}
+"""The first is what the others are compared with."""
+
+PLAN = {
+    "seed": 14,
+    "axes": {"light": {}, "camera": {}, "noise": {}, "language": {}, "robot": {}},
+    "episodes": {"light": 1, "camera": 1, "noise": 1, "language": 1, "robot": 2},
+}
+
+
+def main() -> None:
+    seconds: dict[str, float] = {}
+    different: dict[str, list[str]] = {}
+    with tempfile.TemporaryDirectory() as temporary:
+        first = Path(temporary) / next(iter(COMPUTE))
+        for name, compute in COMPUTE.items():
+            clone = Path(temporary) / name
+            in_a_clone(STARTER | {"plan": PLAN, "compute": compute}, clone)
+            start = time.monotonic()
+            done: subprocess.CompletedProcess[str] = dvc(clone, "repro")
+            if done.returncode:
+                raise SystemExit(done.stdout + done.stderr)
+            seconds[name] = round(time.monotonic() - start, 1)
+            found = [line for line in compared(first, clone) if line != "configs/tiny.yaml is another"]
+            different[name] = found
+            print(f"{name}: {seconds[name]} s, {len(found)} files differ", *found, sep="\n  ")
+        files = sum(1 for file in (first / "data" / "tiny").rglob("*") if file.is_file())
+    faults = sum(map(len, different.values()))
+    print(json.dumps({"files": files, "seconds": seconds, "files_that_differ": faults}))
+    raise SystemExit(bool(faults))
+
+
+if __name__ == "__main__":
+    main()
