@@ -22,12 +22,13 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import psutil
-from conftest import IN_SCRIPTS, SCRIPTS, in_a_clone
+from conftest import IN_SCRIPTS, SCRIPTS, dvc, in_a_clone
 
 LONGEST_S = 20.0
 """A run is killed this long after it was started, or earlier."""
@@ -54,7 +55,7 @@ class Killed:
     Attributes:
         kills: victim, and the stage that ran, to how often.
         runs: how often the run came to its end and was begun again, as there were kills left.
-        locks: how often DVC was killed while it wrote dvc.lock, and refused to start until the file was deleted.
+        locks: how often DVC was killed while it wrote a lock file, and refused to start until the file was deleted.
         faults: what should not be.
     """
 
@@ -69,7 +70,7 @@ def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
     rng, result = random.Random(seed), Killed()
     whole: dict[Path, int] = {}
     while result.kills.total() < kills:
-        result.locks += _without_broken_lock(clone)
+        result.locks += _without_broken_locks(clone)
         run = _started(clone)
         victim: Victim = rng.choice(("everything", "stage", "worker"))
         _wait(run, rng.uniform(0.0, LONGEST_S))
@@ -87,11 +88,13 @@ def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
         result.kills[killed] += 1
         if killed.startswith("worker"):
             _wait(run, LONGEST_S)
+            if run.poll():
+                result.faults.append(f"the run did not survive: {killed}")
         result.faults += _end(run)
         stamps = {file: file.stat().st_mtime_ns for file in _stored(clone)}
         result.faults += [f"{file.name} was made again" for file, stamp in whole.items() if stamps.get(file) != stamp]
         whole = stamps
-    result.locks += _without_broken_lock(clone)
+    result.locks += _without_broken_locks(clone)
     run = _started(clone)
     if run.wait() != 0:
         result.faults.append(f"the last run ended with {run.returncode}")
@@ -100,12 +103,18 @@ def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
     return result
 
 
-def _without_broken_lock(clone: Path) -> bool:
-    """Delete dvc.lock where DVC cannot read it, as setup.sh does; whether that was so."""
-    readable = subprocess.run([SCRIPTS / "dvc", "stage", "list", "--quiet"], cwd=clone, env=IN_SCRIPTS, check=False)
-    if readable.returncode:
-        (clone / "dvc.lock").unlink()
-    return readable.returncode != 0
+def _without_broken_locks(clone: Path) -> int:
+    """Delete DVC's two lock files where DVC cannot read them, as setup.sh does; how many of them that was."""
+    broken = [] if dvc(clone, "stage", "list").returncode == 0 else [clone / "dvc.lock"]
+    with suppress(FileNotFoundError):
+        users = clone / ".dvc" / "tmp" / "rwlock"
+        try:
+            json.loads(users.read_text())
+        except ValueError:
+            broken.append(users)
+    for file in broken:
+        file.unlink()
+    return len(broken)
 
 
 def _started(clone: Path) -> subprocess.Popen[bytes]:

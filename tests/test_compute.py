@@ -8,8 +8,10 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
+import psutil
 import pytest
 from conftest import REPOSITORY
 
@@ -78,6 +80,33 @@ def test_work_that_ends_its_workers_is_given_up_or_ends_the_run_with_words(tmp_p
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
             run(die, [1], "deaths")
         assert run(square, [3], "squares") == [9], "a new worker has come"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("deaths", [1, TRIES])
+def test_workers_that_die_while_they_start_are_started_again(deaths: int, tmp_path: Path) -> None:
+    def kill_the_first_of_each_start() -> None:
+        killed: set[int] = set()
+        while len(killed) < deaths:
+            for worker in _workers_here():
+                if worker.pid not in killed and len(killed) < deaths:
+                    worker.kill()
+                    killed.add(worker.pid)
+            time.sleep(0.01)
+
+    killer = threading.Thread(target=kill_the_first_of_each_start, daemon=True)
+    killer.start()
+    refused = pytest.raises(PipelineError, match=f"{TRIES} times(?s:.*)fewer workers")
+    with (
+        nullcontext() if deaths < TRIES else refused,
+        runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run,
+    ):
+        assert run(square, [3], "squares") == [9]
+    killer.join()
+
+
+def _workers_here() -> list[psutil.Process]:
+    return [each for each in psutil.Process().children() if any("spawn_main" in word for word in each.cmdline())]
 
 
 @pytest.mark.slow

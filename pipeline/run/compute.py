@@ -98,7 +98,7 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     import dask
     from dask.system import CPU_COUNT
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
     if config.cluster == "local":
         dask.config.set(
@@ -112,16 +112,7 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
         workers = config.workers or CPU_COUNT
         # So would software GL; where workers are fewer than cores, it uses the others.
         os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
-        cluster = LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=":0",
-            memory_limit=None,
-            # An error reaches the user once, from here.
-            silence_logs=logging.CRITICAL,
-        )
-        with cluster, Client(cluster) as client:
+        with _local_cluster(workers) as cluster, Client(cluster) as client:
             client.run(_leave_interrupts_to_the_run)
             # A worker that dies while it starts is not replaced by Dask alone.
             yield _on(client, refill=partial(cluster.scale, workers))
@@ -136,6 +127,32 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
             ) from error
         with client, joined(client, folder) as workplace:
             yield _on(client, workplace)
+
+
+def _local_cluster(workers: int) -> Any:
+    """Worker processes on this machine. Where one of them dies before all have started, Dask ends them; they are
+    started once more."""
+    from distributed import LocalCluster
+
+    # An error reaches the user once, from here.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for attempt in range(TRIES):
+        try:
+            return LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=":0",
+                memory_limit=None,
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as error:
+            failure, attempts = error, attempt + 1
+    raise PipelineError(
+        f"worker processes ended while they started, {attempts} times",
+        expected="workers that live: the system may have ended them because memory ran out",
+        remedy=f"see the system's log, use fewer workers, and {GO_ON}",
+    ) from failure
 
 
 def _leave_interrupts_to_the_run() -> None:
