@@ -12,7 +12,7 @@ from arenas import TASKS
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.culling import Culling, Part
+from pipeline.rendering.culling import Culling
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame
 
@@ -51,10 +51,8 @@ def renderer(request: pytest.FixtureRequest) -> Iterator[Renderer]:
 
 def plain(renderer: Renderer, camera: str) -> Frame:
     """A frame for which everything is drawn."""
-    whole = slice(0, SCHEMA.frame.shape[0]), slice(0, SCHEMA.frame.shape[1])
     with pytest.MonkeyPatch.context() as patch:
-        everything = Part(np.ones(renderer.model.ngeom, np.bool_), True, *whole)
-        patch.setattr(Culling, "parts", lambda *_: [everything])
+        patch.setattr(Culling, "parts", lambda culling, *_: [culling.everything()])
         return renderer.frame(camera)
 
 
@@ -82,6 +80,7 @@ def test_the_same_pixels_with_less_drawn(renderer: Renderer) -> None:
 def test_the_same_pixels_in_every_arena(arena: str) -> None:
     opened = arenas.renderer(arena)
     rng = seeding.rng("test_culling", arena)
+    left_out, boxes = 0, opened._culling.boxes
     try:
         for _ in range(3):
             # The first seven are the arm's.
@@ -89,5 +88,11 @@ def test_the_same_pixels_in_every_arena(arena: str) -> None:
             mujoco.mj_forward(opened.model, opened.data)
             for camera in (view.camera for view in SCHEMA.views.values()):
                 assert np.array_equal(opened.frame(camera), plain(opened, camera)), camera
+                for part in opened._culling.parts(opened.data, camera):
+                    left_out += int((part.geoms[boxes.geom] & ~part.boxes).sum())
+                shown = opened.geoms(camera)
+                opened.frame(camera)
+                assert np.array_equal(opened.geoms(camera), shown), "which pieces a frame was drawn of does not matter"
+        assert left_out > 30, "pieces of meshes that are in the picture"
     finally:
         opened.close()

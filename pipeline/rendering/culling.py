@@ -8,17 +8,14 @@ camera; what reflects is a plate of the stove, around which little is to be seen
 from __future__ import annotations
 
 from collections.abc import Collection
-from itertools import product
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.rendering.mesh_pieces import MARGIN_M, boxes_of
 from pipeline.types import Floats
-
-MARGIN_M = 1e-3
-"""Added around every geom, for what the rasteriser rounds."""
 
 EDGE_PX = 3
 """How much wider than a reflecting box its rectangle is, for the smoothing of edges."""
@@ -29,11 +26,13 @@ class Part(NamedTuple):
 
     Attributes:
         geoms: (ngeom,) which geoms.
+        boxes: (N,) which of the model's boxes (``Boxes``): of large geoms, the pieces.
         reflections: whether one of them reflects.
         rows, columns: of the picture, the first row at the top.
     """
 
     geoms: NDArray[np.bool_]
+    boxes: NDArray[np.bool_]
     reflections: bool
     rows: slice
     columns: slice
@@ -50,10 +49,9 @@ class Culling:
     def __init__(self, model: mujoco.MjModel, height: int, width: int, hidden_groups: Collection[int]):
         self._model, self._height, self._width = model, height, width
         self._hidden_groups = list(hidden_groups)
+        self.boxes = boxes_of(model, hidden_groups)
         # A plane has no bound: it is drawn wherever it is.
-        self._unbounded = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-        centres_m, halves_m = model.geom_aabb[:, None, :3], model.geom_aabb[:, None, 3:] + MARGIN_M
-        self._corners_m: Floats = centres_m + np.array(list(product((-1, 1), repeat=3))) * halves_m
+        self._planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
         self._flat = np.flatnonzero(flat & (model.geom_matid >= 0))
 
@@ -63,38 +61,53 @@ class Culling:
         The first part is all of the picture. Where a box reflects, a further part is the rectangle around it, for which
         mirror images are drawn too; in the first part nothing reflects.
         """
-        model = self._model
+        model, boxes = self._model, self.boxes
         whole = slice(0, self._height), slice(0, self._width)
         if (model.light_castshadow & model.light_active).any():
             # A shadow may come from outside of the picture.
-            return [Part(np.ones(model.ngeom, np.bool_), True, *whole)]
+            return [self.everything()]
         view = _View(model, data, camera, self._height, self._width)
-        corners_m = data.geom_xpos[:, None] + self._corners_m @ data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
-        seen = self._unbounded | view.shows(corners_m, *whole)
+        turns = data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
+        corners_m = data.geom_xpos[boxes.geom, None] + boxes.corners_m @ turns[boxes.geom]
+        unbounded = self._planes[boxes.geom]
+        seen = unbounded | view.shows(corners_m, *whole)
         reflects = model.mat_reflectance[model.geom_matid[self._flat]] > 0
         mirrors = self._flat[reflects & ~np.isin(model.geom_group[self._flat], self._hidden_groups)]
-        seen_mirrors = mirrors[seen[mirrors]]
+        # What reflects is no mesh, and so has one box.
+        mirror_boxes = np.searchsorted(boxes.geom, mirrors)
+        seen_mirrors = mirrors[seen[mirror_boxes]]
         rectangles = [
-            whole if self._unbounded[mirror] else view.rectangle(corners_m[mirror]) or whole for mirror in seen_mirrors
+            whole if self._planes[mirror] else view.rectangle(corners_m[box]) or whole
+            for mirror, box in zip(seen_mirrors, mirror_boxes[seen[mirror_boxes]], strict=True)
         ]
         images = [self._mirrored(data, corners_m, mirror) for mirror in seen_mirrors]
-        parts = [] if whole in rectangles else [Part(seen, False, *whole)]
+        parts = [] if whole in rectangles else [self._part(seen, False, *whole)]
         for rectangle in [whole] if whole in rectangles else rectangles:
-            geoms = self._unbounded | view.shows(corners_m, *rectangle)
+            drawn = unbounded | view.shows(corners_m, *rectangle)
             for mirrored, image_m in images:
-                geoms |= mirrored & view.shows(image_m, *rectangle)
+                drawn |= mirrored & view.shows(image_m, *rectangle)
             # MuJoCo has the first of them reflect: without it, that would be another.
-            geoms[mirrors] = True
-            parts.append(Part(geoms, True, *rectangle))
+            drawn[mirror_boxes] = True
+            parts.append(self._part(drawn, True, *rectangle))
         return parts
 
+    def everything(self) -> Part:
+        """All of a picture, with all that there is."""
+        whole = slice(0, self._height), slice(0, self._width)
+        return self._part(np.ones(len(self.boxes.geom), np.bool_), True, *whole)
+
+    def _part(self, boxes: NDArray[np.bool_], reflections: bool, rows: slice, columns: slice) -> Part:
+        geoms = np.zeros(self._model.ngeom, np.bool_)
+        geoms[self.boxes.geom[boxes]] = True
+        return Part(geoms, boxes, reflections, rows, columns)
+
     def _mirrored(self, data: mujoco.MjData, corners_m: Floats, mirror: int) -> tuple[NDArray[np.bool_], Floats]:
-        """(ngeom,) which geoms have a part before a mirror, and (ngeom, 8, 3) the images of their corners.
+        """(N,) which boxes have a part before a mirror, and (N, 8, 3) the images of their corners.
 
         The reflecting side is that of a plane, or a box's upper z face (``mjr_render``).
         """
         normal = data.geom_xmat[mirror].reshape(3, 3)[:, 2]
-        face_m = 0 if self._unbounded[mirror] else self._model.geom_size[mirror, 2]
+        face_m = 0 if self._planes[mirror] else self._model.geom_size[mirror, 2]
         heights_m = (corners_m - data.geom_xpos[mirror]) @ normal - face_m
         return (heights_m > 0).any(axis=1), corners_m - 2 * heights_m[..., None] * normal
 

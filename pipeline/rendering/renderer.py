@@ -15,6 +15,7 @@ from pipeline import gl
 from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.culling import Culling
+from pipeline.rendering.mesh_pieces import MeshPieces
 from pipeline.types import Frame
 
 _CULLED = mujoco.mjNGROUP - 1
@@ -56,6 +57,8 @@ class Renderer:
         self._option.geomgroup[_CULLED] = 0
         hidden = np.flatnonzero(np.logical_not(self._option.geomgroup))
         self._culling = Culling(self.model, height, width, hidden.tolist())
+        self._renderer._gl_context.make_current()
+        self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
         """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
@@ -69,10 +72,12 @@ class Renderer:
     def frame(self, camera: str) -> Frame:
         """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
         groups = self.model.geom_group.copy()
+        self._renderer._gl_context.make_current()
         frame = np.empty((*SCHEMA.frame.shape,), np.uint8)
         try:
             for part in self._culling.parts(self.data, camera):
                 self.model.geom_group[:] = np.where(part.geoms, groups, _CULLED)
+                self._pieces.show(part.boxes)
                 self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = part.reflections
                 self._renderer.update_scene(self.data, camera, self._option)
                 frame[part.rows, part.columns] = self._renderer.render()[part.rows, part.columns]
@@ -88,6 +93,8 @@ class Renderer:
     def surfaces(self, camera: str) -> Surfaces:
         """What each pixel of :meth:`frame` shows of the restored state."""
         self._renderer.enable_segmentation_rendering()
+        self._renderer._gl_context.make_current()
+        self._pieces.show(self._culling.everything().boxes)
         try:
             self._renderer.update_scene(self.data, camera, self._option)
             number, kind = np.moveaxis(self._renderer.render()[::-1], -1, 0)
