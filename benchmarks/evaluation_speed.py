@@ -18,7 +18,7 @@ import json
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from typing import Any
 
 from pipeline import gl
@@ -32,9 +32,9 @@ from vla_eval.benchmarks.libero.benchmark import LIBEROBenchmark  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
-from pipeline.evaluation import replay_server  # noqa: E402
 from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.policies import Server, checked_actions  # noqa: E402
+from pipeline.evaluation.replay_server import replaying  # noqa: E402
 from pipeline.evaluation.settings import Wanted  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select  # noqa: E402
 
@@ -129,15 +129,11 @@ def main() -> None:
     arguments = parser.parse_args()
     episodes = select(Selection(tasks=tuple(arguments.tasks), episodes=arguments.states))
     results: dict[str, Any] = {"device": CHOICE.device, "episodes": len(episodes)}
-    with server(1) as address, server(CHUNK) as in_chunks:
+    with replaying(1) as address, replaying(CHUNK) as in_chunks:
         for views, both_views in (("agent_view", False), ("both_views", True)):
             results[views] = compared(episodes, arguments.steps, address, in_chunks, both_views)
             print(f"{views}: {json.dumps(results[views])}")
     print(json.dumps(results))
-
-
-def server(chunk: int) -> AbstractContextManager[str]:
-    return replay_server.running("-m", replay_server.__name__, "--args.chunk", str(chunk))
 
 
 def compared(

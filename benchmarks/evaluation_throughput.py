@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation import replay_server
+from pipeline.evaluation.replay_server import replaying
 from pipeline.libero.tasks import find_task
 
 TASKS = (
@@ -43,7 +43,7 @@ def main() -> None:
     arguments = parser.parse_args()
     tasks = [tuple(task.split("/")) for task in arguments.tasks]
     figures: dict[str, Any] = {"cores": CORES, "tasks": arguments.tasks, "states": arguments.states}
-    with tempfile.TemporaryDirectory() as folder, served(1) as one_by_one, served(CHUNK) as in_chunks:
+    with tempfile.TemporaryDirectory() as folder, replaying(1) as one_by_one, replaying(CHUNK) as in_chunks:
         out = Path(folder)
         for name, commands in {
             "harness": harness(tasks, arguments.states, one_by_one, out / "harness", 1),
@@ -69,10 +69,6 @@ def main() -> None:
             figures[name]["successes"] = sum(row["success"] for row in rows)
             figures[name]["steps"] = sum(row["steps"] for row in rows)
     print(json.dumps(figures))
-
-
-def served(chunk: int) -> Any:
-    return replay_server.running("-m", replay_server.__name__, "--args.chunk", str(chunk))
 
 
 def harness(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Path, shards: int) -> list[list[str]]:

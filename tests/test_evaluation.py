@@ -26,9 +26,10 @@ from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 
 from pipeline.axes.camera import CameraPerturbation  # noqa: E402
 from pipeline.errors import PipelineError  # noqa: E402
-from pipeline.evaluation import libero_plus, replay_server  # noqa: E402
+from pipeline.evaluation import libero_plus  # noqa: E402
 from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.initial_states import libero_states  # noqa: E402
+from pipeline.evaluation.replay_server import replaying  # noqa: E402
 from pipeline.evaluation.settings import Wanted  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select  # noqa: E402
 from pipeline.rendering.jpeg import to_policy  # noqa: E402
@@ -197,7 +198,7 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -
 
 @pytest.mark.slow
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
-    with replay_server.running("-m", replay_server.__name__, "--args.chunk", "8") as address:
+    with replaying(8) as address:
         ours = tmp_path / "ours"
         arguments = ["--suite", "libero_goal", "--server", address, "--workers", "1", "--videos", "all"]
         subprocess.run(command(ours, *arguments), cwd=REPOSITORY, check=True)

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 from vla_eval.model_servers.base import ModelServer, SessionContext
@@ -81,6 +81,15 @@ def running(*program: str) -> Iterator[str]:
     finally:
         server.terminate()
         server.wait()
+
+
+def replaying(chunk: int) -> AbstractContextManager[str]:
+    """Run this server in a process of its own; its address, while it is entered.
+
+    Args:
+        chunk: how many actions each answer has.
+    """
+    return running("-m", "pipeline.evaluation.replay_server", "--args.chunk", str(chunk))
 
 
 if __name__ == "__main__":

@@ -171,6 +171,14 @@ class HDF5Source:
         with self._data(task) as data:
             return self._read(task, key, data)
 
+    def count(self, task: Task) -> int:
+        """How many demonstrations the file of a task holds; 0 where it is missing or cannot be read."""
+        try:
+            with self._data(task) as data:
+                return len(hdf5.names(data, str(self._path(task))))
+        except PipelineError:
+            return 0
+
     def _path(self, task: Task) -> Path:
         return self.root / task.suite / f"{task.name}_demo.hdf5"
 

@@ -118,15 +118,15 @@ class Reader:
             return TestChange(base.name, "robot", "initial_joints", {"id": int(number)})
         if view := match["view"]:
             return TestChange(base.name, "camera", *_camera(*map(int, view.split("_"))))
-        problem = self._heading(suite, name).problem
-        if light := _LIGHT.fullmatch(problem):
-            return TestChange(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
         if match["layout"]:
             return TestChange(base.name, "layout", "objects", _added(self._scene(suite, name)))
         if match["level"]:
             moved = _displacement(self._scene(suite, name), bddl.read(base.bddl_file))
             drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
             return TestChange(base.name, "pose", "pose", {**drawn, **moved})
+        problem = self._heading(suite, name).problem
+        if light := _LIGHT.fullmatch(problem):
+            return TestChange(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
         component = "theme" if match["theme"] else "surface"
         return TestChange(base.name, "background", component, self._textures(problem, component == "theme"))
 

