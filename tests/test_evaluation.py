@@ -96,8 +96,8 @@ def test_a_camera_task_is_seen_from_the_axis_camera(evaluated: EpisodeEnvironmen
     clean = evaluated.observation(Wanted())["images"]
     evaluated.reset(task)
     moved = evaluated.observation(Wanted())["images"]
-    assert evaluated._picture._renderer is not None
-    camera = evaluated._picture._renderer.model.camera("agentview")
+    assert evaluated._picture._opened._renderer is not None
+    camera = evaluated._picture._opened._renderer.model.camera("agentview")
     test = libero_plus.by_name()[task.suite, task.name]
     own = CameraPerturbation.model_validate({"component": test.component, "level": 1, **test.parameters})
     nominal = evaluated._opened.model.camera("agentview")

@@ -302,7 +302,7 @@ def test_nothing_is_said_and_black_views_are_not_rendered() -> None:
         "agentview": ((256, 256, 3), np.False_),
         "wrist": ((256, 256, 3), np.False_),
     }
-    assert environment._picture._renderer is None
+    assert environment._picture._opened._renderer is None
     environment.settings = Settings(black="agentview")
     environment.reset(task)
     images = environment.observation(Wanted())["images"]

@@ -106,6 +106,8 @@ def add_commands(commands: Any) -> None:
 
 def _evaluate(arguments: argparse.Namespace) -> int:
     # The simulator takes seconds to import, which the other commands can do without.
+    from dask.system import CPU_COUNT
+
     from pipeline.evaluation.evaluate import PolicyConfig, evaluate
     from pipeline.evaluation.settings import Settings
     from pipeline.evaluation.tasks import Selection
@@ -136,8 +138,9 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         look_every=arguments.look_every,
         timeout_s=arguments.timeout,
     )
-    compute = ComputeConfig(cluster="loop" if arguments.workers == 1 else "local", workers=arguments.workers)
+    workers = arguments.workers or CPU_COUNT
+    compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
     with runner(compute, arguments.out) as run:
-        found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets)
+        found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
     return 0

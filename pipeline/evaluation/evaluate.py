@@ -35,6 +35,9 @@ from pipeline.types import Frame
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
 
+JOBS_A_WORKER = 4
+"""With few episodes, jobs are made smaller until there are so many, or one worker would end long after the others."""
+
 SCENE_AXES = ("pose", "layout", "light", "background")
 """The axes whose test tasks have a scene each."""
 
@@ -196,6 +199,7 @@ def evaluate(
     run: Run,
     videos: Videos = "none",
     archive: Path | None = None,
+    workers: int = 1,
 ) -> dict[str, Any]:
     """Run what ``folder`` does not hold yet, and write ``summary.json`` of what was selected.
 
@@ -204,6 +208,7 @@ def evaluate(
     Args:
         videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
         archive: folder of LIBERO-Plus's asset archive, where there is one.
+        workers: how many share the work. Results do not depend on it.
 
     Returns:
         The summary.
@@ -218,7 +223,9 @@ def evaluate(
     missing = [task for episode, task in wanted.items() if not files.path(episode).exists()]
     if missing:
         device = gl.choose().device
-        jobs = [EvaluationJob(tasks, settings, policy, folder, device, videos, archive) for tasks in _jobs(missing)]
+        jobs = [
+            EvaluationJob(tasks, settings, policy, folder, device, videos, archive) for tasks in _jobs(missing, workers)
+        ]
         faults = [fault for of_job in run(EvaluationJob.__call__, jobs, "evaluate") for fault in of_job]
     found = summary(row for row in files.rows() if row["episode"] in wanted)
     found |= {
@@ -233,16 +240,17 @@ def evaluate(
     return found
 
 
-def _jobs(missing: Sequence[EvaluationTask]) -> list[tuple[EvaluationTask, ...]]:
+def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
     for task in missing:
         own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
         moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
+    size = EPISODES_A_JOB if workers == 1 else len(missing) // (workers * JOBS_A_WORKER)
     jobs = []
     for scene in scenes.values():
         ordered = iter(sorted(scene, key=lambda task: (task.axis == "robot", task.number, task.name)))
-        while job := tuple(islice(ordered, EPISODES_A_JOB)):
+        while job := tuple(islice(ordered, min(max(1, size), EPISODES_A_JOB))):
             jobs.append(job)
     return jobs

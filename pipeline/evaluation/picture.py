@@ -14,23 +14,23 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.settings import VIEWS
 from pipeline.evaluation.simulator import Observed
 from pipeline.rendering.jpeg import to_policy
-from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.types import Frame
 
 
 class Picture:
-    """Renders one scene after the other; episodes of the same scene share a renderer."""
+    """Renders one scene after the other; episodes of the same meshes and textures share an OpenGL context."""
 
     def __init__(self) -> None:
+        self._opened = LastScene()
         self._scene: mujoco.MjModel | str | None = None
-        self._renderer: Renderer | None = None
         self._looks: Sequence[AnyPerturbation] | None = None
         self._changes = ExitStack()
 
     def show(self, scene: mujoco.MjModel | str) -> None:
         """Render from here on a model, or a scene's MJCF where the model is without its images."""
         if scene is not self._scene:
-            self.close()
+            self.restore()
             self._scene = scene
 
     def frame(self, view: str, observed: Observed, perturbations: Sequence[AnyPerturbation], step: int) -> Frame:
@@ -58,18 +58,16 @@ class Picture:
     def close(self) -> None:
         self.restore()
         self._scene = None
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._opened.close()
 
     def _with_looks(self, perturbations: Sequence[AnyPerturbation]) -> Renderer:
         if self._scene is None:
             raise PipelineError("no episode was started", remedy="reset first")
-        if self._renderer is None:
-            self._renderer = Renderer(self._scene)
         if self._looks is not perturbations:
             self.restore()
+        renderer = self._opened.renderer(self._scene)
+        if self._looks is not perturbations:
             looks = of_layer(perturbations, RenderPerturbation)
-            self._changes.enter_context(self._renderer.perturbed(looks))
+            self._changes.enter_context(renderer.perturbed(looks))
             self._looks = perturbations
-        return self._renderer
+        return renderer

@@ -7,6 +7,7 @@ camera; what reflects is a plate of the stove, around which little is to be seen
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Collection
 from typing import NamedTuple
 
@@ -54,6 +55,12 @@ class Culling:
         self._planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
         self._flat = np.flatnonzero(flat & (model.geom_matid >= 0))
+
+    def of(self, model: mujoco.MjModel) -> Culling:
+        """The same for a model that has the same geoms in other places."""
+        other = copy.copy(self)
+        other._model = model
+        return other
 
     def parts(self, data: mujoco.MjData, camera: str) -> list[Part]:
         """What a picture of the data's state is made of; positions must be up to date.

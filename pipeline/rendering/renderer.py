@@ -18,6 +18,12 @@ from pipeline.rendering.culling import Culling
 from pipeline.rendering.mesh_pieces import MeshPieces
 from pipeline.types import Frame
 
+_UPLOADED = (
+    *(name for name in dir(mujoco.MjModel) if name.startswith(("tex_", "mat_tex", "mesh_", "hfield_", "skin_"))),
+    *("geom_type", "geom_dataid", "geom_matid", "geom_group", "geom_aabb"),
+)
+"""What a model's GL context was made from, textures and shapes, and what tells which geom has which."""
+
 _CULLED = mujoco.mjNGROUP - 1
 """A group of geoms that nothing in LIBERO is in, and that is not drawn."""
 
@@ -48,7 +54,7 @@ class Renderer:
     def __init__(self, scene: str | mujoco.MjModel):
         gl.prepare()
         height, width, _ = SCHEMA.frame.shape
-        self.model = mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else copy.copy(scene)
+        self.model = _compiled(scene)
         self.data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()
@@ -59,6 +65,24 @@ class Renderer:
         self._culling = Culling(self.model, height, width, hidden.tolist())
         self._renderer._gl_context.make_current()
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
+
+    def adopted(self, scene: str | mujoco.MjModel) -> bool:
+        """Go on with another scene, where its meshes and textures are those that are in the GL context already.
+
+        Returns:
+            Whether it is so; else nothing is changed.
+        """
+        model = _compiled(scene)
+        if not all(np.array_equal(getattr(self.model, name), getattr(model, name)) for name in _UPLOADED):
+            return False
+        self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
+        self._culling = self._culling.of(model)
+        context = self._renderer._mjr_context
+        # What a context keeps of a model's size, as mjr_makeContext works it out.
+        context.shadowClip = model.stat.extent * model.vis.map.shadowclip
+        context.fogStart = model.stat.extent * model.vis.map.fogstart
+        context.fogEnd = model.stat.extent * model.vis.map.fogend
+        return True
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
         """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
@@ -157,26 +181,36 @@ class Renderer:
         self._renderer.close()
 
 
-class LastScene:
-    """Keeps the renderer of the last scene open for whoever asks for the same scene next; only one is open at a time.
+def _compiled(scene: str | mujoco.MjModel) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else copy.copy(scene)
 
-    To compile a scene and open its context takes about three seconds on one core.
+
+class LastScene:
+    """Keeps the renderer of the last scene open for whoever asks for the same scene next, or for one of the same
+    meshes and textures; only one is open at a time.
+
+    To compile a scene takes a second on one core, and to open its context two.
     """
 
     def __init__(self) -> None:
         self._renderer: Renderer | None = None
-        self._model_xml: str | None = None
+        self._scene: str | mujoco.MjModel | None = None
 
-    def renderer(self, model_xml: str) -> Renderer:
-        """The renderer of a scene, by its MJCF.
+    def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
+        """The renderer of a scene, by its MJCF or by a compiled model, which must not change meanwhile.
 
         Raises:
             PipelineError: when nothing renders on this machine.
         """
-        if self._renderer is None or self._model_xml != model_xml:
-            self.close()
-            self._renderer, self._model_xml = Renderer(model_xml), model_xml
+        if self._renderer is None or not self._is_last(scene):
+            if self._renderer is None or not self._renderer.adopted(scene):
+                self.close()
+                self._renderer = Renderer(scene)
+            self._scene = scene
         return self._renderer
+
+    def _is_last(self, scene: str | mujoco.MjModel) -> bool:
+        return scene is self._scene or (isinstance(scene, str) and scene == self._scene)
 
     def close(self) -> None:
         if self._renderer is not None:
