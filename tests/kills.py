@@ -3,9 +3,9 @@
     python tests/kills.py [--kills 50] [--seed 0]
 
 Two folders get the same configuration. In one `dvc repro` runs undisturbed. In the other it is killed by SIGKILL again
-and again, after a time that is drawn: everything at once, the stage's process alone, or one of its workers, which the
-run has to survive. In the end both must hold the same files with the same bytes, and no file that was whole at a kill
-may have been made again. The last line is JSON.
+and again, in any stage and after a time that is drawn: everything at once, the stage's process alone, or one of its
+workers, which the run has to survive. In the end both must hold the same files with the same bytes, and no file that
+was whole at a kill may have been made again. The last line is JSON.
 """
 
 from __future__ import annotations
@@ -21,17 +21,22 @@ import subprocess
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import psutil
 from conftest import IN_SCRIPTS, SCRIPTS, dvc, in_a_clone
 
-LONGEST_S = 20.0
-"""A run is killed this long after it was started, or earlier."""
+CHANCE = 0.5
+"""So likely is a kill in each stage that works."""
+GUESS_S = 5.0
+"""How long a stage takes, where no run was watched."""
+SURVIVES_S = 20.0
+"""So long a run whose worker was killed goes on before it is killed as well."""
 ALONE_S = 60.0
 """So long processes may live on after what started them was killed."""
 
@@ -65,15 +70,22 @@ class Killed:
     faults: list[str] = field(default_factory=list)
 
 
-def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
-    """Kill the run of a clone so often, then let it end."""
+def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float] = MappingProxyType({})) -> Killed:
+    """Kill the run of a clone so often, then let it end.
+
+    Args:
+        took_s: how long each stage took in a run that was left alone; kills are spread over it.
+    """
     rng, result = random.Random(seed), Killed()
     whole: dict[Path, int] = {}
     while result.kills.total() < kills:
         result.locks += _without_broken_locks(clone)
         run = _started(clone)
         victim: Victim = rng.choice(("everything", "stage", "worker"))
-        _wait(run, rng.uniform(0.0, LONGEST_S))
+        for stage in _stages(run):
+            if rng.random() < CHANCE:
+                _wait(run, rng.uniform(0.0, took_s.get(stage, GUESS_S)))
+                break
         if run.poll() is not None:
             result.runs += 1
             if run.returncode:
@@ -87,7 +99,7 @@ def kill_and_resume(clone: Path, kills: int, seed: int) -> Killed:
         killed = _kill(run, victim)
         result.kills[killed] += 1
         if killed.startswith("worker"):
-            _wait(run, LONGEST_S)
+            _wait(run, SURVIVES_S)
             if run.poll():
                 result.faults.append(f"the run did not survive: {killed}")
         result.faults += _end(run)
@@ -129,14 +141,42 @@ def _wait(run: subprocess.Popen[bytes], seconds: float) -> None:
         time.sleep(0.02)
 
 
+def _stages(run: subprocess.Popen[bytes]) -> Iterator[str]:
+    """The name of each stage that works, once it has begun, until the run ends."""
+    last = ""
+    while run.poll() is None:
+        name = next((name for name, _ in _working(run)), "")
+        if name and name != last:
+            yield name
+        last = name
+        time.sleep(0.1)
+
+
+def _working(run: subprocess.Popen[bytes]) -> list[tuple[str, psutil.Process]]:
+    """The stage that works, and its process."""
+    with suppress(psutil.Error):
+        below = [(_command(process), process) for process in psutil.Process(run.pid).children(recursive=True)]
+        return [(Path(words[1]).stem, each) for words, each in below if words[1:] and words[1].startswith("stages/")]
+    return []
+
+
+def watched(run: subprocess.Popen[bytes]) -> dict[str, float]:
+    """How many seconds each stage of a run takes that is left alone."""
+    took_s: dict[str, float] = {}
+    began, last = time.monotonic(), ""
+    for name in _stages(run):
+        took_s[last] = time.monotonic() - began
+        began, last = time.monotonic(), name
+    return {**took_s, last: time.monotonic() - began}
+
+
 def _kill(run: subprocess.Popen[bytes], victim: Victim) -> str:
     """Kill a victim, or everything where there is no such one at the moment; says what, and in which stage."""
+    working = _working(run)
+    stage = working[0][0] if working else "dvc"
     below = psutil.Process(run.pid).children(recursive=True)
-    with_commands = [(process, _command(process)) for process in below]
-    stages = [(process, words) for process, words in with_commands if len(words) > 1 and words[1].startswith("stages/")]
-    stage = Path(stages[0][1][1]).stem if stages else "dvc"
-    workers = [process for process, words in with_commands if any("spawn_main" in word for word in words)]
-    chosen = {"everything": [], "stage": [process for process, _ in stages], "worker": workers}[victim]
+    workers = [process for process in below if any("spawn_main" in word for word in _command(process))]
+    chosen = {"everything": [], "stage": [process for _, process in working], "worker": workers}[victim]
     if not chosen:
         os.killpg(run.pid, signal.SIGKILL)
         return f"everything in {stage}"
@@ -214,10 +254,12 @@ def main() -> None:
         for clone in (undisturbed, disturbed):
             in_a_clone(STARTER, clone)
         start = time.monotonic()
-        if _started(undisturbed).wait() != 0:
+        alone = _started(undisturbed)
+        took_s = watched(alone)
+        if alone.wait() != 0:
             raise SystemExit((folder / "undisturbed.log").read_text())
         alone_s = time.monotonic() - start
-        result = kill_and_resume(disturbed, arguments.kills, arguments.seed)
+        result = kill_and_resume(disturbed, arguments.kills, arguments.seed, took_s)
         faults = result.faults + compared(undisturbed, disturbed)
         for fault in faults:
             print(fault)
