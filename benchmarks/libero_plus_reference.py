@@ -69,7 +69,7 @@ def initial_state(root: Path, suite: str, name: str) -> Any:
     if "_add_" in name or "_level" in name:
         path = root / "init_files" / "libero_newobj" / suite / f"{name}.pruned_init"
     else:
-        base = re.split("_language_|_view_|_table_|_tb_|_light_", name)[0]
+        base = re.split(r"_language_|_view_|_table_(?=\d)|_tb_|_light_", name)[0]
         path = root / "init_files" / suite / f"{base}.pruned_init"
     with zipfile.ZipFile(path) as archive:
         (member,) = (member for member in archive.namelist() if member.endswith("/data.pkl"))
