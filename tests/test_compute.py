@@ -64,6 +64,14 @@ def mark(file: Path) -> None:
     time.sleep(0.1)
 
 
+def test_progress_is_counted_in_what_items_hold(capsys: pytest.CaptureFixture[str]) -> None:
+    """Else a bar of few large items stands still, and the time that is left is wrong."""
+    work = Expendable(square, limit_s=lambda _: 1.0, lost=square, size=lambda number: number)
+    assert loop(work, [1, 9, 10], "squares, sides") == [1, 81, 100]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.split(",")[1].split(": ")[1] for line in lines] == ["10/20", "20/20"]
+
+
 def die_or_hang(number: int) -> int:
     if number == 2:
         die(number)

@@ -87,6 +87,7 @@ class MeshPieces:
         from OpenGL import GL
 
         self._gl, self._base = GL, context.baseMesh
+        self._forget_errors()
         meshes = model.geom_dataid[boxes.geom]
         counts = {int(mesh): int(boxes.piece[meshes == mesh].max()) + 1 for mesh in meshes[boxes.piece > 0]}
         self._boxes = {mesh: np.flatnonzero(meshes == mesh) for mesh in counts}
@@ -106,6 +107,7 @@ class MeshPieces:
         Args:
             seen: (N,) which of the boxes.
         """
+        self._forget_errors()
         for mesh, boxes in self._boxes.items():
             lists = self._lists[mesh]
             pieces = np.zeros(len(lists), np.bool_)
@@ -116,6 +118,10 @@ class MeshPieces:
                 self._gl.glCallLists(called)
                 self._gl.glEndList()
                 self._shown[mesh] = called.tobytes()
+
+    def _forget_errors(self) -> None:
+        """Else PyOpenGL would raise here what MuJoCo's own calls have left."""
+        self._gl.glGetError()
 
 
 def _upload(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, first: int, faces: int) -> int:

@@ -148,9 +148,12 @@ class RenderJob:
             )
         store.save(self.trajectory_id, rendered, device)
 
+    def frames_at_most(self) -> int:
+        return self.steps * len(self.streams)
+
     def limit_s(self) -> float:
         """So long it may take before it counts as hanging: about twenty times what a frame takes without a GPU."""
-        return 1800.0 + 2.0 * self.steps * len(self.streams)
+        return 1800.0 + 2.0 * self.frames_at_most()
 
     def lost(self) -> None:
         """Store that no worker survived the streams that are missing, or finished them, beside those that are there.
@@ -231,5 +234,6 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
             )
         undone = jobs
         # The longest first, so that no worker is left alone with one at the end.
-        longest_first = sorted(jobs, key=lambda job: -job.steps * len(job.streams))
-        run(Expendable(RenderJob.__call__, RenderJob.limit_s, RenderJob.lost), longest_first, "render")
+        longest_first = sorted(jobs, key=RenderJob.frames_at_most, reverse=True)
+        work = Expendable(RenderJob.__call__, RenderJob.limit_s, RenderJob.lost, RenderJob.frames_at_most)
+        run(work, longest_first, "render, frames")

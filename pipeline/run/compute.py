@@ -49,11 +49,13 @@ class Expendable(Generic[Item, Result]):
         fn: the function.
         limit_s: so long an item may take; then it hangs, and its worker is ended. Far above what any takes.
         lost: called in the run's own process; what it returns takes the place of the item's result.
+        size: how much of the work an item is, where items are not alike; progress is counted in it.
     """
 
     fn: Callable[[Item], Result]
     limit_s: Callable[[Item], float]
     lost: Callable[[Item], Result]
+    size: Callable[[Item], int] = lambda item: 1
 
     def __call__(self, item: Item) -> Result:
         return self.fn(item)
@@ -71,12 +73,17 @@ class Run(Protocol):
 
 def loop(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
     """Everything in this process, one after the other: for debugging and small jobs. What ends it ends the run."""
-    with _progress(description, len(items)) as advance:
+    sizes = _sizes(fn, items)
+    with _progress(description, sum(sizes)) as advance:
         results = []
-        for item in items:
+        for item, size in zip(items, sizes, strict=True):
             results.append(fn(item))
-            advance()
+            advance(size)
         return results
+
+
+def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
+    return [fn.size(item) if isinstance(fn, Expendable) else 1 for item in items]
 
 
 @contextmanager
@@ -212,13 +219,14 @@ def _on(client: Any, workplace: Workplace | None = None, refill: Callable[[], No
         work = limited if workplace is None else InPlace(limited, workplace)
         results: dict[int, Result] = {}
         deadly: list[int] = []
-        with _progress(description, len(items)) as advance, closing(ended(work, items)) as outcomes:
+        sizes = _sizes(fn, items)
+        with _progress(description, sum(sizes)) as advance, closing(ended(work, items)) as outcomes:
             for number, outcome in outcomes:
                 if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
                     deadly.append(number)
                     continue
                 results[number] = _result(outcome)
-                advance()
+                advance(sizes[number])
             for number in deadly:
                 # Alone now: another item may have ended the workers that this one waited on.
                 ((_, outcome),) = ended(work, [items[number]])
@@ -226,7 +234,7 @@ def _on(client: Any, workplace: Workplace | None = None, refill: Callable[[], No
                     results[number] = fn.lost(items[number])
                 else:
                     results[number] = _result(outcome)
-                advance()
+                advance(sizes[number])
         return [results[number] for number in range(len(items))]
 
     return run
@@ -285,7 +293,7 @@ def _killed(error: Any) -> PipelineError:
 
 
 @contextmanager
-def _progress(description: str, total: int) -> Iterator[Callable[[], None]]:
+def _progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
     """A bar with rate and ETA on a terminal; a line every tenth of the way where there is none."""
     console = Console(stderr=True)
     columns = (
@@ -300,15 +308,15 @@ def _progress(description: str, total: int) -> Iterator[Callable[[], None]]:
     )
     with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task(description, total=total, rate="")
-        marks = {round(total * tenth / 10) for tenth in range(1, 11)}
 
-        def advance() -> None:
-            progress.advance(task)
+        def advance(size: int) -> None:
             state = progress.tasks[task]
+            tenths = int(10 * state.completed / total)
+            progress.advance(task, size)
             done = int(state.completed)
             rate = done / max(state.elapsed or 0.0, 1e-9)
             progress.update(task, rate=f"{rate:.2f}/s")
-            if not console.is_terminal and done in marks:
+            if not console.is_terminal and int(10 * done / total) > tenths:
                 left = (total - done) / rate
                 console.print(f"{description}: {done}/{total}, {rate:.2f}/s, {left:.0f} s left", highlight=False)
 
