@@ -40,6 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--tasks", nargs="+", default=list(TASKS), metavar="SUITE/TASK")
     parser.add_argument("--states", type=int, default=2, help="initial states of each task")
+    parser.add_argument("--quick", action="store_true", help="leave out the shards and the single worker")
     arguments = parser.parse_args()
     tasks = [tuple(task.split("/")) for task in arguments.tasks]
     figures: dict[str, Any] = {"cores": CORES, "tasks": arguments.tasks, "states": arguments.states}
@@ -52,6 +53,8 @@ def main() -> None:
             "ours": [ours(tasks, arguments.states, one_by_one, out / "ours")],
             f"ours_look_in_{CHUNK}": [ours(tasks, arguments.states, in_chunks, out / "ours_in_chunks")],
         }.items():
+            if arguments.quick and ("shards" in name or "1_worker" in name):
+                continue
             figures[name] = timed(commands, len(tasks) * arguments.states)
             for kind in ("wall", "cpu"):
                 ratio = figures["harness"][f"{kind}_s"] / figures[name][f"{kind}_s"]
