@@ -144,6 +144,14 @@ def keep_below(folder: Path, files: set[Path]) -> None:
                 remove(entry)
 
 
+def remove_leftovers(folder: Path) -> None:
+    """Delete what ``replaced`` left beside a folder's files where its process was killed."""
+    for temporary in folder.glob(".*.tmp"):
+        process = Path("/proc", temporary.name.split(".")[-2])
+        if not process.exists():
+            remove(temporary)
+
+
 def remove_if_empty(folder: Path) -> None:
     if folder.is_dir() and not any(folder.iterdir()):
         folder.rmdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -91,6 +92,21 @@ def test_one_stage_of_a_run_works_at_a_time(tmp_path: Path) -> None:
         pass
     with locked(tmp_path):
         pass
+
+
+def test_what_a_killed_stage_left_goes_with_the_next_one(tmp_path: Path) -> None:
+    """A stage that found nothing to do would leave it for ever."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    left, whole = tmp_path / f".previews.{dead.pid}.tmp", tmp_path / "previews"
+    for folder in (left, whole):
+        (folder / "libero_goal").mkdir(parents=True)
+    being_written = tmp_path / f".report.html.{os.getpid()}.tmp"
+    being_written.touch()
+    with locked(tmp_path):
+        assert not left.exists()
+        assert whole.exists()
+        assert being_written.exists()
 
 
 def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:

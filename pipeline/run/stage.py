@@ -13,6 +13,7 @@ from pathlib import Path
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import exit_status
+from pipeline.files import remove_leftovers
 
 OWNER = "configuration.json"
 """File of a run's folder that says which configuration file the folder belongs to."""
@@ -58,7 +59,9 @@ def claimed(file: Path) -> Config:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other stages out of a run's folder. The system ends the lock with this process, however it ends.
+    """Keep other stages out of a run's folder, and clear what killed ones left in it.
+
+    The system ends the lock with this process, however it ends.
 
     Raises:
         PipelineError: when a stage runs there.
@@ -73,6 +76,7 @@ def locked(folder: Path) -> Iterator[None]:
                 expected="one stage at a time, as each reads what the one before it has finished",
                 remedy="wait for it, or stop it; `dvc repro` runs all stages in order",
             ) from error
+        remove_leftovers(folder)
         yield
 
 
