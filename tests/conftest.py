@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -112,11 +112,16 @@ def once(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Once:
 @pytest.fixture(scope="session")
 def whole(once: Once) -> dict[Task, Trajectory]:
     """The three demonstrations replayed from start to end."""
-    store = TrajectoryStore(once("whole", _replay_whole))
+    folder = once("whole", replay_whole)
+    return loaded_whole(folder)
+
+
+def loaded_whole(folder: Path) -> dict[Task, Trajectory]:
+    store = TrajectoryStore(folder)
     return {task: store.load(task.name) for task in SHORT}
 
 
-def _replay_whole(folder: Path) -> None:
+def replay_whole(folder: Path) -> None:
     for task in SHORT:
         environment = Environment(task)
         trajectory = replay(environment, starter_demo(task), task.name, ReplayConfig())
@@ -128,10 +133,10 @@ def _replay_whole(folder: Path) -> None:
 @pytest.fixture(scope="session")
 def short_demos(whole: dict[Task, Trajectory], once: Once) -> Path:
     """A root of HDF5 demonstrations: one of each task that succeeds, and one of the milk that only waits."""
-    return once("demos", partial(_write_short_demos, whole))
+    return once("demos", partial(write_short_demos, whole))
 
 
-def _write_short_demos(whole: dict[Task, Trajectory], root: Path) -> None:
+def write_short_demos(whole: Mapping[Task, Trajectory], root: Path) -> None:
     for task, steps in SHORT.items():
         trajectory = whole[task]
         states = trajectory.states[-steps - 1 : -1]

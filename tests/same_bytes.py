@@ -2,7 +2,8 @@
 
     python tests/same_bytes.py
 
-Each run is a `dvc repro` in a folder of its own. Only the configuration may differ. The last line is JSON.
+Each run is a `dvc repro` in a folder of its own, on the tests' short demonstrations. Of their files only the
+configuration may differ. The last line is JSON.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from conftest import dvc, in_a_clone
-from kills import STARTER, compared
+from conftest import dvc, in_a_clone, loaded_whole, replay_whole, tiny_config, write_short_demos
+from kills import compared
 
 COMPUTE: dict[str, dict[str, object]] = {
     "two": {"cluster": "local", "workers": 2},
@@ -25,21 +26,26 @@ COMPUTE: dict[str, dict[str, object]] = {
 }
 """The first is what the others are compared with."""
 
-PLAN = {
-    "seed": 14,
-    "axes": {"light": {}, "camera": {}, "noise": {}, "language": {}, "robot": {}},
-    "episodes": {"light": 1, "camera": 1, "noise": 1, "language": 1, "robot": 2},
-}
-
 
 def main() -> None:
     seconds: dict[str, float] = {}
     different: dict[str, list[str]] = {}
     with tempfile.TemporaryDirectory() as temporary:
         first = Path(temporary) / next(iter(COMPUTE))
+        whole, demos = Path(temporary) / "whole", Path(temporary) / "demos"
+        whole.mkdir()
+        replay_whole(whole)
+        write_short_demos(loaded_whole(whole), demos)
+        config = tiny_config(demos)
+        config["plan"] = {
+            "seed": 14,
+            "axes": {"light": {}, "camera": {}, "noise": {}, "language": {}, "layout": {}},
+            "episodes": {"light": 2, "camera": 3, "noise": 4, "language": 3, "layout": 2},
+            "reserve": 0.5,
+        }
         for name, compute in COMPUTE.items():
             clone = Path(temporary) / name
-            in_a_clone(STARTER | {"plan": PLAN, "compute": compute}, clone)
+            in_a_clone(config | {"compute": compute}, clone)
             start = time.monotonic()
             done: subprocess.CompletedProcess[str] = dvc(clone, "repro")
             if done.returncode:
