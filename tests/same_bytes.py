@@ -14,7 +14,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from conftest import dvc, in_a_clone, loaded_whole, replay_whole, tiny_config, write_short_demos
+from conftest import STOVE, dvc, in_a_clone, loaded_whole, replay_whole, tiny_config, write_short_demos
 from kills import compared
 
 COMPUTE: dict[str, dict[str, object]] = {
@@ -26,6 +26,8 @@ COMPUTE: dict[str, dict[str, object]] = {
 }
 """The first is what the others are compared with."""
 
+AXES = ("camera", "light", "noise", "language", "layout")
+
 
 def main() -> None:
     seconds: dict[str, float] = {}
@@ -36,12 +38,9 @@ def main() -> None:
         whole.mkdir()
         replay_whole(whole)
         write_short_demos(loaded_whole(whole), demos)
-        config = tiny_config(demos)
-        config["plan"] = {
-            "seed": 14,
-            "axes": {"light": {}, "camera": {}, "noise": {}, "language": {}, "layout": {}},
-            "episodes": {"light": 2, "camera": 3, "noise": 4, "language": 3, "layout": 2},
-            "reserve": 0.5,
+        config = tiny_config(demos) | {
+            "demos": {"source": "hdf5", "root": str(demos), "tasks": [f"{STOVE.suite}/{STOVE.name}"]},
+            "plan": {"seed": 14, "axes": {key: {} for key in AXES}, "episodes": dict.fromkeys(AXES, 1)},
         }
         for name, compute in COMPUTE.items():
             clone = Path(temporary) / name
