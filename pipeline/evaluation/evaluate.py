@@ -247,10 +247,11 @@ def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[Evaluat
         own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
         moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
-    size = EPISODES_A_JOB if workers == 1 else len(missing) // (workers * JOBS_A_WORKER)
+    spread = len(missing) if workers == 1 else max(1, len(missing) // (workers * JOBS_A_WORKER))
+    size = min(spread, EPISODES_A_JOB)
     jobs = []
     for scene in scenes.values():
         ordered = iter(sorted(scene, key=lambda task: (task.axis == "robot", task.number, task.name)))
-        while job := tuple(islice(ordered, min(max(1, size), EPISODES_A_JOB))):
+        while job := tuple(islice(ordered, size)):
             jobs.append(job)
     return jobs

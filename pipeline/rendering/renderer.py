@@ -54,7 +54,7 @@ class Renderer:
     def __init__(self, scene: str | mujoco.MjModel):
         gl.prepare()
         height, width, _ = SCHEMA.frame.shape
-        self.model = _compiled(scene)
+        self.model = _compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         self.data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()
@@ -66,15 +66,15 @@ class Renderer:
         self._renderer._gl_context.make_current()
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
 
-    def adopted(self, scene: str | mujoco.MjModel) -> bool:
-        """Go on with another scene, where its meshes and textures are those that are in the GL context already.
+    def adopted(self, model: mujoco.MjModel) -> bool:
+        """Go on with a copy of another model, where its meshes and textures are those in the GL context already.
 
         Returns:
             Whether it is so; else nothing is changed.
         """
-        model = _compiled(scene)
         if not all(np.array_equal(getattr(self.model, name), getattr(model, name)) for name in _UPLOADED):
             return False
+        model = copy.copy(model)
         self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
         self._culling = self._culling.of(model)
         context = self._renderer._mjr_context
@@ -182,7 +182,7 @@ class Renderer:
 
 
 def _compiled(scene: str | mujoco.MjModel) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else copy.copy(scene)
+    return mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else scene
 
 
 class LastScene:
@@ -203,9 +203,10 @@ class LastScene:
             PipelineError: when nothing renders on this machine.
         """
         if self._renderer is None or not self._is_last(scene):
-            if self._renderer is None or not self._renderer.adopted(scene):
+            model = _compiled(scene)
+            if self._renderer is None or not self._renderer.adopted(model):
                 self.close()
-                self._renderer = Renderer(scene)
+                self._renderer = Renderer(model)
             self._scene = scene
         return self._renderer
 
@@ -215,4 +216,4 @@ class LastScene:
     def close(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
-            self._renderer = None
+            self._renderer = self._scene = None

@@ -143,7 +143,7 @@ def _local_cluster(workers: int) -> Any:
 
     # An error reaches the user once, from here.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    for attempt in range(TRIES):
+    for _ in range(TRIES):
         try:
             return LocalCluster(
                 n_workers=workers,
@@ -154,9 +154,9 @@ def _local_cluster(workers: int) -> Any:
                 silence_logs=logging.CRITICAL,
             )
         except RuntimeError as error:
-            failure, attempts = error, attempt + 1
+            failure = error
     raise PipelineError(
-        f"worker processes ended while they started, {attempts} times",
+        f"worker processes ended while they started, {TRIES} times",
         expected="workers that live: the system may have ended them because memory ran out",
         remedy=f"see the system's log, use fewer workers, and {GO_ON}",
     ) from failure
