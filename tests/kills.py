@@ -3,9 +3,9 @@
     python tests/kills.py [--kills 50] [--seed 0]
 
 Two folders get the same configuration. In one `dvc repro` runs undisturbed. In the other it is killed by SIGKILL again
-and again, in any stage and after a time that is drawn: everything at once, the stage's process alone, or one of its
-workers, which the run has to survive. In the end both must hold the same files with the same bytes, and no file that
-was whole at a kill may have been made again. The last line is JSON.
+and again, every stage as often as any other and after a time that is drawn: everything at once, the stage's process
+alone, or one of its workers, which the run has to survive. In the end both must hold the same files with the same
+bytes, and no file that was whole at a kill may have been made again. The last line is JSON.
 """
 
 from __future__ import annotations
@@ -25,16 +25,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 import psutil
 from conftest import IN_SCRIPTS, SCRIPTS, dvc, in_a_clone
 
-CHANCE = 0.5
-"""So likely is a kill in each stage that works."""
-GUESS_S = 5.0
-"""How long a stage takes, where no run was watched."""
 SURVIVES_S = 20.0
 """So long a run whose worker was killed goes on before it is killed as well."""
 ALONE_S = 60.0
@@ -70,30 +65,31 @@ class Killed:
     faults: list[str] = field(default_factory=list)
 
 
-def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float] = MappingProxyType({})) -> Killed:
+def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float]) -> Killed:
     """Kill the run of a clone so often, then let it end.
 
     Args:
-        took_s: how long each stage took in a run that was left alone; kills are spread over it.
+        took_s: how long each stage takes that is to be killed; the moment is drawn from that time.
     """
     rng, result = random.Random(seed), Killed()
     whole: dict[Path, int] = {}
-    while result.kills.total() < kills:
+    due: set[str] = set()
+    while (left := kills - result.kills.total()) > 0:
+        due = due or set(rng.sample(sorted(took_s), min(left, len(took_s))))
         result.locks += _without_broken_locks(clone)
         run = _started(clone)
         victim: Victim = rng.choice(("everything", "stage", "worker"))
         for stage in _stages(run):
-            if rng.random() < CHANCE:
-                _wait(run, rng.uniform(0.0, took_s.get(stage, GUESS_S)))
+            if stage in due:
+                due.remove(stage)
+                _wait(run, rng.uniform(0.0, took_s[stage]))
                 break
         if run.poll() is not None:
             result.runs += 1
             if run.returncode:
                 result.faults.append(f"the run ended with {run.returncode}")
                 return result
-            # From the beginning, but for the plan and the tables of the first run.
-            for folder in ("trajectories", "frames", "rlds", "lerobot"):
-                shutil.rmtree(clone / "data" / "tiny" / folder)
+            shutil.rmtree(clone / "data" / "tiny")
             whole = {}
             continue
         killed = _kill(run, victim)
@@ -162,12 +158,9 @@ def _working(run: subprocess.Popen[bytes]) -> list[tuple[str, psutil.Process]]:
 
 def watched(run: subprocess.Popen[bytes]) -> dict[str, float]:
     """How many seconds each stage of a run takes that is left alone."""
-    took_s: dict[str, float] = {}
-    began, last = time.monotonic(), ""
-    for name in _stages(run):
-        took_s[last] = time.monotonic() - began
-        began, last = time.monotonic(), name
-    return {**took_s, last: time.monotonic() - began}
+    began = {name: time.monotonic() for name in _stages(run)}
+    ended = [*began.values(), time.monotonic()][1:]
+    return {name: end - start for (name, start), end in zip(began.items(), ended, strict=True)}
 
 
 def _kill(run: subprocess.Popen[bytes], victim: Victim) -> str:
