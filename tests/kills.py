@@ -89,8 +89,10 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
             if run.returncode:
                 result.faults.append(f"the run ended with {run.returncode}")
                 return result
-            shutil.rmtree(clone / "data" / "tiny")
-            whole = {}
+            # DVC's own cache too, or it would take the reports from there.
+            for folder in (clone / "data" / "tiny", clone / ".dvc" / "cache"):
+                shutil.rmtree(folder, ignore_errors=True)
+            whole, due = {}, set()
             continue
         killed = _kill(run, victim)
         result.kills[killed] += 1
