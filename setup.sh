@@ -39,8 +39,9 @@ missing_packages() {
     has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which links libpython too
     "$PYTHON" -c 'import ctypes; ctypes.CDLL("libpython3.11.so.1.0")' 2>/dev/null || echo libpython3.11
     command -v git >/dev/null || echo git
-    # The tests' browser; `quick` leaves out the test that needs it.
+    # The tests' browser and batch system; `quick` leaves out the tests that need them.
     [[ $VERB != test ]] || command -v chromium-headless-shell >/dev/null || echo chromium-headless-shell
+    [[ $VERB != test || -x /usr/sbin/slurmctld ]] || echo slurm-wlm
     [[ -x .venv/bin/pip ]] || "$PYTHON" -c 'import ensurepip' 2>/dev/null || echo python3.11-venv
 }
 

@@ -1,4 +1,4 @@
-"""One function behind which the work is spread: worker processes here, a Dask cluster elsewhere, or a plain loop."""
+"""One function behind which the work is spread: worker processes here or on a cluster, or a plain loop."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
@@ -21,6 +22,7 @@ from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
 from pipeline.run.cluster import InPlace, Workplace, joined
+from pipeline.run.slurm import slurm_cluster
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -107,15 +109,16 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
     from dask.system import CPU_COUNT
     from distributed import Client
 
+    # What the scheduler of a cluster elsewhere does, its own settings say.
+    dask.config.set(
+        {
+            "distributed.worker.multiprocessing-method": "spawn",
+            "distributed.admin.tick.limit": "60s",
+            "distributed.scheduler.allowed-failures": TRIES - 1,
+            "distributed.deploy.lost-worker-timeout": "5s",
+        }
+    )
     if config.cluster == "local":
-        dask.config.set(
-            {
-                "distributed.worker.multiprocessing-method": "spawn",
-                "distributed.admin.tick.limit": "60s",
-                "distributed.scheduler.allowed-failures": TRIES - 1,
-                "distributed.deploy.lost-worker-timeout": "5s",
-            }
-        )
         workers = config.workers or CPU_COUNT
         # So would software GL; where workers are fewer than cores, it uses the others.
         os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
@@ -123,6 +126,12 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
             client.run(_leave_interrupts_to_the_run)
             # A worker that dies while it starts is not replaced by Dask alone.
             yield _on(client, refill=partial(cluster.scale, workers))
+    elif config.cluster == "slurm":
+        with slurm_cluster(config, folder) as cluster, Client(cluster) as client:
+            client.wait_for_workers(1)
+            with joined(client, folder) as workplace:
+                # Jobs that end are asked for again; they may wait in the queue for hours.
+                yield _on(client, workplace, partial(cluster.scale, config.workers), patience_s=inf)
     else:
         try:
             client = Client(config.cluster, timeout=CONNECT_S)
@@ -181,7 +190,14 @@ class _Limited(Generic[Item, Result]):
             faulthandler.cancel_dump_traceback_later()
 
 
-def _on(client: Any, workplace: Workplace | None = None, refill: Callable[[], None] = lambda: None) -> Run:
+def _on(
+    client: Any,
+    workplace: Workplace | None = None,
+    refill: Callable[[], None] = lambda: None,
+    patience_s: float = ALONE_S,
+) -> Run:
+    """Work on a client's workers; ``refill`` brings back those that are missing, ``patience_s`` is how long to wait for
+    one where none is left."""
     from distributed import CancelledError, Future, KilledWorker
 
     def ended(work: Callable[[Item], Result], items: Sequence[Item]) -> Generator[tuple[int, Result | Exception]]:
@@ -194,7 +210,7 @@ def _on(client: Any, workplace: Workplace | None = None, refill: Callable[[], No
             future.add_done_callback(done.put)
         try:
             while numbers:
-                future = _next(done, client, refill)
+                future = _next(done, client, refill, patience_s)
                 if future.status == "error":
                     yield numbers.pop(future.key), future.exception()
                     continue
@@ -251,8 +267,8 @@ def _result(outcome: Result | Exception) -> Result:
     return outcome
 
 
-def _next(done: Queue[Any], client: Any, refill: Callable[[], None]) -> Any:
-    """The next future that is done; while nothing is, ``refill`` brings back workers that are missing.
+def _next(done: Queue[Any], client: Any, refill: Callable[[], None], patience_s: float) -> Any:
+    """The next future that is done, as ``_on`` waits for it.
 
     Raises:
         PipelineError: when nobody is left who could do one.
@@ -267,8 +283,8 @@ def _next(done: Queue[Any], client: Any, refill: Callable[[], None]) -> Any:
             # A new worker may be on its way, or have come and died over its work.
             alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
             last_came_s = came_s
-            if alone_s >= ALONE_S:
-                raise _lost(client, f"no worker is left, and none came in {ALONE_S} s") from None
+            if alone_s >= patience_s:
+                raise _lost(client, f"no worker is left, and none came in {patience_s} s") from None
 
 
 def _workers(client: Any) -> tuple[int, float]:
