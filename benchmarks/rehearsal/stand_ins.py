@@ -1,0 +1,117 @@
+"""A stage of a run whose physics and pixels are stand-ins; everything else is the stage itself.
+
+    python benchmarks/rehearsal/stand_ins.py stages/replay.py configs/NAME.yaml
+
+Eight steps take the place of a replay, and smooth patterns that of frames. Dask's workers load this file as they start
+(``distributed.worker.preload``).
+"""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+import pipeline.physics.replay
+import pipeline.rendering.render
+import pipeline.validation.doctor
+import pipeline.validation.validate
+from pipeline import seeding
+from pipeline.axes import PhysicsPerturbation
+from pipeline.config import RenderConfig, ReplayConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.rendering.jpeg import encode
+from pipeline.run.frame_store import Rendered
+from pipeline.run.streams import Stream
+from pipeline.types import Demo, Frame, Geometry, Task, Trajectory, Verdict
+
+STEPS = 8
+"""The fewest that OpenVLA-OFT can read: one of its chunks."""
+DROPPED = 0.1
+"""So many perturbed replays fail."""
+
+
+def replay(
+    environment: object,
+    demo: Demo,
+    trajectory_id: str,
+    config: ReplayConfig,
+    perturbations: Sequence[PhysicsPerturbation],
+    reference: object,
+) -> Trajectory:
+    """A robot that stands still in the demonstration's scene."""
+    rng = seeding.rng("rehearsal", trajectory_id)
+    states = np.repeat(demo.init_state[None], STEPS + 1, axis=0)
+    states[:, 0] = np.arange(STEPS + 1) / SCHEMA.fps_hz
+    actions = rng.uniform(-1, 1, (STEPS, 7))
+    actions[:, 6] = -1.0
+    model_xml = demo.model_xml or ""
+    kept = not perturbations or rng.uniform() >= DROPPED
+    return Trajectory(
+        trajectory_id=trajectory_id,
+        mode="open_loop",
+        model_xml=model_xml,
+        states=states,
+        actions=actions,
+        kept_mask=np.ones(STEPS, bool),
+        site_alpha=np.zeros((STEPS + 1, model_xml.count("<site ")), np.float32),
+        resolved="{}",
+        verdict=Verdict(kept, "" if kept else "goal_not_reached"),
+    )
+
+
+def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
+    """A pattern of its own for each stream and step."""
+    steps = len(trajectory.actions)
+    state = np.zeros((steps, 8), np.float32)
+    state[:, 6:] = 0.04, -0.04
+    return Rendered(
+        replay_mode=trajectory.mode,
+        state=state,
+        joint_state=np.zeros((steps, 7), np.float32),
+        action=trajectory.actions.astype(np.float32),
+        streams={
+            stream.stream_id: [encode(_pattern(f"{stream.stream_id} {step}"), config) for step in range(steps)]
+            for stream in streams
+        },
+        geometry={
+            geometry.stream_id: Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
+            for geometry in {stream.geometry for stream in streams}
+        },
+    )
+
+
+def _pattern(name: str) -> Frame:
+    height, width, channels = SCHEMA.frame.shape
+    coarse = seeding.rng("rehearsal", name).integers(40, 216, (4, 4, channels), np.uint8)
+    return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), np.uint8)
+
+
+def put_in() -> None:
+    """Have this process work with the stand-ins."""
+    for module, name, stand_in in (
+        (pipeline.physics.replay, "shared", lambda task: None),
+        (pipeline.physics.replay, "replay", replay),
+        (pipeline.rendering.render, "render", render),
+        (pipeline.validation.validate, "rendered", lambda *_: ()),
+    ):
+        setattr(module, name, stand_in)
+
+
+def dask_setup(worker: object) -> None:
+    """What Dask calls in a worker that starts."""
+    put_in()
+
+
+if __name__ == "__main__":
+    sys.argv = sys.argv[1:]
+    if Path(sys.argv[0]).stem == "doctor":
+        # It steps and renders for some seconds, whatever the size; the disk is not going to be filled.
+        pipeline.validation.doctor.needed_gb = lambda config: 0.0
+    else:
+        put_in()
+    runpy.run_path(sys.argv[0], run_name="__main__")
