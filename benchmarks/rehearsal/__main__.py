@@ -2,11 +2,12 @@
 
     nice -n 10 python benchmarks/rehearsal [--config configs/full.yaml] [--episodes 1000 28000] [--workers 2]
 
-For each size: 50 demonstrations of eight steps for each task are written, and every stage runs on them as `dvc repro`
-calls it, with as many episodes in the configuration's proportions. A replay is eight steps that nothing simulates, a
-frame a pattern that nothing renders (``stand_ins.py``); plan, stores, exports, manifest, checks and report are real.
-The last line is JSON: for each size and stage its seconds, the most memory of its own process and of one worker, and
-how large the run's folder is after it. Stopped, the same command goes on with the next stage.
+First 50 demonstrations of eight steps are written for each task. For each size, every stage runs as `dvc repro` calls
+it, with as many episodes in the configuration's proportions, and the demonstrations in proportion too. A replay is
+eight steps that nothing simulates, a frame a pattern that nothing renders (``stand_ins.py``); plan, stores, exports,
+manifest, checks and report are real. The last line is JSON: for each size and stage its seconds, the most memory of its
+own process and of one worker, and how large the run's folder is after it. Stopped, the same command goes on with the
+next stage.
 """
 
 from __future__ import annotations
@@ -84,7 +85,7 @@ def configuration(source: Path, episodes: int, workers: int) -> Path:
     whole = sum(content["plan"]["episodes"].values())
     share = episodes / whole
     content["name"] = f"rehearsal_{episodes}"
-    content["demos"]["root"] = str(DEMOS)
+    content["demos"] |= {"root": str(DEMOS), "per_task": max(1, round(PER_TASK * share))}
     content["plan"]["episodes"] = {name: max(1, round(n * share)) for name, n in content["plan"]["episodes"].items()}
     for section, name in (("rlds", "shards"), ("lerobot", "parts")):
         content["export"][section][name] = max(1, round(content["export"][section][name] * share))
