@@ -1,0 +1,148 @@
+"""Replay and rendering of a configuration's episodes, ours beside one LIBERO environment for each of them.
+
+    nice -n 10 python benchmarks/against_naive.py [--config configs/starter.yaml] [--tasks 'libero_goal/put_the_bowl_*']
+
+Takes a demonstration of the starter set for each task, and as many episodes as the configuration asks for each
+demonstration. Ours replays and renders as the stages do, failed replays included. The naive way opens LIBERO's own
+environment for every kept episode, makes the same changes to its model, steps the same actions with both cameras, and
+encodes the frames. Each in this process and on one core. The last line is JSON: CPU seconds of both, and how many
+of the frames are the same bytes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+from pipeline import gl
+
+# Both render with what is chosen before robosuite is imported.
+gl.choose()
+
+import mujoco  # noqa: E402
+from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
+
+from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer  # noqa: E402
+from pipeline.config import Config, DemosConfig, load  # noqa: E402
+from pipeline.episode_schema import SCHEMA  # noqa: E402
+from pipeline.libero.tasks import find_task, select_tasks  # noqa: E402
+from pipeline.physics.replay import replay_plan  # noqa: E402
+from pipeline.rendering.jpeg import encode, to_policy  # noqa: E402
+from pipeline.rendering.render import render_plan  # noqa: E402
+from pipeline.run import plan  # noqa: E402
+from pipeline.run.compute import loop  # noqa: E402
+from pipeline.run.frame_store import FrameStore  # noqa: E402
+from pipeline.run.outcome import rejections  # noqa: E402
+from pipeline.run.streams import streams_of  # noqa: E402
+from pipeline.run.trajectory_store import TrajectoryStore  # noqa: E402
+from pipeline.testset import benchmark  # noqa: E402
+from pipeline.types import Trajectory  # noqa: E402
+
+PER_TASK = 50
+"""So many demonstrations LIBERO has of each task."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--config", type=Path, default=Path("configs/starter.yaml"))
+    parser.add_argument("--tasks", nargs="+", help="default: those of the configuration")
+    arguments = parser.parse_args()
+    config = sliced(load(arguments.config), arguments.tasks)
+    rows = plan.make(config.demos.index().entries, config.plan, config.replay, benchmark.load())
+    with TemporaryDirectory() as temporary:
+        trajectories, frames = Path(temporary) / "trajectories", Path(temporary) / "frames"
+        begun = time.process_time()
+        verdicts = replay_plan(rows, config.demos, config.replay, trajectories, loop)
+        replayed = time.process_time()
+        render_plan(rows, config, trajectories, frames, loop)
+        rendered = time.process_time()
+        store = FrameStore(frames, config.render)
+        outcome = plan.select(rows, verdicts, rejections(rows, store.rows()))
+        kept = [row for row in rows if outcome[row.episode_id].kept]
+        naive_s, same, count = 0.0, 0, 0
+        for row in kept:
+            trajectory = TrajectoryStore(trajectories).load(row.trajectory_id)
+            start = time.process_time()
+            theirs = naive(row, trajectory, config)
+            naive_s += time.process_time() - start
+            shown = streams_of(row.perturbations)
+            ours = store.load(row.trajectory_id, [stream.stream_id for stream in shown.values()], set()).streams
+            pairs = [
+                (mine, other)
+                for view, stream in shown.items()
+                for mine, other in zip(ours[stream.stream_id], theirs[view], strict=True)
+            ]
+            same += sum(mine == other for mine, other in pairs)
+            count += len(pairs)
+            print(f"{row.episode_id} {row.axis}: naive {time.process_time() - start:.0f} s", flush=True)
+    ours_s = rendered - begun
+    print(
+        json.dumps(
+            {
+                "config": str(arguments.config),
+                "tasks": len(select_tasks(config.demos.tasks)),
+                "episodes": len(kept),
+                "frames": count,
+                "same_frames": same,
+                "replay_s": round(replayed - begun, 1),
+                "render_s": round(rendered - replayed, 1),
+                "naive_s": round(naive_s, 1),
+                "naive_against_ours": round(naive_s / ours_s, 2),
+            }
+        )
+    )
+
+
+def sliced(config: Config, tasks: Sequence[str] | None) -> Config:
+    """One demonstration of each task, and its share of the episodes."""
+    patterns = tuple(tasks or config.demos.tasks)
+    chosen = len(select_tasks(patterns))
+    whole = len(select_tasks(config.demos.tasks)) * (1 if config.demos.source == "starter" else PER_TASK)
+    episodes = {name: max(1, round(number * chosen / whole)) for name, number in config.plan.episodes.items()}
+    return config.model_copy(
+        update={
+            "demos": DemosConfig(source="starter", tasks=patterns),
+            "plan": config.plan.model_copy(update={"episodes": episodes}),
+        }
+    )
+
+
+def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, list[bytes]]:
+    """View to the encoded frames before each action, from an environment of the episode's own."""
+    height, width, _ = SCHEMA.frame.shape
+    task = find_task(row.suite, row.task)
+    env = OffScreenRenderEnv(bddl_file_name=str(task.bddl_file), camera_heights=height, camera_widths=width)
+    env.reset()
+    env.reset_from_xml_string(trajectory.model_xml)
+    model, perturbations = env.sim.model._model, from_json(row.perturbations)
+    textures = model.tex_data.copy()
+    for change in of_layer(perturbations, RenderPerturbation):
+        change.apply(model)
+    context = env.sim._render_context_offscreen
+    context.gl_ctx.make_current()
+    if not (textures == model.tex_data).all():
+        for texture in range(model.ntex):
+            mujoco.mjr_uploadTexture(model, context.con, texture)
+    observation = env.set_init_state(trajectory.states[0])
+    frames: dict[str, list[bytes]] = {view: [] for view in SCHEMA.views}
+    for step, action in enumerate(trajectory.actions):
+        for view, spec in SCHEMA.views.items():
+            frame = observation[f"{spec.camera}_image"]
+            for noise in of_layer(perturbations, PixelPerturbation):
+                if view in noise.views:
+                    frame = noise.apply(frame, step)
+            frames[view].append(encode(to_policy(frame), config.render))
+        observation, *_ = env.step(action)
+    env.close()
+    return frames
+
+
+if __name__ == "__main__":
+    main()
