@@ -1,6 +1,6 @@
 """A stage of a run whose physics and pixels are stand-ins; everything else is the stage itself.
 
-    python benchmarks/rehearsal/stand_ins.py stages/replay.py configs/NAME.yaml
+    python benchmarks/rehearsal_stand_ins.py stages/replay.py configs/NAME.yaml
 
 Eight steps take the place of a replay, and smooth patterns that of frames. Dask's workers load this file as they start
 (``distributed.worker.preload``).

@@ -1,13 +1,13 @@
 """A whole configuration at its full size, with stand-ins for physics and pixels: what do time and memory grow with?
 
-    nice -n 10 python benchmarks/rehearsal [--config configs/full.yaml] [--episodes 1000 28000] [--workers 2]
+    nice -n 10 python benchmarks/rehearsal.py [--config configs/full.yaml] [--episodes 1000 28000] [--workers 2]
 
 First 50 demonstrations of eight steps are written for each task. For each size, every stage runs as `dvc repro` calls
 it, with as many episodes in the configuration's proportions, and the demonstrations in proportion too. A replay is
-eight steps that nothing simulates, a frame a pattern that nothing renders (``stand_ins.py``); plan, stores, exports,
-manifest, checks and report are real. The last line is JSON: for each size and stage its seconds, the most memory of its
-own process and of one worker, and how large the run's folder is after it. Stopped, the same command goes on with the
-next stage.
+eight steps that nothing simulates, a frame a pattern that nothing renders (``rehearsal_stand_ins.py``); plan, stores,
+exports, manifest, checks and report are real. The last line is JSON: for each size and stage its seconds, the most
+memory of its own process and of one worker, and how large the run's folder is after it. Stopped, the same command goes
+on with the next stage.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import psutil
 import yaml
-from stand_ins import STEPS
+from rehearsal_stand_ins import STEPS
 
 from pipeline import seeding
 from pipeline.config import DemosConfig, load
@@ -36,8 +36,8 @@ from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.types import Task
 
-HERE = Path(__file__).resolve().parent
-REPOSITORY = HERE.parents[1]
+REPOSITORY = Path(__file__).resolve().parents[1]
+STAND_INS = REPOSITORY / "benchmarks" / "rehearsal_stand_ins.py"
 DEMOS = Path("data/rehearsal_demos")
 FIGURES = Path("data/rehearsal_figures")
 PER_TASK = 50
@@ -108,9 +108,14 @@ def measured(stage: str, config: Path) -> dict[str, Any]:
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))),
-        "DASK_DISTRIBUTED__WORKER__PRELOAD": json.dumps([str(HERE / "stand_ins.py")]),
+        "DASK_DISTRIBUTED__WORKER__PRELOAD": json.dumps([str(STAND_INS)]),
     }
-    command = [sys.executable, str(HERE / "stand_ins.py"), str(REPOSITORY / "stages" / f"{stage}.py"), str(config)]
+    command = [
+        sys.executable,
+        str(STAND_INS),
+        str(REPOSITORY / "stages" / f"{stage}.py"),
+        str(config),
+    ]
     start = time.perf_counter()
     with subprocess.Popen(command, env=environment, stdout=sys.stderr) as process:
         own, worker = 0, 0
