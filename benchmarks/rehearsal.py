@@ -35,12 +35,13 @@ from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.types import Task
+from pipeline.validation.doctor import DEMOS_PER_TASK
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 STAND_INS = REPOSITORY / "benchmarks" / "rehearsal_stand_ins.py"
 DEMOS = Path("data/rehearsal_demos")
 FIGURES = Path("data/rehearsal_figures")
-PER_TASK = 50
+PER_TASK = DEMOS_PER_TASK["hdf5"]
 LOOK_S = 0.5
 """How often memory is looked at."""
 
@@ -110,18 +111,13 @@ def measured(stage: str, config: Path) -> dict[str, Any]:
         "PYTHONPATH": os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))),
         "DASK_DISTRIBUTED__WORKER__PRELOAD": json.dumps([str(STAND_INS)]),
     }
-    command = [
-        sys.executable,
-        str(STAND_INS),
-        str(REPOSITORY / "stages" / f"{stage}.py"),
-        str(config),
-    ]
+    command = [sys.executable, str(STAND_INS), str(REPOSITORY / "stages" / f"{stage}.py"), str(config)]
     start = time.perf_counter()
     with subprocess.Popen(command, env=environment, stdout=sys.stderr) as process:
         own, worker = 0, 0
         while process.poll() is None:
-            for number, memory in enumerate(_memory(process.pid)):
-                own, worker = (max(own, memory), worker) if number == 0 else (own, max(worker, memory))
+            first, *others = [*_memory(process.pid), 0]
+            own, worker = max(own, first), max(worker, *others, 0)
             time.sleep(LOOK_S)
     if process.returncode:
         raise SystemExit(f"{stage} of {config} ended with {process.returncode}")
