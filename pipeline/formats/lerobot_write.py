@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -28,7 +29,8 @@ import pyarrow.parquet as pq
 from lerobot.datasets.aggregate import aggregate_datasets
 from lerobot.datasets.compute_stats import compute_episode_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import write_info, write_stats
+from lerobot.datasets.utils import get_file_size_in_mb, write_info, write_stats
+from lerobot.datasets.video_utils import concatenate_video_files
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import MATRICES, SCHEMA, check
@@ -40,8 +42,8 @@ from pipeline.formats.lerobot_video import VideoEncoder
 from pipeline.run.motion_statistics import describe
 from pipeline.types import Episode, Extra, Floats, Frame
 
-PART_VIDEO_MB = 16
-"""lerobot rewrites a video file for each episode that it appends: small files here, its own 200 MB after the merge."""
+PART_VIDEO_MB = 1e-6
+"""A file for each episode's video: lerobot rewrites a file for each that it appends. The merge fills its own 200 MB."""
 
 DATA_MB = 25
 """Size of the data files: lerobot's merge has one in memory over and over, 1.4 GB of images at its own 100 MB."""
@@ -116,6 +118,7 @@ def merge(parts: Sequence[Path], root: Path, cache: Path, *, repo_id: str) -> No
     with (
         local_only(cache),
         _set(lerobot.datasets.aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_MB),
+        _videos_joined_once(),
     ):
         aggregate_datasets(
             [repo_id] * len(parts),
@@ -231,6 +234,24 @@ def _write_provenance(root: Path, rows: Sequence[Mapping[str, str]]) -> None:
     columns: dict[str, Any] = {"episode_index": pa.array(range(len(rows)), pa.int64())}
     columns |= {column: pa.array([row[column] for row in rows], pa.string()) for column in SCHEMA.provenance}
     pq.write_table(pa.table(columns), root / "meta" / "provenance.parquet")
+
+
+@contextmanager
+def _videos_joined_once() -> Iterator[None]:
+    """Write each video file of a merge in one go: lerobot rewrites it for each source that it appends."""
+    sources: defaultdict[Path, list[Path]] = defaultdict(list)
+
+    def append(paths: Sequence[Path], joined: Path) -> None:
+        sources[joined].append(paths[-1])
+
+    def size_mb(file: Path) -> float:
+        return float(sum(map(get_file_size_in_mb, (file, *sources.get(file, ())))))
+
+    merging = lerobot.datasets.aggregate
+    with _set(merging, "concatenate_video_files", append), _set(merging, "get_file_size_in_mb", size_mb):
+        yield
+    for joined, rest in sources.items():
+        concatenate_video_files([joined, *rest], joined)
 
 
 @contextmanager
