@@ -24,6 +24,7 @@ import tensorflow_datasets as tfds
 import tf_readback
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import dataset_to_policy_features
+from lerobot.datasets.video_utils import concatenate_video_files
 from numpy.typing import NDArray
 from synthetic import (
     EXTRAS,
@@ -330,11 +331,29 @@ def test_lerobot_statistics_are_exact(written: Written) -> None:
 @pytest.mark.slow
 def test_lerobot_reads_when_videos_spread_over_many_files(written: Written, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lerobot_write, "PART_VIDEO_MB", 0.05)
         patch.setattr(lerobot.datasets.aggregate, "DEFAULT_VIDEO_FILE_SIZE_IN_MB", 0.15)
         target = write_lerobot(tmp_path)
     assert len(list(target.root.rglob("*.mp4"))) > 2
     assert_lerobot_episodes(target.root)
+
+
+def test_no_video_is_written_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """lerobot appends an episode to a file by writing all of the file again."""
+    views = []
+
+    def join(paths: Sequence[Path], joined: Path) -> None:
+        assert len(set(paths)) == len(IDS)
+        views.append(joined.parents[1].name)
+        concatenate_video_files(paths, joined)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("an episode was appended")
+
+    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
+    monkeypatch.setattr(lerobot.datasets.lerobot_dataset, "concatenate_video_files", refuse)
+    monkeypatch.setattr(lerobot_write, "concatenate_video_files", join)
+    write_lerobot(tmp_path)
+    assert sorted(views) == sorted(view.lerobot_key for view in SCHEMA.views.values())
 
 
 def test_formats_carry_the_same_numbers(written: Written) -> None:

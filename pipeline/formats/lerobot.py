@@ -19,7 +19,7 @@ class LeRobot(Format[LeRobotConfig]):
 
     name: ClassVar = "lerobot"
     title: ClassVar = "LeRobot"
-    recipe: ClassVar = 3
+    recipe: ClassVar = 4
     packages: ClassVar = ("lerobot", "datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
