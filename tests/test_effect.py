@@ -93,6 +93,10 @@ def small_experiment(folder: Path, demos: Path) -> Path:
     run = tiny_config(demos) | {"name": "effect_tiny"}
     run["demos"] = {"source": "hdf5", "root": str(demos), "tasks": [f"{STOVE.suite}/{STOVE.name}"]}
     run["plan"] = {"seed": 7, "axes": {"noise": {}}, "episodes": {"noise": 1}}
+    run["export"] = {
+        "rlds": {"name": "libero_tiny", "shards": 1},
+        "lerobot": {"name": "tiny", "parts": 1, "frames": "images"},
+    }
     (folder / "data.yaml").write_text(yaml.safe_dump(run))
     experiment = {
         "data": "data.yaml",
@@ -102,7 +106,10 @@ def small_experiment(folder: Path, demos: Path) -> Path:
             **{"type": "act", "pretrained_backbone_weights": None, "chunk_size": 100, "n_action_steps": 40},
             **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1, "use_vae": False},
         },
-        "training": {"steps": 2, "batch_size": 2, "save_every": 1},
+        "training": {
+            **{"steps": 2, "batch_size": 2, "save_every": 1},
+            **{"learning_rate": 1e-3, "mixed_precision": "bf16", "at_once": 2},
+        },
         "seeds": [0],
         "evaluation": {"episodes": 1},
     }
@@ -110,6 +117,16 @@ def small_experiment(folder: Path, demos: Path) -> Path:
     file.write_text(yaml.safe_dump(experiment))
     link_testset(folder)
     return file
+
+
+def test_a_run_with_videos_is_refused(short_demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = small_experiment(tmp_path, short_demos)
+    run = yaml.safe_load((tmp_path / "data.yaml").read_text())
+    run["export"]["lerobot"]["frames"] = "video"
+    (tmp_path / "data.yaml").write_text(yaml.safe_dump(run))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PipelineError, match="write frames: images there"):
+        read(file)
 
 
 @pytest.mark.slow
@@ -152,7 +169,7 @@ def test_a_training_that_was_stopped_goes_on_from_its_last_checkpoint(tmp_path: 
     training = TrainingConfig(steps=2, batch_size=2, save_every=1)
 
     def run(command: Callable[[list[str]], None]) -> None:
-        train(tmp_path / "dataset", tmp_path / "policy", {}, training, 0, command)
+        train({tmp_path / "policy": tmp_path / "dataset"}, {}, training, 0, command)
 
     with pytest.raises(StoppedError):
         run(partial(stopped_after, 1))

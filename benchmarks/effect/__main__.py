@@ -17,6 +17,10 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
 from pathlib import Path
 
 import comparison_table
@@ -32,7 +36,7 @@ STAGES = ("inputs", "plan", "leakage", "replay", "render", "export_lerobot")
 
 
 class Shell:
-    """Runs commands, each as a person would, and adds what they took to ``times.jsonl``."""
+    """Runs commands, each as a person would, and adds what the parts took to ``times.jsonl``."""
 
     def __init__(self, out: Path):
         out.mkdir(parents=True, exist_ok=True)
@@ -47,19 +51,24 @@ class Shell:
             "OMP_WAIT_POLICY": "passive",
         }
 
-    def __call__(self, part: str, command: list[str]) -> None:
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """What runs in it counts as a part's time."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            with self._times.open("a") as file:
+                file.write(json.dumps({"part": name, "seconds": round(time.perf_counter() - start, 1)}) + "\n")
+
+    def __call__(self, command: list[str]) -> None:
         """Run a command to its end.
 
         Raises:
             PipelineError: when it fails.
         """
         print(f"$ {shlex.join(command)}", file=sys.stderr, flush=True)
-        start = time.perf_counter()
-        try:
-            done = subprocess.run(command, env=self._environment, stdout=sys.stderr, check=False)
-        finally:
-            with self._times.open("a") as file:
-                file.write(json.dumps({"part": part, "seconds": round(time.perf_counter() - start, 1)}) + "\n")
+        done = subprocess.run(command, env=self._environment, stdout=sys.stderr, check=False)
         if done.returncode:
             raise PipelineError(
                 f"ended with {done.returncode}", where=shlex.join(command), remedy="see what it printed, and run again"
@@ -93,17 +102,19 @@ def run(experiment: Experiment, out: Path) -> None:
     """
     shell = Shell(out)
     datasets = {arm: out / "datasets" / experiment.dataset_name(arm) for arm in experiment.arms}
-    make_data(experiment, datasets, shell)
-    policies: dict[str, list[str]] = {arm: [] for arm in experiment.arms}
-    for seed in experiment.seeds:
-        for arm, dataset in datasets.items():
-            name = experiment.policy_name(arm, seed)
-            policies[arm].append(name)
-            policy = out / "policies" / name
-            if not policy.exists():
-                options = experiment.policy, experiment.training, seed
-                train(dataset, policy, *options, lambda command: shell("training", command))
-            evaluate(experiment, policy, out / "evaluations" / name, shell)
+    policies = {arm: [experiment.policy_name(arm, seed) for seed in experiment.seeds] for arm in experiment.arms}
+    with shell.part("data"):
+        make_data(experiment, datasets, shell)
+    for number, seed in enumerate(experiment.seeds):
+        untrained = {
+            out / "policies" / names[number]: datasets[arm]
+            for arm, names in policies.items()
+            if not (out / "policies" / names[number]).exists()
+        }
+        with shell.part("training"):
+            train(untrained, experiment.policy, experiment.training, seed, shell)
+        with shell.part("evaluation"):
+            evaluate(experiment, [names[number] for names in policies.values()], out, shell)
     lines, hours = comparison_table.table(comparison_table.read(out / "evaluations", policies)), shell.hours()
     contents = {arm: comparison_table.contents(dataset) for arm, dataset in datasets.items()}
     command = shlex.join(["python", "benchmarks/effect", *sys.argv[1:]])
@@ -137,17 +148,22 @@ def make_data(experiment: Experiment, datasets: dict[str, Path], shell: Shell) -
     if experiment.demonstrations is not None:
         per_task = str(experiment.demonstrations)
         words = ["demos", "expand", str(demos.root), "--per-task", per_task, "--tasks", *experiment.tasks]
-        shell("data", [sys.executable, "-m", "pipeline", *words])
+        shell([sys.executable, "-m", "pipeline", *words])
     for stage in STAGES:
-        shell("data", [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(experiment.data)])
+        shell([sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(experiment.data)])
     source = experiment.run.data / "lerobot" / experiment.run.export.lerobot.name
     rows = provenance(source)
-    for arm in missing:
-        write_small(source, chosen(rows, experiment.arms[arm]), datasets[arm], experiment.frame_px)
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        jobs = [
+            pool.submit(write_small, source, chosen(rows, experiment.arms[arm]), datasets[arm], experiment.frame_px)
+            for arm in missing
+        ]
+        for job in jobs:
+            job.result()
 
 
-def evaluate(experiment: Experiment, policy: Path, out: Path, shell: Shell) -> None:
-    """Every episode of a policy; the same for all policies."""
+def evaluate(experiment: Experiment, policies: Sequence[str], out: Path, shell: Shell) -> None:
+    """The same episodes for each policy."""
     wanted, tasks = experiment.evaluation, experiment.tasks
     suites, names = zip(*(task.split("/") for task in tasks), strict=True)
     each = math.ceil(wanted.episodes / len(tasks))
@@ -164,14 +180,15 @@ def evaluate(experiment: Experiment, policy: Path, out: Path, shell: Shell) -> N
             subset = str(wanted.episodes * len(axes))
             selections.append(["--source", source, *options, "--subset", subset, "--axis", *axes])
     for selection in selections:
-        shell(
-            "evaluation",
-            [
-                *(sys.executable, "-m", "pipeline", "evaluate", str(out), "--checkpoint", str(policy)),
-                *("--label", policy.name, "--initial-states", wanted.initial_states),
-                *("--suite", *dict.fromkeys(suites), "--task", *names, *selection),
-            ],
-        )
+        for policy in policies:
+            shell(
+                [
+                    *(sys.executable, "-m", "pipeline", "evaluate", str(out / "evaluations" / policy)),
+                    *("--checkpoint", str(out / "policies" / policy), "--label", policy),
+                    *("--initial-states", wanted.initial_states),
+                    *("--suite", *dict.fromkeys(suites), "--task", *names, *selection),
+                ]
+            )
 
 
 if __name__ == "__main__":

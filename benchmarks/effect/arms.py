@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.dataset
 import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced, scratch
-from pipeline.rendering.jpeg import resized
+from pipeline.rendering.jpeg import decode, resized
 from pipeline.seeding import digest
 
 EpisodeRow = Mapping[str, Any]
@@ -64,12 +65,11 @@ def write_small(source: Path, rows: Sequence[EpisodeRow], out: Path, frame_px: i
     Decoding a small image costs a training step next to nothing; decoding video costs more than the step.
 
     Args:
-        source: root of the run's LeRobot dataset.
+        source: root of the run's LeRobot dataset, frames stored as images.
         rows: the episodes, of ``meta/provenance.parquet``.
         out: root of the new dataset; complete once it is there. ``meta/provenance.parquet`` has its episodes.
     """
     # lerobot takes seconds to import.
-    import pyarrow as pa
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from pipeline.formats.lerobot_write import local_only
@@ -81,23 +81,23 @@ def write_small(source: Path, rows: Sequence[EpisodeRow], out: Path, frame_px: i
         vector.lerobot_key: {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
         for vector in vectors
     }
-    with replaced(out) as unfinished, scratch(out.parent / ".cache") as cache, local_only(cache):
-        run = LeRobotDataset(source.name, root=source, video_backend="pyav")
+    episodes = pq.read_table(source / "meta" / "episodes", columns=["episode_index", "tasks"]).to_pylist()
+    instructions = {episode["episode_index"]: episode["tasks"][0] for episode in episodes}
+    data = pyarrow.dataset.dataset(source / "data")
+    with replaced(out) as unfinished, scratch(out.parent / f".cache_{out.name}") as cache, local_only(cache):
         small = LeRobotDataset.create(
             out.name, SCHEMA.fps_hz, features, root=unfinished, robot_type=SCHEMA.robot_type, use_videos=False
         )
-        bounds = {name: run.meta.episodes[f"dataset_{name}_index"] for name in ("from", "to")}
         for row in rows:
             number = int(row["episode_index"])
-            for index in range(bounds["from"][number], bounds["to"][number]):
-                step = run[index]
-                pixels = {key: np.rint(step[key].numpy().transpose(1, 2, 0) * 255).astype(np.uint8) for key in views}
+            its_own = pyarrow.dataset.field("episode_index") == number
+            for step in data.to_table(list(features), filter=its_own).to_pylist():
                 small.add_frame(
-                    {key: resized(pixels[key], frame_px, frame_px) for key in views}
-                    | {vector.lerobot_key: step[vector.lerobot_key].numpy() for vector in vectors}
-                    | {"task": step["task"]}
+                    {key: resized(decode(step[key]["bytes"]), frame_px, frame_px) for key in views}
+                    | {vector.lerobot_key: np.array(step[vector.lerobot_key], vector.dtype) for vector in vectors}
+                    | {"task": instructions[number]}
                 )
             small.save_episode()
         small.finalize()
         renumbered = [{**row, "episode_index": number} for number, row in enumerate(rows)]
-        pq.write_table(pa.Table.from_pylist(renumbered), unfinished / "meta" / "provenance.parquet")
+        pq.write_table(pyarrow.Table.from_pylist(renumbered), unfinished / "meta" / "provenance.parquet")

@@ -1,11 +1,12 @@
-"""One policy, by lerobot's own training, from weights made here and never from the hub."""
+"""Policies, by lerobot's own training, from weights made here and never from the hub."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,31 +17,51 @@ from pipeline.files import put_in_place, remove, replaced
 CALIBRATION_FRAMES = 64
 """Frames that the backbone's normalisation is set by."""
 
+WARMUP_STEPS = 200
+"""Steps in which the learning rate rises, where the experiment sets one."""
+
 Command = Callable[[list[str]], None]
 """Runs a command to its end."""
 
 
 def train(
-    dataset: Path, out: Path, policy: dict[str, Any], training: TrainingConfig, seed: int, command: Command
+    datasets: Mapping[Path, Path], policy: dict[str, Any], training: TrainingConfig, seed: int, command: Command
 ) -> None:
-    """Train a policy, or go on from its last checkpoint; ``out`` is there once it is trained.
+    """Train policies, each on a dataset of its own, or go on from their last checkpoints.
 
     Args:
-        dataset: root of a LeRobot dataset.
-        out: folder of the trained policy, as lerobot saves it.
+        datasets: folder of each policy, as lerobot saves it, to the root of its LeRobot dataset. A folder is there once
+            its policy is trained.
         policy: options of lerobot's policy, among them ``type``.
     """
-    work = out.with_name(f".{out.name}.training")
-    start, outputs = work / "start", work / "lerobot"
-    if not start.exists():
-        with replaced(start) as unfinished:
-            initialise(dataset, unfinished, policy, seed)
-    program = str(Path(sys.executable).parent / "lerobot-train")
+    for out, dataset in datasets.items():
+        start = _work(out) / "start"
+        if not start.exists():
+            with replaced(start) as unfinished:
+                initialise(dataset, unfinished, policy, seed)
+    with ThreadPoolExecutor(training.at_once) as pool:
+        jobs = [pool.submit(_train, dataset, out, training, seed, command) for out, dataset in datasets.items()]
+        for job in jobs:
+            job.result()
+
+
+def _work(out: Path) -> Path:
+    return out.with_name(f".{out.name}.training")
+
+
+def _train(dataset: Path, out: Path, training: TrainingConfig, seed: int, command: Command) -> None:
+    """Train one policy, which has its weights already."""
+    outputs = _work(out) / "lerobot"
+    environment: dict[str, str] = {"ACCELERATE_MIXED_PRECISION": training.mixed_precision}
+    if training.at_once > 1:
+        environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // training.at_once))
+    program = ["env", *(f"{name}={value}" for name, value in environment.items())]
+    program += [sys.executable, str(Path(__file__).with_name("lerobot_train.py"))]
     last = _last_checkpoint(outputs)
     if last is None:
         remove(outputs)
-        options = {
-            "policy.path": start,
+        options: dict[str, Any] = {
+            "policy.path": _work(out) / "start",
             "dataset.repo_id": dataset.name,
             "dataset.root": dataset,
             "output_dir": outputs,
@@ -53,14 +74,16 @@ def train(
             # The process that trains reads frames too where there are few cores.
             "num_workers": max(0, min(4, (os.cpu_count() or 1) - 2)),
         }
-        command([program, *(f"--{name}={value}" for name, value in options.items())])
+        if training.learning_rate is not None:
+            options |= _schedule(training.learning_rate, training.steps)
+        command([*program, *(f"--{name}={value}" for name, value in options.items())])
     elif _step(last) < training.steps:
         config = last / "pretrained_model" / "train_config.json"
-        command([program, f"--config_path={config}", "--resume=true", f"--steps={training.steps}"])
+        command([*program, f"--config_path={config}", "--resume=true", f"--steps={training.steps}"])
     last = _last_checkpoint(outputs)
-    assert last is not None, "lerobot-train saves after the last step"
+    assert last is not None, "lerobot saves after the last step"
     put_in_place(last / "pretrained_model", out)
-    remove(work)
+    remove(_work(out))
 
 
 def initialise(dataset: Path, out: Path, options: dict[str, Any], seed: int) -> None:
@@ -103,6 +126,20 @@ def _measure(layer: Any, inputs: tuple[Any, ...]) -> None:
     (features,) = inputs
     layer.running_mean.copy_(features.mean(dim=(0, 2, 3)))
     layer.running_var.copy_(features.var(dim=(0, 2, 3)))
+
+
+def _schedule(learning_rate: float, steps: int) -> dict[str, Any]:
+    return {
+        "use_policy_training_preset": "false",
+        "optimizer.type": "adamw",
+        "optimizer.lr": learning_rate,
+        "optimizer.weight_decay": 1e-4,
+        "scheduler.type": "cosine_decay_with_warmup",
+        "scheduler.num_warmup_steps": min(WARMUP_STEPS, steps // 10),
+        "scheduler.num_decay_steps": steps,
+        "scheduler.peak_lr": learning_rate,
+        "scheduler.decay_lr": learning_rate / 100,
+    }
 
 
 def _last_checkpoint(outputs: Path) -> Path | None:
