@@ -22,7 +22,8 @@ import numpy as np
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig, RldsConfig
-from pipeline.formats.base import Episodes, Format
+from pipeline.formats.base import Format
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds

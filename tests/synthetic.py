@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig, RldsConfig
-from pipeline.formats.base import Episodes
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds

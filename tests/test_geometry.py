@@ -24,7 +24,7 @@ from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.light import LightPerturbation
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.base import Episodes
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.export import export
 from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl

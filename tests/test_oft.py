@@ -20,7 +20,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
 from pipeline.formats import rlds_write
-from pipeline.formats.base import Episodes
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.export import export
 from pipeline.formats.rlds import Rlds
 from pipeline.run import motion_statistics

@@ -16,7 +16,7 @@ from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, RldsConfig
-from pipeline.formats.base import Episodes
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds

@@ -21,7 +21,7 @@ from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum
 from pipeline.formats import lerobot_video, rlds_write
-from pipeline.formats.base import Copy, Fault
+from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.rendering.jpeg import decode, encode
 from pipeline.run import manifest

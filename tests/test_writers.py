@@ -44,7 +44,7 @@ from synthetic import (
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats import lerobot_write, rlds_write
-from pipeline.formats.base import split
+from pipeline.formats.episodes import split
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import columns

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
-from pipeline.formats.base import Episodes, Export, Format, Load
+from pipeline.formats.base import Export, Format
+from pipeline.formats.episodes import Episodes, Load
 from pipeline.seeding import digest
 
 if TYPE_CHECKING:  # this package imports no simulator, and this would

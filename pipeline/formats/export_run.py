@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from pipeline.config import Config
-from pipeline.formats.base import Episodes, Format
+from pipeline.formats.base import Format
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.export import export, is_current
 from pipeline.run import outcome
 from pipeline.run.compute import runner

@@ -11,7 +11,9 @@ import pyarrow as pa
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig
-from pipeline.formats.base import Copy, Episodes, Fault, Format, Load, Row, column
+from pipeline.formats.base import Format, Row, column
+from pipeline.formats.episodes import Episodes, Load
+from pipeline.formats.read_back import Copy, Fault
 
 
 class LeRobot(Format[LeRobotConfig]):

@@ -21,9 +21,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import PipelineError
-from pipeline.formats.base import Copy, Fault, Row, sampled
+from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import INSTANCES, OBJECT_POSES, camera_column, geometry_columns
 from pipeline.formats.lerobot_write import local_only
+from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.types import Extra, Geometry
 
 UNREADABLE = (

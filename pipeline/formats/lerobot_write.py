@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from pipeline.episode_schema import MATRICES, SCHEMA, check
 from pipeline.errors import PipelineError
-from pipeline.formats.base import Load
+from pipeline.formats.episodes import Load
 from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, Frames, camera_column, features
 from pipeline.formats.lerobot_video import VideoEncoder

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from pipeline.formats.base import Row, split
+from pipeline.formats.base import Row
+from pipeline.formats.episodes import split
 
 VERSION = "1.0.0"
 

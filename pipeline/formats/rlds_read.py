@@ -12,7 +12,8 @@ import tensorflow_datasets as tfds
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import PipelineError
-from pipeline.formats.base import Copy, Fault, Row, sampled
+from pipeline.formats.base import Row
+from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.rlds_layout import VERSION, dataset_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans

@@ -18,7 +18,7 @@ import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MapSpec, MatrixSpec, VectorSpec, check, named
-from pipeline.formats.base import Load
+from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
 from pipeline.formats.tfrecord import OVERHEAD_BYTES, framed
 from pipeline.types import Episode, Extra

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import MATRICES, SCHEMA
-from pipeline.formats.base import Copy, Fault, sampled
+from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.libero.tasks import find_task
 from pipeline.rendering.jpeg import decode
 from pipeline.types import Episode, Frame, Trajectory

@@ -18,7 +18,8 @@ from pipeline import gl
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
-from pipeline.formats.base import Episodes, Row
+from pipeline.formats.base import Row
+from pipeline.formats.episodes import Episodes
 from pipeline.formats.export import export
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, record_at

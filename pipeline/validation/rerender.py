@@ -14,7 +14,7 @@ from pipeline import gl
 from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.base import Fault
+from pipeline.formats.read_back import Fault
 from pipeline.rendering.jpeg import decode, encode
 from pipeline.rendering.renderer import LastScene
 from pipeline.run.streams import streams_of

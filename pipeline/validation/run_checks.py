@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.files import read_json
-from pipeline.formats.base import Fault, Row
+from pipeline.formats.base import Row
+from pipeline.formats.read_back import Fault
 from pipeline.run import manifest, plan
 from pipeline.validation import oft_check
 

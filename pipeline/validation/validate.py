@@ -15,7 +15,8 @@ from typing import Any
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json, scratch
-from pipeline.formats.base import Fault, Format, Row, Written
+from pipeline.formats.base import Format, Row
+from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import formats_of
 from pipeline.rendering.renderer import LastScene
 from pipeline.run import manifest

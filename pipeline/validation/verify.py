@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
-from pipeline.formats.base import Written
+from pipeline.formats.read_back import Written
 from pipeline.formats.registry import formats_of
 from pipeline.run.compute import Run
 from pipeline.run.frame_store import FrameStore

@@ -1,0 +1,97 @@
+"""The episodes of a dataset: which, in which order, in which splits and slices."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import ceil
+
+from pipeline.errors import PipelineError
+from pipeline.seeding import digest
+from pipeline.types import Episode
+
+Load = Callable[[str], Episode]
+"""Episode id to episode; picklable, called in worker processes."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What a dataset is made of.
+
+    Attributes:
+        ids: in the order in which they are written: shuffled, because readers walk a dataset in order.
+        load: reads one episode.
+        suites: episode id to LIBERO suite.
+        content: episode id to a token that changes with anything ``load`` would return.
+        demos: episode id to its demonstration, ``<suite>/<task>/<key>``.
+    """
+
+    ids: Sequence[str]
+    load: Load
+    suites: Mapping[str, str]
+    content: Mapping[str, str]
+    demos: Mapping[str, str] = field(default_factory=dict)
+
+    def by_split(self, validation: float) -> dict[str, list[str]]:
+        """``train``, and ``val`` where a share is held out, to their episodes in the order of ``ids``.
+
+        A demonstration is held out with all of its episodes, so that no perturbed episode has its clean twin, or the
+        same actions, on the other side. Of each task at least one demonstration stays to train on.
+
+        Args:
+            validation: share of each task's demonstrations, by number, rounded; drawn by a hash of its name.
+
+        Raises:
+            PipelineError: when the demonstrations are too few to hold any out.
+        """
+        if not validation:
+            return {"train": list(self.ids)}
+        by_task: dict[str, set[str]] = {}
+        for episode_id in self.ids:
+            demo = self.demos[episode_id]
+            by_task.setdefault(demo.rpartition("/")[0], set()).add(demo)
+        held_out = {
+            demo
+            for demos in by_task.values()
+            for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: round(validation * len(demos))]
+            if len(demos) > 1
+        }
+        if not held_out:
+            raise PipelineError(
+                f"no task has enough demonstrations to hold {validation:g} of them out",
+                where="export.<format>.validation",
+                expected=f"{ceil(0.5 / validation)} or more demonstrations of a task",
+                remedy="use more demonstrations, a larger share, or 0",
+            )
+        splits: dict[str, list[str]] = {"train": [], "val": []}
+        for episode_id in self.ids:
+            splits["val" if self.demos[episode_id] in held_out else "train"].append(episode_id)
+        return splits
+
+    def slices(self, members: Sequence[str], pieces: int) -> list[list[str]]:
+        """Some of the episodes in slices (see ``split``): as many of ``pieces`` as they are of all, at least one."""
+        return split(members, max(1, round(pieces * len(members) / len(self.ids))))
+
+
+def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
+    """Contiguous slices whose sizes differ by at most one, so that their concatenation keeps the caller's order.
+
+    There are ``pieces`` of them, or one per episode when there are fewer episodes than that.
+
+    Raises:
+        PipelineError: when there is nothing to write, an id comes twice or ``pieces`` is not positive.
+    """
+    if not episode_ids:
+        raise PipelineError(
+            "no episodes to write", expected="1 or more", remedy="read in the manifest why all were dropped"
+        )
+    twice = [episode_id for episode_id, times in Counter(episode_ids).items() if times > 1]
+    if twice:
+        raise PipelineError(f"{len(twice)} episodes come twice, such as {twice[0]}", expected="unique ids")
+    if pieces < 1:
+        raise PipelineError(f"{pieces} output files were asked for", expected="1 or more")
+    count = min(pieces, len(episode_ids))
+    bounds = [len(episode_ids) * k // count for k in range(count + 1)]
+    return [list(episode_ids[start:stop]) for start, stop in pairwise(bounds)]

@@ -1,0 +1,93 @@
+"""What is found where a dataset is read back: its copies of episodes, its files, and what is off with either."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from pipeline.files import checksum
+from pipeline.types import Frame, Geometry
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something off.
+
+    Attributes:
+        dataset: a format's name, ``manifest``, or ``frames`` for the store that the datasets were made from.
+        episode: its id, or None when it is about the whole dataset.
+        what: the fault.
+        expected: what would have been right.
+    """
+
+    dataset: str
+    episode: str | None
+    what: str
+    expected: str
+
+
+@dataclass(frozen=True)
+class Copy:
+    """An episode as a dataset hands it out.
+
+    Attributes:
+        dataset: the format's name.
+        motion: ``action``, ``state`` and ``joint_state``, each (T, D).
+        instructions: one for each step.
+        provenance: the columns of ``schemas/episode.json``.
+        frames: (view, step) to the decoded frame, for ``sampled`` steps.
+        marks: what else stands at each step, by the dataset's own names, each (T,).
+        place: where it lies, by the format's columns of the manifest.
+        geometry: view to where it is seen from.
+        object_poses: (T, 24, 7), None where the dataset has none.
+        instances: names of the things that segmentation and poses number.
+        encoded: view to the image file of every step; None where frames are stored otherwise.
+    """
+
+    dataset: str
+    motion: Mapping[str, NDArray[Any]]
+    instructions: Sequence[str]
+    provenance: Mapping[str, str]
+    frames: Mapping[tuple[str, int], Frame]
+    marks: Mapping[str, NDArray[Any]]
+    place: Mapping[str, Any]
+    geometry: Mapping[str, Geometry]
+    object_poses: NDArray[Any] | None = None
+    instances: Sequence[str] = ()
+    encoded: Mapping[str, Sequence[bytes]] | None = None
+
+    def __len__(self) -> int:
+        return len(self.motion["action"])
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file as the record of its dataset has it.
+
+    Attributes:
+        dataset: the format's name.
+        file: where it lies.
+        sha256: of what was written.
+    """
+
+    dataset: str
+    file: Path
+    sha256: str
+
+    def faults(self) -> list[Fault]:
+        """What is off with it, by reading all of it: nothing, or that it is not what was written."""
+        expected = f"what its checksum in {self.dataset}.json is of; delete it, and `dvc repro` makes it again"
+        try:
+            same = checksum(self.file) == self.sha256
+        except OSError as error:
+            return [Fault(self.dataset, None, f"{self.file}: cannot be read ({error})", expected)]
+        return [] if same else [Fault(self.dataset, None, f"{self.file}: was changed since it was written", expected)]
+
+
+def sampled(steps: int) -> list[int]:
+    """The steps whose frames are decoded: the first, the middle and the last."""
+    return sorted({0, steps // 2, steps - 1})
