@@ -119,8 +119,8 @@ def small_experiment(folder: Path, demos: Path) -> Path:
     return file
 
 
-def test_a_run_with_videos_is_refused(short_demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = small_experiment(tmp_path, short_demos)
+def test_a_run_with_videos_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = small_experiment(tmp_path, tmp_path / "demos")
     run = yaml.safe_load((tmp_path / "data.yaml").read_text())
     run["export"]["lerobot"]["frames"] = "video"
     (tmp_path / "data.yaml").write_text(yaml.safe_dump(run))

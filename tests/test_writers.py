@@ -337,6 +337,7 @@ def test_lerobot_reads_when_videos_spread_over_many_files(written: Written, tmp_
     assert_lerobot_episodes(target.root)
 
 
+@pytest.mark.slow
 def test_no_video_is_written_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """lerobot appends an episode to a file by writing all of the file again."""
     views = []

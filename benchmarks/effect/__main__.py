@@ -105,16 +105,13 @@ def run(experiment: Experiment, out: Path) -> None:
     policies = {arm: [experiment.policy_name(arm, seed) for seed in experiment.seeds] for arm in experiment.arms}
     with shell.part("data"):
         make_data(experiment, datasets, shell)
-    for number, seed in enumerate(experiment.seeds):
-        untrained = {
-            out / "policies" / names[number]: datasets[arm]
-            for arm, names in policies.items()
-            if not (out / "policies" / names[number]).exists()
-        }
+    for seed, *names in zip(experiment.seeds, *policies.values(), strict=True):
+        folders = {out / "policies" / name: dataset for name, dataset in zip(names, datasets.values(), strict=True)}
+        untrained = {folder: dataset for folder, dataset in folders.items() if not folder.exists()}
         with shell.part("training"):
             train(untrained, experiment.policy, experiment.training, seed, shell)
         with shell.part("evaluation"):
-            evaluate(experiment, [names[number] for names in policies.values()], out, shell)
+            evaluate(experiment, names, out, shell)
     lines, hours = comparison_table.table(comparison_table.read(out / "evaluations", policies)), shell.hours()
     contents = {arm: comparison_table.contents(dataset) for arm, dataset in datasets.items()}
     command = shlex.join(["python", "benchmarks/effect", *sys.argv[1:]])
