@@ -22,7 +22,7 @@ sys.path.append(str(EFFECT))
 
 from arms import chosen  # noqa: E402
 from comparison_table import markdown, table  # noqa: E402
-from experiment import TrainingConfig, read  # noqa: E402
+from experiment import read  # noqa: E402
 from training import train  # noqa: E402
 
 
@@ -102,6 +102,7 @@ def small_experiment(folder: Path, demos: Path) -> Path:
         "data": "data.yaml",
         "arms": {"perturbed": ["noise"]},
         "frame_px": 32,
+        "proprioception": False,
         "policy": {
             **{"type": "act", "pretrained_backbone_weights": None, "chunk_size": 100, "n_action_steps": 40},
             **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1, "use_vae": False},
@@ -139,6 +140,8 @@ def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path) -> 
     assert found["episodes_by_axis"] == {"perturbed": {"noise": 1}}
     (line,) = found["table"]
     assert (line["source"], line["axis"], line["arms"]["perturbed"]["episodes"]) == ("libero", "clean", 1)
+    (policy,) = (tmp_path / "out" / "policies").iterdir()
+    assert "observation.state" not in json.loads((policy / "config.json").read_text())["input_features"]
     (row,) = merging.read([*(tmp_path / "out" / "evaluations").iterdir()])[0].rows
     assert (row["reason"], row["steps"], row["looks"]) == ("step_limit", 300, 8), "it looks once in its chunk"
     assert {*found["hours"]} == {"data", "training", "evaluation"}
@@ -148,7 +151,9 @@ class StoppedError(Exception):
     """The training's process was killed."""
 
 
-def test_a_training_that_was_stopped_goes_on_from_its_last_checkpoint(tmp_path: Path) -> None:
+def test_a_training_that_was_stopped_goes_on_from_its_last_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """lerobot's part is a stand-in that leaves the files of a checkpoint."""
     started = tmp_path / ".policy.training" / "start"
     started.mkdir(parents=True)
@@ -166,10 +171,12 @@ def test_a_training_that_was_stopped_goes_on_from_its_last_checkpoint(tmp_path: 
         if step < 2:
             raise StoppedError
 
-    training = TrainingConfig(steps=2, batch_size=2, save_every=1)
+    file = small_experiment(tmp_path, tmp_path / "demos")
+    monkeypatch.chdir(tmp_path)
+    experiment = read(file)
 
     def run(command: Callable[[list[str]], None]) -> None:
-        train({tmp_path / "policy": tmp_path / "dataset"}, {}, training, 0, command)
+        train({tmp_path / "policy": tmp_path / "dataset"}, experiment, 0, command)
 
     with pytest.raises(StoppedError):
         run(partial(stopped_after, 1))

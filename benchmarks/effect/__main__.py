@@ -109,7 +109,7 @@ def run(experiment: Experiment, out: Path) -> None:
         folders = {out / "policies" / name: dataset for name, dataset in zip(names, datasets.values(), strict=True)}
         untrained = {folder: dataset for folder, dataset in folders.items() if not folder.exists()}
         with shell.part("training"):
-            train(untrained, experiment.policy, experiment.training, seed, shell)
+            train(untrained, experiment, seed, shell)
         with shell.part("evaluation"):
             evaluate(experiment, names, out, shell)
     lines, hours = comparison_table.table(comparison_table.read(out / "evaluations", policies)), shell.hours()
