@@ -38,7 +38,7 @@ from pipeline.rendering.jpeg import encode, to_policy  # noqa: E402
 from pipeline.rendering.render import render_plan  # noqa: E402
 from pipeline.run import plan  # noqa: E402
 from pipeline.run.compute import loop  # noqa: E402
-from pipeline.run.frame_store import FrameStore  # noqa: E402
+from pipeline.run.frame_store import FrameStore, shown_of  # noqa: E402
 from pipeline.run.outcome import rejections  # noqa: E402
 from pipeline.run.streams import streams_of  # noqa: E402
 from pipeline.run.trajectory_store import TrajectoryStore  # noqa: E402
@@ -62,7 +62,7 @@ def main() -> None:
         render_plan(rows, config, trajectories, frames, loop)
         rendered = time.process_time()
         store = FrameStore(frames, config.render)
-        outcome = plan.select(rows, verdicts, rejections(rows, store.rows()))
+        outcome = plan.select(rows, verdicts, rejections(rows, shown_of(store.rows())))
         kept = [row for row in rows if outcome[row.episode_id].kept]
         naive_s, same, count = 0.0, 0, 0
         for row in kept:

@@ -135,13 +135,17 @@ def keep_only(folder: Path, names: set[str]) -> None:
 
 def keep_below(folder: Path, files: set[Path]) -> None:
     """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one."""
-    if folder.is_dir():
-        on_the_way = {parent for file in files for parent in file.parents}
-        for entry in folder.iterdir():
+    on_the_way = {parent for file in files for parent in file.parents}
+
+    def clear(below: Path) -> None:
+        for entry in below.iterdir():
             if entry in on_the_way and not entry.is_symlink():
-                keep_below(entry, files)
+                clear(entry)
             elif entry not in files:
                 remove(entry)
+
+    if folder.is_dir():
+        clear(folder)
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -18,7 +18,7 @@ def run(config: Config) -> None:
     with runner(config.compute, config.data) as workers:
         rendered = render_plan(rows, config, config.data / "trajectories", folder, workers)
     FrameStore(folder, config.render).keep(rendered)
-    print(f"rendered {len(rendered)} trajectories into {folder}")
+    print(f"{len(rendered)} files of frames are in {folder}")
 
 
 if __name__ == "__main__":

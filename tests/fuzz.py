@@ -208,13 +208,14 @@ def _frames() -> bytes:
         store = FrameStore(folder, RenderConfig())
         streams = {"one": [bytes([n]) * 200 for n in range(20)], "two": [bytes([n]) * 90 for n in range(20)]}
         store.save("frames", Rendered("open_loop", state, joints, action, streams, {"three": "too_dark"}), "llvmpipe")
-        return store.path("frames")
+        (name,) = store.names()
+        return store.path(name)
 
     return _in_temporary(write)
 
 
 def _read_frames(file: Path) -> object:
-    loaded = FrameStore(file.parent, RenderConfig()).load(file.stem, ["one", "two"])
+    loaded = FrameStore(file.parent.parent, RenderConfig()).load(file.parent.name, ["one", "two"])
     return [loaded.streams, loaded.rejected, loaded.replay_mode, loaded.state.tolist(), loaded.action.tolist()]
 
 

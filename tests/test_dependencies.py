@@ -47,7 +47,7 @@ def test_a_stage_opens_all_that_it_declares_and_needs_nothing_else(stage: str, f
     if store := MADE_BUT_FOR_ONE.get(stage):
         shutil.copytree(clone / store, tmp_path / store)
         (tmp_path / store / "index.parquet").unlink()
-        min((tmp_path / store).glob("*.h5"), key=lambda file: file.stat().st_size).unlink()
+        min((tmp_path / store).rglob("*.h5"), key=lambda file: file.stat().st_size).unlink()
     # Without other processes: what a worker opens is seen too, but starting them takes longer than the stage.
     file = tmp_path / "configs" / "tiny.yaml"
     config = yaml.safe_load(file.read_text()) | {"compute": {"cluster": "loop"}}

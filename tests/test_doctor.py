@@ -64,7 +64,7 @@ def test_disk_is_asked_for_as_the_configuration_needs_it(
 def test_what_a_run_has_made_already_needs_no_more_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     link_testset(tmp_path)
-    frames = tmp_path / "data" / "starter" / "frames" / "0123.h5"
+    frames = tmp_path / "data" / "starter" / "frames" / "0123" / "4567.h5"
     frames.parent.mkdir(parents=True)
     with frames.open("wb") as file:
         file.truncate(500_000_000)

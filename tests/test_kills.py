@@ -29,7 +29,7 @@ def test_a_run_that_is_killed_anywhere_ends_like_one_that_is_not(finished: Path,
     for folder in ("trajectories", "frames"):
         store = clone / "data" / "tiny" / folder
         (store / "index.parquet").unlink()
-        for made_last in sorted(store.glob("*.h5"), key=lambda path: path.stat().st_size)[:2]:
+        for made_last in sorted(store.rglob("*.h5"), key=lambda path: path.stat().st_size)[:2]:
             made_last.unlink()
     seed = date.today().toordinal()
     killed = kill_and_resume(clone, kills=2, seed=seed, took_s=dict.fromkeys(REPEATED, 5.0))

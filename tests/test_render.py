@@ -187,7 +187,7 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     assert set(rendered.streams) == {streams[0].stream_id, streams[2].stream_id}
     store = FrameStore(tmp_path, RenderConfig())
     store.save("t", rendered, "some device")
-    row = store.rows()["t"]
+    (row,) = store.rows().values()
     assert stream_ids(row) == {stream.stream_id for stream in streams}
     assert json.loads(row["rejected"]) == rendered.rejected
 

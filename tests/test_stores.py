@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +12,7 @@ import numpy as np
 import pytest
 from conftest import BOWL, read_with_flipped_bits, tiny_config
 
-from pipeline import gl, identity
+from pipeline import identity
 from pipeline.axes import to_json
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.robot import RobotPerturbation
@@ -22,12 +20,12 @@ from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.physics.replay import replay_plan
-from pipeline.rendering.render import render_plan
+from pipeline.rendering.render import STREAMS_OF_A_JOB, portions, render_plan
 from pipeline.run import outcome, plan
 from pipeline.run.compute import loop
-from pipeline.run.frame_store import FrameStore
+from pipeline.run.frame_store import FrameStore, Shown, shown_of
 from pipeline.run.store import TABLE
-from pipeline.run.streams import streams_of
+from pipeline.run.streams import Stream, streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
@@ -190,28 +188,58 @@ def test_rendering_ends_when_all_streams_of_a_trajectory_are_rejected(
         return loop(fn, items, description)
 
     render_plan(lights, config, replayed, tmp_path, counted)
-    stored = FrameStore(tmp_path, config.render).rows()
-    (row,) = stored.values()
-    assert row["streams"] == []
-    assert len(json.loads(row["rejected"])) == 4, "two views of the light episode and of its reserve"
+    stored = shown_of(FrameStore(tmp_path, config.render).rows())
+    (shown,) = stored.values()
+    assert shown.streams == set()
+    assert len(shown.rejected) == 4, "two views of the light episode and of its reserve"
     assert outcome.rejections(lights, stored) == dict.fromkeys((row.episode_id for row in lights), "too_dark")
     rendered = len(passes)
     render_plan(lights, config, replayed, tmp_path, counted)
     assert len(passes) == rendered, "a second run has nothing to do"
 
 
-def test_a_rejection_that_is_no_longer_planned_is_forgotten(
+def test_frames_are_the_same_in_one_file_and_in_several(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As when a trajectory has more streams than a job renders, and when a plan grows."""
+    render_plan(rows, config, replayed, tmp_path / "one", loop)
+    monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", 1)
+    render_plan(rows[:1], config, replayed, tmp_path / "several", loop)
+    files = render_plan(rows, config, replayed, tmp_path / "several", loop)
+    streams = {s.stream_id: s.geometry.stream_id for row in rows[:2] for s in streams_of(row.perturbations).values()}
+    assert len(streams) == len(files) == 4
+    one, several = (
+        FrameStore(tmp_path / name, config.render).load(rows[0].trajectory_id, [*streams], {*streams.values()})
+        for name in ("one", "several")
+    )
+    assert one.streams == several.streams
+    assert one.geometry.keys() == several.geometry.keys() == set(streams.values())
+    assert np.array_equal(one.state, several.state)
+
+
+def test_files_of_frames_that_no_plan_needs_are_deleted(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
 ) -> None:
-    store, trajectory_id = FrameStore(tmp_path, config.render), rows[0].trajectory_id
-    render_plan(rows[:1], config, replayed, tmp_path, loop)
-    geometry = [stream.geometry.stream_id for stream in streams_of(rows[0].perturbations).values()]
-    twin = store.load(trajectory_id, store.rows()[trajectory_id]["streams"], geometry)
-    store.save(trajectory_id, replace(twin, rejected={"earlier": "too_dark"}), gl.choose().device)
-    render_plan(rows[:1], config, replayed, tmp_path, loop)
-    row = store.rows()[trajectory_id]
-    assert json.loads(row["rejected"]) == {}
-    assert row["streams"] == sorted(twin.streams)
+    store = FrameStore(tmp_path, config.render)
+    lights = render_plan(without_twins(rows), config, replayed, tmp_path, loop)
+    twin = render_plan(rows[:1], config, replayed, tmp_path, loop)
+    assert not lights & twin
+    (tmp_path / "0123.h5").write_bytes(b"all frames of a trajectory, as an earlier version stored them")
+    store.keep(twin)
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.h5")} == {f"{name}.h5" for name in twin}
+
+
+@pytest.mark.parametrize("number", [1, 64, 65, 600])
+def test_a_job_has_so_many_streams_at_most(number: int) -> None:
+    """And a run that was stopped is cut as the whole one."""
+    lights = [NIGHT.model_copy(update={"diffuse_scale_rgb": (0.0, 0.0, step / number)}) for step in range(number)]
+    streams = [Stream("image", (light,)) for light in lights]
+    jobs = portions(streams, None)
+    assert len(jobs) == -(-number // STREAMS_OF_A_JOB)
+    assert max(map(len, jobs)) <= STREAMS_OF_A_JOB
+    assert sorted(stream.stream_id for job in jobs for stream in job) == sorted(s.stream_id for s in streams)
+    stored = Shown("", "", "", {stream.stream_id for stream in jobs[0]})
+    assert portions(streams, stored) == jobs[1:]
 
 
 def test_rendering_that_leaves_the_same_work_undone_is_an_error(
@@ -249,16 +277,16 @@ def test_a_rendering_that_is_given_up_is_dropped_with_its_reason_and_keeps_what_
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
 ) -> None:
     render_plan(rows, config, replayed, tmp_path / "at_once", given_up)
-    stored = FrameStore(tmp_path / "at_once", config.render).rows()
+    stored = shown_of(FrameStore(tmp_path / "at_once", config.render).rows())
     assert set(outcome.rejections(rows, stored).values()) == {"worker_lost"}
     render_plan(rows, config, replayed, tmp_path / "at_once", nothing_to_do)
 
     twin, lights = rows[:1], without_twins(rows)
     render_plan(twin, config, replayed, tmp_path / "later", loop)
     render_plan(rows, config, replayed, tmp_path / "later", given_up)
-    stored = FrameStore(tmp_path / "later", config.render).rows()
+    stored = shown_of(FrameStore(tmp_path / "later", config.render).rows())
     assert outcome.rejections(rows, stored) == dict.fromkeys((row.episode_id for row in lights), "worker_lost")
-    assert len(stored[twin[0].trajectory_id]["streams"]) == 2, "the twin's own frames stay"
+    assert len(stored[twin[0].trajectory_id].streams) == 2, "the twin's own frames stay"
 
 
 def test_reserves_are_replayed_where_frames_may_be_rejected_after_all_physics(rows: list[plan.Row]) -> None:

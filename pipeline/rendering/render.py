@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import platform
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,13 +25,19 @@ from pipeline.rendering.jpeg import encode, to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import CAMERA, Sight
 from pipeline.run.compute import LOST, Expendable, Run
-from pipeline.run.frame_store import FrameStore, Rendered, stream_ids
+from pipeline.run.frame_store import FrameStore, Rendered, Shown, file_name, shown_of, stream_ids, trajectory_of
 from pipeline.run.outcome import rejections, replayed
 from pipeline.run.plan import Row, select
 from pipeline.run.streams import Stream, streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Task, Trajectory
+
+STREAMS_OF_A_JOB = 64
+"""Bounds a render job: minutes of a core, which a kill loses at most, and some 200 MB of encoded frames.
+
+A trajectory's second job opens its scene once more, which takes some seconds.
+"""
 
 
 def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
@@ -42,7 +50,7 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
     """
     variants: dict[str, list[Stream]] = {}
     for stream in streams:
-        variants.setdefault(to_json(of_layer(stream.perturbations, RenderPerturbation)), []).append(stream)
+        variants.setdefault(_scene(stream), []).append(stream)
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     refused: dict[str, str] = {}
     proprioceptions: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
@@ -100,7 +108,7 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
 
 @dataclass(frozen=True)
 class RenderJob:
-    """One trajectory's share of the rendering, as it is sent to a worker.
+    """Streams of one trajectory to render into one file, as they are sent to a worker.
 
     Attributes:
         trajectory_id, task, streams: what to render.
@@ -120,7 +128,7 @@ class RenderJob:
     device: str
 
     def __call__(self) -> None:
-        """Render what is missing and store it with what an earlier run already rendered.
+        """Render the streams and store them.
 
         Raises:
             PipelineError: when another device renders here: its pixels differ, and the run would never use them.
@@ -135,18 +143,7 @@ class RenderJob:
             )
         store = FrameStore(self.frames, self.config)
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
-        earlier = self._earlier(store, device)
-        known = {*earlier.streams, *earlier.rejected} if earlier else set()
-        missing = [stream for stream in self.streams if stream.stream_id not in known]
-        rendered = render(trajectory, self.task, missing, self.config)
-        if earlier:
-            rendered = replace(
-                rendered,
-                streams={**rendered.streams, **earlier.streams},
-                rejected={**rendered.rejected, **earlier.rejected},
-                geometry={**rendered.geometry, **earlier.geometry},
-            )
-        store.save(self.trajectory_id, rendered, device)
+        store.save(self.trajectory_id, render(trajectory, self.task, self.streams, self.config), device)
 
     def frames_at_most(self) -> int:
         return self.steps * len(self.streams)
@@ -156,30 +153,38 @@ class RenderJob:
         return 1800.0 + 2.0 * self.frames_at_most()
 
     def lost(self) -> None:
-        """Store that no worker survived the streams that are missing, or finished them, beside those that are there.
+        """Store that no worker survived the streams, unless one stored them before it was lost.
 
         They are not tried again while the file is there.
         """
         store = FrameStore(self.frames, self.config)
-        earlier = self._earlier(store, self.device)
-        if earlier is None:
-            trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
-            action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
-            state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)
-            earlier = Rendered(trajectory.mode, state, joint_state, action)
-        missing = {stream.stream_id for stream in self.streams} - {*earlier.streams, *earlier.rejected}
-        rejected = {**earlier.rejected, **dict.fromkeys(missing, LOST)}
-        store.save(self.trajectory_id, replace(earlier, rejected=rejected), self.device)
+        streams = [stream.stream_id for stream in self.streams]
+        row = store.row(file_name(self.trajectory_id, streams))
+        if row is not None and row["device"] == self.device:
+            return
+        trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
+        action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
+        state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)
+        nothing = Rendered(trajectory.mode, state, joint_state, action, rejected=dict.fromkeys(streams, LOST))
+        store.save(self.trajectory_id, nothing, self.device)
 
-    def _earlier(self, store: FrameStore, device: str) -> Rendered | None:
-        """What is stored of the wanted streams, from the same device."""
-        wanted = {stream.stream_id: stream.geometry.stream_id for stream in self.streams}
-        row = store.row(self.trajectory_id)
-        if row is None or row["device"] != device:
-            return None
-        streams = sorted(wanted.keys() & set(row["streams"]))
-        stored = store.load(self.trajectory_id, streams, {wanted[stream_id] for stream_id in streams})
-        return replace(stored, rejected={name: why for name, why in stored.rejected.items() if name in wanted})
+
+def portions(streams: Iterable[Stream], stored: Shown | None) -> list[tuple[Stream, ...]]:
+    """The streams of a trajectory that are not stored, in portions of ``STREAMS_OF_A_JOB`` at most.
+
+    They are cut before those that are stored are left out: a run that was stopped makes the files that it would have
+    made. Streams that share a scene stay together.
+    """
+    ordered = sorted(streams, key=lambda stream: (_scene(stream), stream.stream_id))
+    known = stored.streams | stored.rejected.keys() if stored else set()
+    cut = [int(end) for end in np.linspace(0, len(ordered), math.ceil(len(ordered) / STREAMS_OF_A_JOB) + 1)]
+    wanted = [tuple(s for s in ordered[start:end] if s.stream_id not in known) for start, end in pairwise(cut)]
+    return [portion for portion in wanted if portion]
+
+
+def _scene(stream: Stream) -> str:
+    """What streams have in common that are made from the same scene."""
+    return to_json(of_layer(stream.perturbations, RenderPerturbation))
 
 
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, run: Run) -> set[str]:
@@ -188,7 +193,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing.
 
     Returns:
-        The trajectories whose frames the plan needs; all have a file in ``folder`` now.
+        The files of ``folder`` that hold frames that the plan needs.
 
     Raises:
         PipelineError: when a trajectory is missing, or rendering leaves the same work undone.
@@ -201,7 +206,8 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     undone: list[RenderJob] = []
     while True:
         stored = {name: row for name, row in store.refresh().items() if row["device"] == device}
-        rejected = rejections(rows, stored)
+        shown = shown_of(stored)
+        rejected = rejections(rows, shown)
         outcome = select(rows, judged, rejected)
         needed: dict[str, dict[str, Stream]] = {}
         for row in rows:
@@ -213,7 +219,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
             RenderJob(
                 trajectory_id,
                 find_task(*tasks[trajectory_id]),
-                tuple(streams.values()),
+                missing,
                 steps[trajectory_id],
                 trajectories,
                 folder,
@@ -221,15 +227,17 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
                 device,
             )
             for trajectory_id, streams in needed.items()
-            if trajectory_id not in stored or stream_ids(stored[trajectory_id]) != set(streams)
+            for missing in portions(streams.values(), shown.get(trajectory_id))
         ]
         if not jobs:
-            return set(needed)
+            return {
+                name for name, row in stored.items() if stream_ids(row) & needed.get(trajectory_of(name), {}).keys()
+            }
         if jobs == undone:
             raise PipelineError(
-                f"{len(jobs)} trajectories were rendered and are still not there, such as this one",
-                where=store.path(jobs[0].trajectory_id),
-                expected=f"files written by workers into this folder, rendered on {device}",
+                f"{len(jobs)} files of frames were rendered and are still not there, such as one in this folder",
+                where=store.folder(jobs[0].trajectory_id),
+                expected=f"files written there by workers, rendered on {device}",
                 remedy="check that all workers see this folder and have the same versions and OpenGL device",
             )
         undone = jobs

@@ -1,10 +1,13 @@
-"""Rendered trajectories on disk; episodes that show the same frames share one stream of them."""
+"""Rendered trajectories on disk; episodes that show the same frames share one stream of them.
+
+A trajectory has a folder, and in it a file for each set of streams that were rendered together.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.identity import fingerprint
 from pipeline.run.sealed_file import SealedFile
 from pipeline.run.store import Store
+from pipeline.seeding import digest
 from pipeline.types import Geometry
 
 _SHOWN = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
@@ -58,11 +62,29 @@ class Rendered:
     instances: Sequence[str] = ()
 
 
+@dataclass(frozen=True)
+class Shown:
+    """What is stored of one trajectory's frames, in all its files.
+
+    Attributes:
+        made_by, device, replay_mode: as in the table.
+        streams: ids of those that were rendered.
+        rejected: stream id to the reason why it was not.
+    """
+
+    made_by: str
+    device: str
+    replay_mode: str
+    streams: set[str] = field(default_factory=set)
+    rejected: dict[str, str] = field(default_factory=dict)
+
+
 class FrameStore(Store):
     """Frames under one folder.
 
     The columns of its table are ``device`` (what rendered, as OpenGL names it), ``replay_mode``, ``steps``, ``streams``
-    (ids of those that were rendered) and ``rejected`` (JSON, stream id to the reason why it was not).
+    (ids of those that were rendered) and ``rejected`` (JSON, stream id to the reason why it was not). A file's name is
+    ``<trajectory id>/<digest of its streams>``.
 
     Args:
         root: the folder.
@@ -72,10 +94,13 @@ class FrameStore(Store):
     def __init__(self, root: Path, config: RenderConfig):
         shown = [SCHEMA.model_dump(include=_SHOWN), SCHEMA.image_rotation_deg]
         made_by = fingerprint("encoding", config.model_dump(), shown)
-        super().__init__(root, made_by, "render", _COLUMNS, _describe)
+        super().__init__(root, made_by, "render", _COLUMNS, _describe, files="*/*.h5")
+
+    def folder(self, trajectory_id: str) -> Path:
+        return self.root / trajectory_id
 
     def save(self, trajectory_id: str, rendered: Rendered, device: str) -> None:
-        """Store what was rendered.
+        """Store what was rendered, in a file of its own.
 
         Args:
             trajectory_id: which trajectory it shows.
@@ -88,7 +113,7 @@ class FrameStore(Store):
             "instances": list(rendered.instances),
             "rejected": json.dumps(dict(rendered.rejected), sort_keys=True),
         }
-        with self.created(trajectory_id, attributes) as file:
+        with self.created(file_name(trajectory_id, {*rendered.streams, *rendered.rejected}), attributes) as file:
             for name in ("state", "joint_state", "action"):
                 file[name] = getattr(rendered, name)
             streams = file.create_group("streams")
@@ -109,41 +134,85 @@ class FrameStore(Store):
 
         Args:
             trajectory_id: which trajectory.
-            streams: ids of streams.
+            streams: ids of streams, one at least.
             geometry: ids of the geometry to read with them.
 
         Raises:
             PipelineError: when the file, one of the streams or its geometry is not there.
         """
-        with self.opened(trajectory_id) as file:
-            missing = {*streams, *geometry} - {*file.groups("streams"), *file.groups("geometry")}
-            if missing:
-                raise PipelineError(
-                    f"streams {sorted(missing)} were not rendered",
-                    where=self.path(trajectory_id),
-                    remedy="run the render stage again",
-                )
-            return Rendered(
-                replay_mode=file.attributes["replay_mode"],
-                state=file.array("state"),
-                joint_state=file.array("joint_state"),
-                action=file.array("action"),
-                streams={name: _frames(file, f"streams/{name}") for name in streams},
-                rejected=json.loads(file.attributes["rejected"]),
-                geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
-                object_poses=file.array("object_poses") if "object_poses" in file else None,
-                instances=file.attributes["instances"],
+        frames: dict[str, list[bytes]] = {}
+        views: dict[str, Geometry] = {}
+        loaded = None
+        for name in self._files_of(trajectory_id):
+            with self.opened(name) as file:
+                here = (set(streams) - frames.keys()) & set(file.groups("streams"))
+                seen = (set(geometry) - views.keys()) & set(file.groups("geometry"))
+                frames |= {stream: _frames(file, f"streams/{stream}") for stream in here}
+                views |= {view: _geometry(file, f"geometry/{view}") for view in seen}
+                if here and loaded is None:
+                    loaded = _without_frames(file)
+        missing = {*(set(streams) - frames.keys()), *(set(geometry) - views.keys())}
+        if missing or loaded is None:
+            raise PipelineError(
+                f"streams {sorted(missing)} were not rendered",
+                where=self.folder(trajectory_id),
+                remedy="run the render stage again",
             )
+        return replace(loaded, streams=frames, geometry=views)
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Action (K, 7) and state (K, 8) of a trajectory, without its frames."""
-        with self.opened(trajectory_id) as file:
-            return file.array("action"), file.array("state")
+        """Action (K, 7) and state (K, 8) of a trajectory, without its frames.
+
+        Raises:
+            PipelineError: when a file is damaged, or none is there.
+        """
+        for name in self._files_of(trajectory_id):
+            with self.opened(name) as file:
+                if file.groups("streams"):
+                    return file.array("action"), file.array("state")
+        raise PipelineError("not rendered", where=self.folder(trajectory_id), remedy="run the render stage again")
+
+    def _files_of(self, trajectory_id: str) -> list[str]:
+        return sorted(f"{trajectory_id}/{path.stem}" for path in self.folder(trajectory_id).glob("*.h5"))
+
+
+def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
+    """Of the file that holds these streams of a trajectory, or says that they were rejected."""
+    return f"{trajectory_id}/{digest(*sorted(streams))[:16]}"
 
 
 def stream_ids(row: Mapping[str, Any]) -> set[str]:
     """The streams that a row of the table accounts for: rendered, or rejected."""
     return {*row["streams"], *json.loads(row["rejected"])}
+
+
+def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
+    """Trajectory id to what its files hold, from their rows of the table."""
+    shown: dict[str, Shown] = {}
+    for name, row in rows.items():
+        same = Shown(row["made_by"], row["device"], row["replay_mode"])
+        one = shown.setdefault(trajectory_of(name), same)
+        one.streams.update(row["streams"])
+        one.rejected.update(json.loads(row["rejected"]))
+    return shown
+
+
+def trajectory_of(name: str) -> str:
+    """The trajectory that a file shows."""
+    return name.split("/")[0]
+
+
+def _without_frames(file: SealedFile) -> Rendered:
+    """What a file holds beside streams and geometry."""
+    return Rendered(
+        replay_mode=file.attributes["replay_mode"],
+        state=file.array("state"),
+        joint_state=file.array("joint_state"),
+        action=file.array("action"),
+        rejected=json.loads(file.attributes["rejected"]),
+        object_poses=file.array("object_poses") if "object_poses" in file else None,
+        instances=file.attributes["instances"],
+    )
 
 
 def _pack(group: h5py.Group, files: Sequence[bytes]) -> None:

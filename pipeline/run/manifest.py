@@ -58,14 +58,14 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
     for row in run.rows:
         verdict = run.verdicts[row.episode_id]
         replayed = run.trajectories.get(row.trajectory_id, {})
-        rendered = run.frames.get(row.trajectory_id, {})
+        rendered = run.frames.get(row.trajectory_id)
         results: dict[str, Any] = {
             "kept": verdict.kept,
             "reason": verdict.reason,
             "replay_mode": replayed.get("mode"),
             "steps": replayed.get("steps"),
             "resolved": replayed.get("resolved"),
-            "gl_device": rendered.get("device"),
+            "gl_device": rendered and rendered.device,
         }
         table.append({**asdict(row), **results, **places.get(row.episode_id, {}), **shared})
     return pa.Table.from_pylist(table, schema=schema(columns))

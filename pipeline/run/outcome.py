@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -12,8 +11,7 @@ from typing import Any
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.run import plan
-from pipeline.run.frame_store import FrameStore
-from pipeline.run.store import Store
+from pipeline.run.frame_store import FrameStore, Shown, shown_of
 from pipeline.run.streams import streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.seeding import digest
@@ -27,13 +25,13 @@ class Outcome:
     Attributes:
         rows: the plan.
         trajectories: trajectory id to its row in the table of replays.
-        frames: trajectory id to its row in the table of frames.
+        frames: trajectory id to what is stored of its frames.
         verdicts: episode id to verdict.
     """
 
     rows: Sequence[plan.Row]
     trajectories: Mapping[str, Mapping[str, Any]]
-    frames: Mapping[str, Mapping[str, Any]]
+    frames: Mapping[str, Shown]
     verdicts: Mapping[str, Verdict]
 
     @cached_property
@@ -52,7 +50,7 @@ class Outcome:
 
     def _made_by(self, row: plan.Row) -> tuple[object, ...]:
         frames = self.frames[row.trajectory_id]
-        return frames["made_by"], frames["device"], frames["replay_mode"]
+        return frames.made_by, frames.device, frames.replay_mode
 
 
 def replayed(rows: Sequence[plan.Row], folder: Path) -> dict[str, dict[str, Any]]:
@@ -63,24 +61,23 @@ def replayed(rows: Sequence[plan.Row], folder: Path) -> dict[str, dict[str, Any]
     """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
-    _refuse_missing(plan.pending(rows, verdicts_of(trajectories)), store, "replay")
+    _refuse_missing([store.path(name) for name in plan.pending(rows, verdicts_of(trajectories))], "replay")
     return trajectories
 
 
-def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[str, str]:
     """Episode id to the reason why one of its streams was not rendered, where that is so.
 
     Args:
         rows: the plan.
-        frames: trajectory id to its row in the table of frames.
+        frames: trajectory id to what is stored of its frames.
     """
-    rejected = {trajectory_id: json.loads(row["rejected"]) for trajectory_id, row in frames.items()}
     reasons: dict[str, str] = {}
     for row in rows:
-        if of_trajectory := rejected.get(row.trajectory_id):
+        if (shown := frames.get(row.trajectory_id)) and shown.rejected:
             for stream in streams_of(row.perturbations).values():
-                if stream.stream_id in of_trajectory:
-                    reasons[row.episode_id] = of_trajectory[stream.stream_id]
+                if stream.stream_id in shown.rejected:
+                    reasons[row.episode_id] = shown.rejected[stream.stream_id]
     return reasons
 
 
@@ -93,17 +90,26 @@ def read(config: Config) -> Outcome:
     rows = plan.read(config.data / "plan.parquet")
     trajectories = replayed(rows, config.data / "trajectories")
     store = FrameStore(config.data / "frames", config.render)
-    frames = store.rows()
+    frames = shown_of(store.rows())
     judged = plan.select(rows, verdicts_of(trajectories), rejections(rows, frames))
-    needed = dict.fromkeys(row.trajectory_id for row in rows if judged[row.episode_id].kept)
-    _refuse_missing([trajectory_id for trajectory_id in needed if trajectory_id not in frames], store, "render")
+    missing = dict.fromkeys(
+        store.folder(row.trajectory_id)
+        for row in rows
+        if judged[row.episode_id].kept
+        and not (row.trajectory_id in frames and frames[row.trajectory_id].streams >= _streams(row))
+    )
+    _refuse_missing([*missing], "render")
     return Outcome(rows, trajectories, frames, judged)
 
 
-def _refuse_missing(missing: Sequence[str], store: Store, stage: str) -> None:
+def _streams(row: plan.Row) -> set[str]:
+    return {stream.stream_id for stream in streams_of(row.perturbations).values()}
+
+
+def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
     if missing:
         raise PipelineError(
-            f"{len(missing)} files that the plan needs are missing, damaged or not current, such as this one",
-            where=store.path(missing[0]),
+            f"what the plan needs is missing, damaged or not current in {len(missing)} places, such as this one",
+            where=missing[0],
             remedy=f"run the {stage} stage again, it makes only those",
         )

@@ -1,4 +1,4 @@
-"""A folder of HDF5 files, one for each trajectory, and the table that says what is in them.
+"""A folder of HDF5 files that one stage makes, and the table that says what is in them.
 
 A file is whole or not there, and named after what it holds, so that a changed plan never picks up a file that was made
 for something else, and still finds every file that it shares with the plan before it.
@@ -19,7 +19,7 @@ import h5py
 import pyarrow as pa
 
 from pipeline.errors import PipelineError
-from pipeline.files import keep_only, replaced
+from pipeline.files import keep_below, replaced
 from pipeline.run.sealed_file import SealedFile, sealed
 from pipeline.tables import read_table, write_table
 
@@ -36,8 +36,9 @@ class Store:
         root: the folder.
         made_by: the fingerprint (``pipeline.identity``) of files that are current; others count as missing.
         stage: which stage makes them, for messages.
-        columns: of the table, beside ``trajectory_id``, ``made_by`` and ``bytes``.
+        columns: of the table, beside ``file``, ``made_by`` and ``bytes``.
         describe: reads those columns from an open file.
+        files: how they lie below ``root``, as a pattern.
     """
 
     def __init__(
@@ -47,39 +48,46 @@ class Store:
         stage: str,
         columns: Mapping[str, pa.DataType],
         describe: Callable[[SealedFile], dict[str, Any]],
+        files: str = "*.h5",
     ):
         self.root = root
         self.made_by = made_by
         self._stage = stage
         self._describe = describe
-        common = {"trajectory_id": pa.string(), "made_by": pa.string(), "bytes": pa.int64()}
+        self._files = files
+        common = {"file": pa.string(), "made_by": pa.string(), "bytes": pa.int64()}
         self._schema = pa.schema(list((common | dict(columns)).items()))
 
-    def path(self, trajectory_id: str) -> Path:
-        return self.root / f"{trajectory_id}.h5"
+    def path(self, name: str) -> Path:
+        """Where a file lies; its name may have folders in it, and has no suffix."""
+        return self.root / f"{name}.h5"
+
+    def names(self) -> list[str]:
+        """Of all files, current or not."""
+        return sorted(path.relative_to(self.root).with_suffix("").as_posix() for path in self.root.glob(self._files))
 
     @contextmanager
-    def created(self, trajectory_id: str, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
+    def created(self, name: str, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
         """A new file to fill with arrays; it takes its place when the block ends.
 
         Args:
-            trajectory_id: names it.
+            name: of the file.
             attributes: JSON-serialisable, what it says beside its arrays.
         """
         with (
-            replaced(self.path(trajectory_id)) as temporary,
+            replaced(self.path(name)) as temporary,
             sealed(temporary, {**attributes, "made_by": self.made_by}) as file,
         ):
             yield file
 
     @contextmanager
-    def opened(self, trajectory_id: str) -> Iterator[SealedFile]:
+    def opened(self, name: str) -> Iterator[SealedFile]:
         """A file to read.
 
         Raises:
             PipelineError: when it is missing, damaged, or not current.
         """
-        path, remedy = self.path(trajectory_id), f"run the {self._stage} stage again"
+        path, remedy = self.path(name), f"run the {self._stage} stage again"
         try:
             with h5py.File(path, "r") as opened:
                 file = SealedFile(opened)
@@ -92,53 +100,53 @@ class Store:
             # The stage believes its table, and does not read every file again.
             raise PipelineError(f"damaged ({error})", where=path, remedy=f"delete the file and {remedy}") from error
 
-    def check_all(self, trajectory_id: str) -> None:
+    def check_all(self, name: str) -> None:
         """Compare all of a file with its checksums.
 
         Raises:
             PipelineError: when it is missing, damaged, or not current.
         """
-        with self.opened(trajectory_id) as file:
+        with self.opened(name) as file:
             file.check_all()
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """Trajectory id to its row, for every current file that can be read."""
+        """Name of a file to its row, for every current one that can be read."""
         return self._rows()[0]
 
     def _rows(self) -> tuple[dict[str, dict[str, Any]], bool]:
         """The rows, and whether the table on disk is these rows and is believed in every one."""
         believed, written_ns = self._table()
         rows, doubted = {}, False
-        for path in sorted(self.root.glob("*.h5")):
-            status = path.stat()
-            row = believed.get(path.stem)
+        for name in self.names():
+            status = self.path(name).stat()
+            row = believed.get(name)
             if row is None or row["bytes"] != status.st_size or status.st_mtime_ns >= written_ns:
-                row, doubted = self._read(path.stem, status.st_size), True
+                row, doubted = self._read(name, status.st_size), True
             if row is not None and row["made_by"] == self.made_by:
-                rows[path.stem] = row
+                rows[name] = row
         return rows, not doubted and rows == believed
 
-    def row(self, trajectory_id: str) -> dict[str, Any] | None:
+    def row(self, name: str) -> dict[str, Any] | None:
         """One row, read from the file; None when that is missing, damaged or not current."""
-        path = self.path(trajectory_id)
-        return self._read(trajectory_id, path.stat().st_size) if path.exists() else None
+        path = self.path(name)
+        return self._read(name, path.stat().st_size) if path.exists() else None
 
     def _table(self) -> tuple[dict[str, dict[str, Any]], int]:
         """The rows that were written last, and when; none when the table is missing or damaged."""
         path = self.root / TABLE
         try:
             table = read_table(path, self._schema.names, "")
-            return {row["trajectory_id"]: row for row in table.to_pylist()}, path.stat().st_mtime_ns
+            return {row["file"]: row for row in table.to_pylist()}, path.stat().st_mtime_ns
         except PipelineError:
             return {}, 0
 
-    def _read(self, trajectory_id: str, size: int) -> dict[str, Any] | None:
+    def _read(self, name: str, size: int) -> dict[str, Any] | None:
         try:
-            with self.opened(trajectory_id) as file:
+            with self.opened(name) as file:
                 described = self._describe(file)
         except PipelineError:
             return None
-        return {"trajectory_id": trajectory_id, "made_by": self.made_by, "bytes": size, **described}
+        return {"file": name, "made_by": self.made_by, "bytes": size, **described}
 
     def refresh(self) -> dict[str, dict[str, Any]]:
         """``rows``, written as the table; only for the stage that makes the files."""
@@ -148,7 +156,7 @@ class Store:
             write_table(pa.Table.from_pylist(listed, schema=self._schema), self.root / TABLE)
         return rows
 
-    def keep(self, trajectory_ids: Iterable[str]) -> None:
-        """Delete every file of other trajectories, and what a killed worker left; write the table anew."""
-        keep_only(self.root, {TABLE, *(self.path(trajectory_id).name for trajectory_id in trajectory_ids)})
+    def keep(self, names: Iterable[str]) -> None:
+        """Delete every other file, and what a killed worker left; write the table anew."""
+        keep_below(self.root, {self.root / TABLE, *map(self.path, names)})
         self.refresh()

@@ -30,7 +30,7 @@ from pipeline.rendering.render import RenderJob
 from pipeline.run import manifest, plan
 from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.frame_store import FrameStore
+from pipeline.run.frame_store import FrameStore, shown_of
 from pipeline.run.streams import streams_of
 from pipeline.types import Verdict
 
@@ -139,7 +139,7 @@ def _rebuild(
         return None, verdict.reason
     task = find_task(row["suite"], row["task"])
     RenderJob(trajectory_id, task, streams, row["steps"], trajectories, frames, settings.render, gl.choose().device)()
-    if rejected := FrameStore(frames, settings.render).load(trajectory_id, []).rejected:
+    if rejected := shown_of(FrameStore(frames, settings.render).rows())[trajectory_id].rejected:
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)

@@ -29,8 +29,7 @@ def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:
         "frames": FrameStore(config.data / "frames", config.render),
     }
     for name, store in stores.items():
-        ids = sorted(path.stem for path in store.root.glob("*.h5"))
-        results[name] = _result(run(_Reader(store), ids, name))
+        results[name] = _result(run(_Reader(store), store.names(), name))
     for one in formats_of(config.data, config.export, config.render.extras):
         try:
             files = one.written()
@@ -46,9 +45,9 @@ def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:
 class _Reader:
     store: Store
 
-    def __call__(self, trajectory_id: str) -> list[str]:
+    def __call__(self, file: str) -> list[str]:
         try:
-            self.store.check_all(trajectory_id)
+            self.store.check_all(file)
         except PipelineError as error:
             return [str(error)]
         return []

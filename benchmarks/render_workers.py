@@ -1,0 +1,92 @@
+"""The render stage by one worker and by several, beside the bare drawing of its frames.
+
+    python benchmarks/render_workers.py [--config configs/starter.yaml] [--tasks 'libero_goal/put_the_bowl_*']
+
+Takes a demonstration of the starter set for each task, and as many episodes as the configuration asks for each
+demonstration. They are replayed once. Then the frames are rendered three times: in this process, where the time within
+``Renderer.frame`` is counted, by one worker process, and by several. Run it on a machine that does nothing else. The
+last line is JSON: seconds by the clock, the start of the workers left out; what the workers together take against the
+bare drawing (1 is the least); and how many times faster several are than one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest.mock import patch
+
+from against_naive import sliced
+
+from pipeline.config import ComputeConfig, load
+from pipeline.physics.replay import replay_plan
+from pipeline.rendering.render import render_plan
+from pipeline.rendering.renderer import Renderer
+from pipeline.run import plan
+from pipeline.run.compute import Run, loop, runner
+from pipeline.testset import benchmark
+from pipeline.types import Frame
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--config", type=Path, default=Path("configs/starter.yaml"))
+    parser.add_argument("--tasks", nargs="+", help="default: those of the configuration")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    arguments = parser.parse_args()
+    config = sliced(load(arguments.config), arguments.tasks)
+    rows = plan.make(config.demos.index().entries, config.plan, config.replay, benchmark.load())
+    with TemporaryDirectory() as temporary:
+        root = Path(temporary)
+        trajectories = root / "trajectories"
+        replay_plan(rows, config.demos, config.replay, trajectories, loop)
+
+        def rendered(run: Run, name: str) -> float:
+            start = time.perf_counter()
+            render_plan(rows, config, trajectories, root / name, run)
+            return time.perf_counter() - start
+
+        drawn_s: list[float] = []
+        draw = Renderer.frame
+
+        def timed(renderer: Renderer, camera: str) -> Frame:
+            start = time.perf_counter()
+            frame = draw(renderer, camera)
+            drawn_s.append(time.perf_counter() - start)
+            return frame
+
+        with patch.object(Renderer, "frame", timed):
+            here_s = rendered(loop, "here")
+        by_workers = {}
+        for workers in (1, arguments.workers):
+            with runner(ComputeConfig(cluster="local", workers=workers), root) as run:
+                run(_warm, range(4 * workers), "workers")
+                by_workers[workers] = rendered(run, f"by_{workers}")
+    bare_s, several_s = sum(drawn_s), by_workers[arguments.workers]
+    print(
+        json.dumps(
+            {
+                "config": str(arguments.config),
+                "frames_drawn": len(drawn_s),
+                "bare_s": round(bare_s, 1),
+                "one_process_s": round(here_s, 1),
+                "s_by_workers": {workers: round(seconds, 1) for workers, seconds in by_workers.items()},
+                "workers_against_bare": round(arguments.workers * several_s / bare_s, 2),
+                "several_against_one": round(by_workers[1] / several_s, 2),
+            }
+        )
+    )
+
+
+def _warm(number: int) -> None:
+    """Have a worker import what rendering needs."""
+    import pipeline.rendering.render  # noqa: F401
+
+    time.sleep(0.2)
+
+
+if __name__ == "__main__":
+    main()
