@@ -102,7 +102,6 @@ def small_experiment(folder: Path, demos: Path) -> Path:
         "data": "data.yaml",
         "arms": {"perturbed": ["noise"]},
         "frame_px": 32,
-        "proprioception": False,
         "policy": {
             **{"type": "act", "pretrained_backbone_weights": None, "chunk_size": 100, "n_action_steps": 40},
             **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1, "use_vae": False},
@@ -140,8 +139,6 @@ def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path) -> 
     assert found["episodes_by_axis"] == {"perturbed": {"noise": 1}}
     (line,) = found["table"]
     assert (line["source"], line["axis"], line["arms"]["perturbed"]["episodes"]) == ("libero", "clean", 1)
-    (policy,) = (tmp_path / "out" / "policies").iterdir()
-    assert "observation.state" not in json.loads((policy / "config.json").read_text())["input_features"]
     (row,) = merging.read([*(tmp_path / "out" / "evaluations").iterdir()])[0].rows
     assert (row["reason"], row["steps"], row["looks"]) == ("step_limit", 300, 8), "it looks once in its chunk"
     assert {*found["hours"]} == {"data", "training", "evaluation"}

@@ -70,8 +70,6 @@ class Experiment(Frozen):
         arms: name to what its episodes are perturbed by, axes or combinations of the run's ``plan.episodes``; clean
             twins make up for the others. The first arm is the one that the others are compared with.
         frame_px: height and width of the frames that policies see.
-        proprioception: whether policies are told the state of hand and gripper. A policy that knows them may find a
-            target that hardly moves without looking.
         policy: options of lerobot's policy, among them its ``type``.
         seeds: one policy of each arm is trained from each.
     """
@@ -80,7 +78,6 @@ class Experiment(Frozen):
     demonstrations: int | None = Field(default=None, ge=1)
     arms: dict[str, tuple[str, ...]] = Field(min_length=1)
     frame_px: int = Field(ge=32, le=256)
-    proprioception: bool = True
     policy: dict[str, Any]
     training: TrainingConfig
     seeds: tuple[int, ...] = Field(min_length=1)
@@ -118,8 +115,7 @@ class Experiment(Frozen):
     def policy_name(self, arm: str, seed: int) -> str:
         """The same of a policy."""
         training = self.training.model_dump(exclude={"save_every", "at_once"})
-        made_from = self.dataset_name(arm), self.proprioception, self.policy, training, seed
-        return f"{arm}_seed{seed}_{digest(*made_from)[:8]}"
+        return f"{arm}_seed{seed}_{digest(self.dataset_name(arm), self.policy, training, seed)[:8]}"
 
 
 def read(path: Path) -> Experiment:

@@ -35,7 +35,7 @@ def train(datasets: Mapping[Path, Path], experiment: Experiment, seed: int, comm
         start = _work(out) / "start"
         if not start.exists():
             with replaced(start) as unfinished:
-                initialise(dataset, unfinished, experiment.policy, experiment.proprioception, seed)
+                initialise(dataset, unfinished, experiment.policy, seed)
     training = experiment.training
     with ThreadPoolExecutor(training.at_once) as pool:
         jobs = [pool.submit(_train, dataset, out, training, seed, command) for out, dataset in datasets.items()]
@@ -84,24 +84,18 @@ def _train(dataset: Path, out: Path, training: TrainingConfig, seed: int, comman
     remove(_work(out))
 
 
-def initialise(dataset: Path, out: Path, options: dict[str, Any], proprioception: bool, seed: int) -> None:
+def initialise(dataset: Path, out: Path, options: dict[str, Any], seed: int) -> None:
     """Save a policy with random weights and the processors of a dataset.
 
     lerobot freezes the batch normalisation of ACT's backbone, as it counts on weights from ImageNet. With random
     weights the frozen layers would normalise nothing, and activations would grow from block to block. So their means
     and variances are set by frames of the dataset, layer by layer (data-dependent initialisation, Kraehenbuehl et al.,
     2016, arXiv:1511.06856).
-
-    Args:
-        options: of lerobot's policy, among them ``type``.
-        proprioception: whether the policy is told the state.
     """
     import torch
     from lerobot.configs.default import DatasetConfig
     from lerobot.configs.train import TrainPipelineConfig
-    from lerobot.configs.types import FeatureType
     from lerobot.datasets.factory import make_dataset
-    from lerobot.datasets.utils import dataset_to_policy_features
     from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
     from torchvision.ops.misc import FrozenBatchNorm2d
 
@@ -110,11 +104,6 @@ def initialise(dataset: Path, out: Path, options: dict[str, Any], proprioception
     named = {name: value for name, value in options.items() if name != "type"}
     config = make_policy_config(options["type"], device=device, push_to_hub=False, **named)
     frames = make_dataset(TrainPipelineConfig(DatasetConfig(dataset.name, root=str(dataset)), policy=config))
-    config.input_features = {
-        key: feature
-        for key, feature in dataset_to_policy_features(frames.meta.features).items()
-        if feature.type is FeatureType.VISUAL or (feature.type is FeatureType.STATE and proprioception)
-    }
     policy = make_policy(config, ds_meta=frames.meta)
     before, after = make_pre_post_processors(config, dataset_stats=frames.meta.stats)
     layers = [layer for layer in policy.modules() if isinstance(layer, FrozenBatchNorm2d)]
