@@ -135,6 +135,8 @@ def keep_only(folder: Path, names: set[str]) -> None:
 
 def keep_below(folder: Path, files: set[Path]) -> None:
     """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one."""
+    if not folder.is_dir():
+        return
     on_the_way = {parent for file in files for parent in file.parents}
 
     def clear(below: Path) -> None:
@@ -144,8 +146,7 @@ def keep_below(folder: Path, files: set[Path]) -> None:
             elif entry not in files:
                 remove(entry)
 
-    if folder.is_dir():
-        clear(folder)
+    clear(folder)
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 from conftest import BOWL, read_with_flipped_bits, tiny_config
 
-from pipeline import identity
+from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.robot import RobotPerturbation
@@ -20,10 +22,10 @@ from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.physics.replay import replay_plan
-from pipeline.rendering.render import STREAMS_OF_A_JOB, portions, render_plan
+from pipeline.rendering.render import STREAMS_OF_A_JOB, portions, render, render_plan
 from pipeline.run import outcome, plan
 from pipeline.run.compute import loop
-from pipeline.run.frame_store import FrameStore, Shown, shown_of
+from pipeline.run.frame_store import FrameStore, shown_of
 from pipeline.run.store import TABLE
 from pipeline.run.streams import Stream, streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
@@ -201,10 +203,9 @@ def test_rendering_ends_when_all_streams_of_a_trajectory_are_rejected(
 def test_frames_are_the_same_in_one_file_and_in_several(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As when a trajectory has more streams than a job renders, and when a plan grows."""
+    """As when a trajectory has more streams than a job renders."""
     render_plan(rows, config, replayed, tmp_path / "one", loop)
     monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", 1)
-    render_plan(rows[:1], config, replayed, tmp_path / "several", loop)
     files = render_plan(rows, config, replayed, tmp_path / "several", loop)
     streams = {s.stream_id: s.geometry.stream_id for row in rows[:2] for s in streams_of(row.perturbations).values()}
     assert len(streams) == len(files) == 4
@@ -215,6 +216,38 @@ def test_frames_are_the_same_in_one_file_and_in_several(
     assert one.streams == several.streams
     assert one.geometry.keys() == several.geometry.keys() == set(streams.values())
     assert np.array_equal(one.state, several.state)
+
+
+@pytest.mark.parametrize("streams_of_a_job", [2, 64])
+def test_a_plan_that_grows_or_shrinks_has_the_files_of_a_first_run_and_renders_what_is_missing(
+    config: Config,
+    rows: list[plan.Row],
+    replayed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    streams_of_a_job: int,
+) -> None:
+    monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", streams_of_a_job)
+    made: list[str] = []
+
+    def noted(trajectory: Any, task: Any, streams: Sequence[Stream], render_config: Any) -> Any:
+        made.extend(stream.stream_id for stream in streams)
+        return render(trajectory, task, streams, render_config)
+
+    monkeypatch.setattr("pipeline.rendering.render.render", noted)
+
+    def files(planned: Sequence[plan.Row], folder: str) -> dict[str, bytes]:
+        store = FrameStore(tmp_path / folder, config.render)
+        store.keep(render_plan(planned, config, replayed, tmp_path / folder, loop))
+        return {path.relative_to(store.root).as_posix(): path.read_bytes() for path in store.root.rglob("*.h5")}
+
+    first = files(rows, "first"), files(rows[:1], "shorter")
+    made.clear()
+    files(rows[:1], "then")
+    assert files(rows, "then") == first[0]
+    assert len(made) == len(set(made)) == 4
+    assert files(rows[:1], "then") == first[1]
+    assert len(made) == 4
 
 
 def test_files_of_frames_that_no_plan_needs_are_deleted(
@@ -229,17 +262,47 @@ def test_files_of_frames_that_no_plan_needs_are_deleted(
     assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.h5")} == {f"{name}.h5" for name in twin}
 
 
+def test_a_rejection_that_is_no_longer_planned_is_forgotten(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
+) -> None:
+    store, trajectory_id = FrameStore(tmp_path, config.render), rows[0].trajectory_id
+    (name,) = render_plan(rows[:1], config, replayed, tmp_path, loop)
+    geometry = [stream.geometry.stream_id for stream in streams_of(rows[0].perturbations).values()]
+    twin = store.load(trajectory_id, store.rows()[name]["streams"], geometry)
+    store.path(name).unlink()
+    store.save(trajectory_id, replace(twin, rejected={"earlier": "too_dark"}), gl.choose().device)
+    store.keep(render_plan(rows[:1], config, replayed, tmp_path, loop))
+    (row,) = store.rows().values()
+    assert json.loads(row["rejected"]) == {}
+    assert row["streams"] == sorted(twin.streams)
+
+
+def test_a_damaged_file_is_rendered_again_and_hinders_no_other(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", 2)
+    files = render_plan(rows, config, replayed, tmp_path, loop)
+    store = FrameStore(tmp_path, config.render)
+    whole, damaged = sorted(files)
+    before = store.path(damaged).read_bytes()
+    streams = store.rows()[whole]["streams"]
+    _shorten(store.path(damaged))
+    assert store.load(rows[0].trajectory_id, streams).streams.keys() == set(streams)
+    assert render_plan(rows, config, replayed, tmp_path, loop) == files
+    assert store.path(damaged).read_bytes() == before
+
+
 @pytest.mark.parametrize("number", [1, 64, 65, 600])
 def test_a_job_has_so_many_streams_at_most(number: int) -> None:
-    """And a run that was stopped is cut as the whole one."""
+    """And what is not needed changes its own portion alone."""
     lights = [NIGHT.model_copy(update={"diffuse_scale_rgb": (0.0, 0.0, step / number)}) for step in range(number)]
-    streams = [Stream("image", (light,)) for light in lights]
-    jobs = portions(streams, None)
+    streams = {stream.stream_id: stream for stream in (Stream("image", (light,)) for light in lights)}
+    jobs = portions(streams, streams)
     assert len(jobs) == -(-number // STREAMS_OF_A_JOB)
     assert max(map(len, jobs)) <= STREAMS_OF_A_JOB
-    assert sorted(stream.stream_id for job in jobs for stream in job) == sorted(s.stream_id for s in streams)
-    stored = Shown("", "", "", {stream.stream_id for stream in jobs[0]})
-    assert portions(streams, stored) == jobs[1:]
+    assert sorted(stream.stream_id for job in jobs for stream in job) == sorted(streams)
+    fewer = streams.keys() - {jobs[-1][0].stream_id}
+    assert portions(streams, fewer) == [*jobs[:-1], *([jobs[-1][1:]] if jobs[-1][1:] else [])]
 
 
 def test_rendering_that_leaves_the_same_work_undone_is_an_error(

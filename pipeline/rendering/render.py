@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +25,7 @@ from pipeline.rendering.jpeg import encode, to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import CAMERA, Sight
 from pipeline.run.compute import LOST, Expendable, Run
-from pipeline.run.frame_store import FrameStore, Rendered, Shown, file_name, shown_of, stream_ids, trajectory_of
+from pipeline.run.frame_store import FrameStore, Rendered, file_name, joined, shown_of
 from pipeline.run.outcome import rejections, replayed
 from pipeline.run.plan import Row, select
 from pipeline.run.streams import Stream, streams_of
@@ -128,7 +128,7 @@ class RenderJob:
     device: str
 
     def __call__(self) -> None:
-        """Render the streams and store them.
+        """Store the streams in one file: those that other files of the trajectory hold are copied, others rendered.
 
         Raises:
             PipelineError: when another device renders here: its pixels differ, and the run would never use them.
@@ -141,9 +141,11 @@ class RenderJob:
                 expected="one device for all frames of a run, as devices differ by some grey levels",
                 remedy="start the stage and every worker on machines that render alike (MUJOCO_GL picks the back end)",
             )
-        store = FrameStore(self.frames, self.config)
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
-        store.save(self.trajectory_id, render(trajectory, self.task, self.streams, self.config), device)
+        parts, missing = self._stored(device)
+        if missing:
+            parts = [*parts, render(trajectory, self.task, missing, self.config)]
+        FrameStore(self.frames, self.config).save(self.trajectory_id, joined(parts), device)
 
     def frames_at_most(self) -> int:
         return self.steps * len(self.streams)
@@ -157,28 +159,35 @@ class RenderJob:
 
         They are not tried again while the file is there.
         """
-        store = FrameStore(self.frames, self.config)
-        streams = [stream.stream_id for stream in self.streams]
-        row = store.row(file_name(self.trajectory_id, streams))
-        if row is not None and row["device"] == self.device:
-            return
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
         action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
         state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)
-        nothing = Rendered(trajectory.mode, state, joint_state, action, rejected=dict.fromkeys(streams, LOST))
-        store.save(self.trajectory_id, nothing, self.device)
+        parts, missing = self._stored(self.device)
+        rejected = {stream.stream_id: LOST for stream in missing}
+        parts = [*parts, Rendered(trajectory.mode, state, joint_state, action, rejected=rejected)]
+        FrameStore(self.frames, self.config).save(self.trajectory_id, joined(parts), self.device)
+
+    def _stored(self, device: str) -> tuple[list[Rendered], list[Stream]]:
+        """What files hold of the streams, and those that none holds."""
+        wanted = {stream.stream_id: stream.geometry.stream_id for stream in self.streams}
+        parts = FrameStore(self.frames, self.config).stored(self.trajectory_id, wanted, device)
+        held = {stream_id for part in parts for stream_id in (*part.streams, *part.rejected)}
+        return parts, [stream for stream in self.streams if stream.stream_id not in held]
 
 
-def portions(streams: Iterable[Stream], stored: Shown | None) -> list[tuple[Stream, ...]]:
-    """The streams of a trajectory that are not stored, in portions of ``STREAMS_OF_A_JOB`` at most.
+def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tuple[Stream, ...]]:
+    """The needed streams of a trajectory, in portions of ``STREAMS_OF_A_JOB`` at most, each to be one file.
 
-    They are cut before those that are stored are left out: a run that was stopped makes the files that it would have
-    made. Streams that share a scene stay together.
+    All planned ones are cut, and then those left out that are not needed. So a portion does not change when a stream
+    of another one is rejected and a reserve takes its place. Streams that share a scene are beside each other.
+
+    Args:
+        planned: stream id to each stream that an episode of the plan shows, reserves included.
+        needed: ids of those that are to be rendered.
     """
-    ordered = sorted(streams, key=lambda stream: (_scene(stream), stream.stream_id))
-    known = stored.streams | stored.rejected.keys() if stored else set()
+    ordered = sorted(planned.items(), key=lambda item: (_scene(item[1]), item[0]))
     cut = [int(end) for end in np.linspace(0, len(ordered), math.ceil(len(ordered) / STREAMS_OF_A_JOB) + 1)]
-    wanted = [tuple(s for s in ordered[start:end] if s.stream_id not in known) for start, end in pairwise(cut)]
+    wanted = [tuple(stream for name, stream in ordered[a:b] if name in needed) for a, b in pairwise(cut)]
     return [portion for portion in wanted if portion]
 
 
@@ -193,7 +202,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing.
 
     Returns:
-        The files of ``folder`` that hold frames that the plan needs.
+        The files of ``folder`` that the plan needs: the same ones whatever was rendered before.
 
     Raises:
         PipelineError: when a trajectory is missing, or rendering leaves the same work undone.
@@ -203,36 +212,43 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     judged = verdicts_of(replayed(rows, trajectories))
     steps = {row.trajectory_id: row.demo_steps for row in rows}
     tasks = {row.trajectory_id: (row.suite, row.task) for row in rows}
+    planned: dict[str, dict[str, Stream]] = {row.trajectory_id: {} for row in rows}
+    shown: dict[str, set[str]] = {}
+    for row in rows:
+        streams = {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+        planned[row.trajectory_id] |= streams
+        shown[row.episode_id] = set(streams)
     undone: list[RenderJob] = []
     while True:
         stored = {name: row for name, row in store.refresh().items() if row["device"] == device}
-        shown = shown_of(stored)
-        rejected = rejections(rows, shown)
+        rejected = rejections(rows, shown_of(stored))
         outcome = select(rows, judged, rejected)
-        needed: dict[str, dict[str, Stream]] = {}
+        needed: dict[str, set[str]] = {}
         for row in rows:
             # A rejected stream stays needed: without it, its episode would be tried again.
             if outcome[row.episode_id].kept or row.episode_id in rejected:
-                streams = needed.setdefault(row.trajectory_id, {})
-                streams |= {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+                needed.setdefault(row.trajectory_id, set()).update(shown[row.episode_id])
+        files = {
+            file_name(trajectory_id, [stream.stream_id for stream in portion]): (trajectory_id, portion)
+            for trajectory_id, ids in needed.items()
+            for portion in portions(planned[trajectory_id], ids)
+        }
         jobs = [
             RenderJob(
                 trajectory_id,
                 find_task(*tasks[trajectory_id]),
-                missing,
+                portion,
                 steps[trajectory_id],
                 trajectories,
                 folder,
                 config.render,
                 device,
             )
-            for trajectory_id, streams in needed.items()
-            for missing in portions(streams.values(), shown.get(trajectory_id))
+            for name, (trajectory_id, portion) in files.items()
+            if name not in stored
         ]
         if not jobs:
-            return {
-                name for name, row in stored.items() if stream_ids(row) & needed.get(trajectory_of(name), {}).keys()
-            }
+            return set(files)
         if jobs == undone:
             raise PipelineError(
                 f"{len(jobs)} files of frames were rendered and are still not there, such as one in this folder",

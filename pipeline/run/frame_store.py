@@ -25,7 +25,7 @@ from pipeline.run.store import Store
 from pipeline.seeding import digest
 from pipeline.types import Geometry
 
-_SHOWN = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
+_OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 """The schema's parts that say what files of a store hold."""
 
 _COLUMNS = {
@@ -92,7 +92,7 @@ class FrameStore(Store):
     """
 
     def __init__(self, root: Path, config: RenderConfig):
-        shown = [SCHEMA.model_dump(include=_SHOWN), SCHEMA.image_rotation_deg]
+        shown = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
         made_by = fingerprint("encoding", config.model_dump(), shown)
         super().__init__(root, made_by, "render", _COLUMNS, _describe, files="*/*.h5")
 
@@ -129,7 +129,7 @@ class FrameStore(Store):
             if rendered.object_poses is not None:
                 file["object_poses"] = rendered.object_poses
 
-    def load(self, trajectory_id: str, streams: Sequence[str], geometry: Collection[str] = ()) -> Rendered:
+    def load(self, trajectory_id: str, streams: Collection[str], geometry: Collection[str] = ()) -> Rendered:
         """Read the named streams of a trajectory.
 
         Args:
@@ -138,27 +138,49 @@ class FrameStore(Store):
             geometry: ids of the geometry to read with them.
 
         Raises:
-            PipelineError: when the file, one of the streams or its geometry is not there.
+            PipelineError: when a file is damaged, or one of the streams or its geometry is not there.
         """
-        frames: dict[str, list[bytes]] = {}
-        views: dict[str, Geometry] = {}
-        loaded = None
+        frames, views = set(streams), set(geometry)
+        parts: list[Rendered] = []
         for name in self._files_of(trajectory_id):
+            if not frames and not views:
+                break
             with self.opened(name) as file:
-                here = (set(streams) - frames.keys()) & set(file.groups("streams"))
-                seen = (set(geometry) - views.keys()) & set(file.groups("geometry"))
-                frames |= {stream: _frames(file, f"streams/{stream}") for stream in here}
-                views |= {view: _geometry(file, f"geometry/{view}") for view in seen}
-                if here and loaded is None:
-                    loaded = _without_frames(file)
-        missing = {*(set(streams) - frames.keys()), *(set(geometry) - views.keys())}
-        if missing or loaded is None:
+                here = frames & set(file.groups("streams")), views & set(file.groups("geometry"))
+                if any(here):
+                    parts.append(_rendered(file, *here))
+            frames, views = frames - here[0], views - here[1]
+        if frames or views or not parts:
             raise PipelineError(
-                f"streams {sorted(missing)} were not rendered",
+                f"streams {sorted(frames | views)} were not rendered",
                 where=self.folder(trajectory_id),
                 remedy="run the render stage again",
             )
-        return replace(loaded, streams=frames, geometry=views)
+        return joined(parts)
+
+    def stored(self, trajectory_id: str, streams: Mapping[str, str], device: str) -> list[Rendered]:
+        """What files hold of the named streams of a trajectory, each stream once; a damaged file counts as missing.
+
+        Args:
+            trajectory_id: which trajectory.
+            streams: id of a stream to the id of its geometry.
+            device: which must have rendered them.
+        """
+        parts: list[Rendered] = []
+        missing = set(streams)
+        for name in self._files_of(trajectory_id):
+            try:
+                with self.opened(name) as file:
+                    row = _describe(file)
+                    here = missing & stream_ids(row) if row["device"] == device else set()
+                    if here:
+                        frames = here & set(row["streams"])
+                        part = _rendered(file, frames, {streams[stream] for stream in frames})
+                        parts.append(replace(part, rejected={s: why for s, why in part.rejected.items() if s in here}))
+            except PipelineError:
+                continue
+            missing -= here
+        return parts
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Action (K, 7) and state (K, 8) of a trajectory, without its frames.
@@ -191,25 +213,32 @@ def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
     shown: dict[str, Shown] = {}
     for name, row in rows.items():
         same = Shown(row["made_by"], row["device"], row["replay_mode"])
-        one = shown.setdefault(trajectory_of(name), same)
+        one = shown.setdefault(name.split("/")[0], same)
         one.streams.update(row["streams"])
         one.rejected.update(json.loads(row["rejected"]))
     return shown
 
 
-def trajectory_of(name: str) -> str:
-    """The trajectory that a file shows."""
-    return name.split("/")[0]
+def joined(parts: Sequence[Rendered]) -> Rendered:
+    """Streams of one trajectory that were rendered or stored apart; one part at least."""
+    return replace(
+        parts[0],
+        streams={name: frames for part in parts for name, frames in part.streams.items()},
+        rejected={name: why for part in parts for name, why in part.rejected.items()},
+        geometry={name: view for part in parts for name, view in part.geometry.items()},
+    )
 
 
-def _without_frames(file: SealedFile) -> Rendered:
-    """What a file holds beside streams and geometry."""
+def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[str]) -> Rendered:
+    """What a file holds, of streams and geometry the named ones alone."""
     return Rendered(
         replay_mode=file.attributes["replay_mode"],
         state=file.array("state"),
         joint_state=file.array("joint_state"),
         action=file.array("action"),
+        streams={name: _frames(file, f"streams/{name}") for name in streams},
         rejected=json.loads(file.attributes["rejected"]),
+        geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
         object_poses=file.array("object_poses") if "object_poses" in file else None,
         instances=file.attributes["instances"],
     )
