@@ -29,12 +29,15 @@ class Part(NamedTuple):
         geoms: (ngeom,) which geoms.
         boxes: (N,) which of the model's boxes (``Boxes``): of large geoms, the pieces.
         reflections: whether one of them reflects.
+        layer: whether it can be drawn by itself and then be laid over the other layers, as each sample of it is at its
+            depth. Else it takes the place of what the parts before it show there.
         rows, columns: of the picture, the first row at the top.
     """
 
     geoms: NDArray[np.bool_]
     boxes: NDArray[np.bool_]
     reflections: bool
+    layer: bool
     rows: slice
     columns: slice
 
@@ -45,10 +48,11 @@ class Culling:
     Args:
         height, width: of the pictures, in pixels.
         hidden_groups: groups of geoms that are not drawn.
+        layers: whether pictures are to be made of layers.
     """
 
-    def __init__(self, model: mujoco.MjModel, height: int, width: int, hidden_groups: Collection[int]):
-        self._model, self._height, self._width = model, height, width
+    def __init__(self, model: mujoco.MjModel, height: int, width: int, hidden_groups: Collection[int], layers: bool):
+        self._model, self._height, self._width, self._layers = model, height, width, layers
         self._hidden_groups = list(hidden_groups)
         self.boxes = boxes_of(model, hidden_groups)
         # A plane has no bound: it is drawn wherever it is.
@@ -63,10 +67,12 @@ class Culling:
         return other
 
     def parts(self, data: mujoco.MjData, camera: str) -> list[Part]:
-        """What a picture of the data's state is made of; positions must be up to date.
+        """What a picture of the data's state is made of, in the order in which it is put together; positions must be up
+        to date.
 
         The first part is all of the picture. Where a box reflects, a further part is the rectangle around it, for which
-        mirror images are drawn too; in the first part nothing reflects.
+        mirror images are drawn too; in the first part nothing reflects. Where the first part is a layer, a geom that
+        can be seen through has a part too and is not in the first: it is drawn after what is behind it.
         """
         model, boxes = self._model, self.boxes
         whole = slice(0, self._height), slice(0, self._width)
@@ -88,25 +94,44 @@ class Culling:
             for mirror, box in zip(seen_mirrors, mirror_boxes[seen[mirror_boxes]], strict=True)
         ]
         images = [self._mirrored(data, corners_m, mirror) for mirror in seen_mirrors]
-        parts = [] if whole in rectangles else [self._part(seen, False, *whole)]
+        clear = self._see_through()
+        clear_seen = np.unique(boxes.geom[clear & seen]) if self._layers else ()
+        windows = [view.rectangle(corners_m[boxes.geom == geom].reshape(-1, 3)) or whole for geom in clear_seen]
+        layers = self._layers and whole not in windows and not self._sites_see_through()
+        parts = [] if whole in rectangles else [self._part(seen & ~(clear & layers), False, layers, *whole)]
+        for rectangle in windows if parts and layers else []:
+            parts.append(self._part(unbounded | view.shows(corners_m, *rectangle), False, False, *rectangle))
         for rectangle in [whole] if whole in rectangles else rectangles:
-            drawn = unbounded | view.shows(corners_m, *rectangle)
-            for mirrored, image_m in images:
-                drawn |= mirrored & view.shows(image_m, *rectangle)
+            reflected = unbounded.copy()
             # MuJoCo has the first of them reflect: without it, that would be another.
-            drawn[mirror_boxes] = True
-            parts.append(self._part(drawn, True, *rectangle))
+            reflected[mirror_boxes] = True
+            for mirrored, image_m in images:
+                reflected |= mirrored & view.shows(image_m, *rectangle)
+            before = view.shows(corners_m, *rectangle)
+            layer = layers and bool(parts) and not (clear & (reflected | before)).any()
+            parts.append(self._part(reflected if layer else reflected | before, True, layer, *rectangle))
         return parts
+
+    def _see_through(self) -> NDArray[np.bool_]:
+        """(N,) boxes of geoms that may show what is behind them: by their own colour, or by their material's."""
+        model, materials = self._model, self._model.geom_matid
+        opacity = np.minimum(model.geom_rgba[:, 3], np.append(model.mat_rgba[:, 3], 1)[materials])
+        shown = ~np.isin(model.geom_group, self._hidden_groups)
+        return np.asarray((shown & (opacity < 1))[self.boxes.geom])
+
+    def _sites_see_through(self) -> bool:
+        opacity = self._model.site_rgba[:, 3]
+        return bool(((opacity > 0) & (opacity < 1)).any())
 
     def everything(self) -> Part:
         """All of a picture, with all that there is."""
         whole = slice(0, self._height), slice(0, self._width)
-        return self._part(np.ones(len(self.boxes.geom), np.bool_), True, *whole)
+        return self._part(np.ones(len(self.boxes.geom), np.bool_), True, False, *whole)
 
-    def _part(self, boxes: NDArray[np.bool_], reflections: bool, rows: slice, columns: slice) -> Part:
+    def _part(self, boxes: NDArray[np.bool_], reflections: bool, layer: bool, rows: slice, columns: slice) -> Part:
         geoms = np.zeros(self._model.ngeom, np.bool_)
         geoms[self.boxes.geom[boxes]] = True
-        return Part(geoms, boxes, reflections, rows, columns)
+        return Part(geoms, boxes, reflections, layer, rows, columns)
 
     def _mirrored(self, data: mujoco.MjData, corners_m: Floats, mirror: int) -> tuple[NDArray[np.bool_], Floats]:
         """(N,) which boxes have a part before a mirror, and (N, 8, 3) the images of their corners.
@@ -144,7 +169,7 @@ class _View:
         return inside
 
     def rectangle(self, corners_m: Floats) -> tuple[slice, slice] | None:
-        """Rows and columns around a box with ``corners_m`` (8, 3), some pixels wider; None when it reaches behind the
+        """Rows and columns around ``corners_m`` (N, 3) of boxes, some pixels wider; None when it reaches behind the
         camera."""
         right, up, back = ((corners_m - self._position_m) @ self._axes).T
         if (back >= -MARGIN_M).any():

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from pipeline import gl
 from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.culling import Culling
+from pipeline.rendering.culling import Culling, Part
+from pipeline.rendering.layer import Layer
 from pipeline.rendering.mesh_pieces import MeshPieces
+from pipeline.rendering.still import Still
 from pipeline.types import Frame
 
 _UPLOADED = (
@@ -23,6 +25,12 @@ _UPLOADED = (
     *("geom_type", "geom_dataid", "geom_matid", "geom_group", "geom_aabb"),
 )
 """What a model's GL context was made from, textures and shapes, and what tells which geom has which."""
+
+_LOOK = (
+    *(name for name in dir(mujoco.MjModel) if name.startswith(("cam_", "light_", "mat_"))),
+    *("geom_matid", "geom_rgba"),
+)
+"""What else a picture depends on in a model, beside where its geoms and sites are."""
 
 _CULLED = mujoco.mjNGROUP - 1
 """A group of geoms that nothing in LIBERO is in, and that is not drawn."""
@@ -52,7 +60,8 @@ class Renderer:
     """
 
     def __init__(self, scene: str | mujoco.MjModel):
-        gl.prepare()
+        # On a GPU the geoms are no effort, and what would spare them is.
+        layers = gl.prepare().software
         height, width, _ = SCHEMA.frame.shape
         self.model = _compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         self.data = mujoco.MjData(self.model)
@@ -62,9 +71,11 @@ class Renderer:
         self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
         self._option.geomgroup[_CULLED] = 0
         hidden = np.flatnonzero(np.logical_not(self._option.geomgroup))
-        self._culling = Culling(self.model, height, width, hidden.tolist())
+        self._culling = Culling(self.model, height, width, hidden.tolist(), layers)
         self._renderer._gl_context.make_current()
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
+        self._still: dict[str, Still] = {}
+        self._layers: dict[tuple[str, int], Layer] = {}
 
     def adopted(self, model: mujoco.MjModel) -> bool:
         """Go on with a copy of another model, where its meshes and textures are those in the GL context already.
@@ -77,6 +88,7 @@ class Renderer:
         model = copy.copy(model)
         self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
         self._culling = self._culling.of(model)
+        self._forget_layers()
         context = self._renderer._mjr_context
         # What a context keeps of a model's size, as mjr_makeContext works it out.
         context.shadowClip = model.stat.extent * model.vis.map.shadowclip
@@ -95,19 +107,90 @@ class Renderer:
 
     def frame(self, camera: str) -> Frame:
         """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
-        groups = self.model.geom_group.copy()
         self._renderer._gl_context.make_current()
         frame = np.empty((*SCHEMA.frame.shape,), np.uint8)
-        try:
-            for part in self._culling.parts(self.data, camera):
-                self.model.geom_group[:] = np.where(part.geoms, groups, _CULLED)
+        parts = self._culling.parts(self.data, camera)
+        layers = [part for part in parts if part.layer]
+        if layers:
+            self._draw_layers(layers, camera)
+            self._read(frame, layers[0])
+        for part in parts:
+            if not part.layer:
                 self._pieces.show(part.boxes)
-                self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = part.reflections
-                self._renderer.update_scene(self.data, camera, self._option)
-                frame[part.rows, part.columns] = self._renderer.render()[part.rows, part.columns]
+                self._draw_geoms(part.geoms, part.reflections, camera)
+                self._read(frame, part)
+        return frame
+
+    def _read(self, frame: Frame, part: Part) -> None:
+        """Copy a part's rectangle of what is drawn into a frame."""
+        drawn = np.empty_like(frame)
+        mujoco.mjr_readPixels(drawn, None, self._renderer._rect, self._renderer._mjr_context)
+        # Both have the lowest row first.
+        frame[::-1][part.rows, part.columns] = drawn[::-1][part.rows, part.columns]
+
+    def _draw_layers(self, parts: list[Part], camera: str) -> None:
+        """Draw a picture of layers: the first part, whose geoms that stand still are a layer too, and its mirrors."""
+        view, places = self._view(camera), self._places()
+        first, *mirrors = parts
+        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, first.geoms)
+        layers = []
+        for number, part in enumerate([first._replace(geoms=still), *mirrors]):
+            content = b"".join([view, part.geoms.tobytes(), places[part.geoms].tobytes()])
+            if part.reflections:
+                content += self._sites()
+            if part.geoms.any():
+                layers.append((self._layer(camera, number, part, content), part))
+        self._pieces.show(first.boxes)
+        self._draw_geoms(first.geoms & ~still, False, camera)
+        for layer, part in layers:
+            layer.put(part.rows, part.columns)
+
+    def _layer(self, camera: str, number: int, part: Part, content: bytes) -> Layer:
+        """A layer of a camera's picture; it is drawn if its content is not what it was."""
+        if (camera, number) not in self._layers:
+            context, height, width = self._renderer._mjr_context, self._renderer.height, self._renderer.width
+            self._layers[camera, number] = Layer(context, height, width)
+        layer = self._layers[camera, number]
+        if layer.content != content:
+            self._pieces.show(part.boxes)
+            # What reflects mirrors the sites too; otherwise they are drawn with what moves.
+            self._draw_geoms(part.geoms, part.reflections, camera, sites=part.reflections)
+            layer.keep(content)
+        return layer
+
+    def _draw_geoms(self, geoms: NDArray[np.bool_], reflections: bool, camera: str, sites: bool = True) -> None:
+        """Draw geoms (ngeom,), and the sites, into the emptied off-screen buffer."""
+        groups = self.model.geom_group.copy()
+        site_groups = self._option.sitegroup.copy()
+        try:
+            self.model.geom_group[:] = np.where(geoms, groups, _CULLED)
+            self._option.sitegroup *= sites
+            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
+            self._renderer.update_scene(self.data, camera, self._option)
+            mujoco.mjr_render(self._renderer._rect, self._renderer.scene, self._renderer._mjr_context)
         finally:
             self.model.geom_group[:] = groups
-        return np.ascontiguousarray(frame[::-1])
+            self._option.sitegroup[:] = site_groups
+
+    def _view(self, camera: str) -> bytes:
+        """All that a picture depends on beside textures, geoms and sites."""
+        number, data, headlight = self.model.camera(camera).id, self.data, self.model.vis.headlight
+        fields = [getattr(self.model, name) for name in _LOOK]
+        fields += [data.cam_xpos[number], data.cam_xmat[number], data.light_xpos, data.light_xdir]
+        fields += [headlight.ambient, headlight.diffuse, headlight.specular, np.array(headlight.active)]
+        return b"".join(field.tobytes() for field in fields)
+
+    def _sites(self) -> bytes:
+        """Places and colours of the sites that can be seen."""
+        seen = self.model.site_rgba[:, 3] > 0
+        fields = self.data.site_xpos[seen], self.data.site_xmat[seen], self.model.site_rgba[seen]
+        sites: NDArray[np.float32] = np.concatenate(fields, axis=1).astype(np.float32)
+        return sites.tobytes()
+
+    def _places(self) -> NDArray[np.float32]:
+        """(ngeom, 12) position and rotation of each geom, in the precision in which it is drawn."""
+        places: NDArray[np.float32] = np.concatenate([self.data.geom_xpos, self.data.geom_xmat], axis=1)
+        return places.astype(np.float32)
 
     def geoms(self, camera: str) -> NDArray[np.int32]:
         """(H, W) the geom that each pixel of :meth:`frame` shows, by its number in the model; -1 for none."""
@@ -157,6 +240,11 @@ class Renderer:
                 self.model.tex_data[self._texels()[texture]] = value
             self._upload(replaced)
 
+    def _forget_layers(self) -> None:
+        self._still.clear()
+        for layer in self._layers.values():
+            layer.content = b""
+
     def _texels(self) -> list[slice]:
         """Where each texture's bytes lie in the model's ``tex_data``."""
         starts = self.model.tex_adr
@@ -176,6 +264,7 @@ class Renderer:
         self._renderer._gl_context.make_current()
         for texture in textures:
             mujoco.mjr_uploadTexture(self.model, self._renderer._mjr_context, texture)
+            self._forget_layers()
 
     def close(self) -> None:
         self._renderer.close()

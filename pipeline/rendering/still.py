@@ -1,0 +1,50 @@
+"""Which geoms stand still before a camera: table, fixtures, the robot's base, and most objects most of the time."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+LONGEST_WAIT = 16
+"""So many pictures at most a geom has to stand still before it is drawn with those that do."""
+
+
+class Still:
+    """Chooses the geoms of one camera's layer of what stands still.
+
+    A layer has to be drawn anew when one of its geoms moves, and an object at rest still moves by a millionth now and
+    then. So a geom that left the layer has to stand still for twice as many pictures before it joins again. And geoms
+    join when they were drawn beside the layer so often that it would have paid.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        meshes = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
+        self._faces = np.where(meshes >= 0, np.append(model.mesh_facenum, 0)[meshes], 12)
+        self._wait: NDArray[np.intp] = np.ones(model.ngeom, np.intp)
+        self._view = b""
+
+    def geoms(self, view: bytes, places: NDArray[np.float32], drawn: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(ngeom,) the geoms of the layer for the next picture.
+
+        Args:
+            view: what a picture depends on beside the geoms: the camera, and where the lamps are.
+            places: (ngeom, 12) positions and rotations of the geoms, as they are drawn.
+            drawn: (ngeom,) which geoms are to be drawn.
+        """
+        if view != self._view:
+            self._view, self._places = view, places
+            self._geoms: NDArray[np.bool_] = np.zeros(len(places), np.bool_)
+            self._age: NDArray[np.intp] = np.zeros(len(places), np.intp)
+            self._beside = 0
+            return self._geoms
+        stood = (places == self._places).all(axis=1)
+        self._places = places
+        left = self._geoms & ~stood
+        self._wait[left] = np.minimum(2 * self._wait[left], LONGEST_WAIT)
+        self._age = np.where(stood, self._age + 1, 0)
+        ready = drawn & (self._age >= self._wait)
+        self._beside += int(self._faces[ready & ~self._geoms].sum())
+        if left.any() or self._beside > self._faces[ready].sum():
+            self._geoms, self._beside = ready, 0
+        return self._geoms

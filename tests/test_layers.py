@@ -1,0 +1,128 @@
+"""What stands still is drawn once, and every picture is the one that MuJoCo draws at once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_culling import plain
+
+from pipeline import seeding
+from pipeline.rendering.renderer import Renderer
+
+BODIES = 12
+CAMERAS = ("fixed", "moving")
+
+SITES = "".join(
+    f'<site name="opacity {opacity}" pos="0.1 {y} 0.5" size="0.08" rgba="0.9 0.2 0.2 {opacity}"/>'
+    for y, opacity in ((-0.3, 0), (0, -0.5), (0.3, 1))
+)
+
+
+def scene() -> str:
+    """Bodies above a floor, with a mirror, a pane of glass before some of them, and sites, seen or not, above all."""
+    rng = seeding.rng("test_layers")
+    bodies = "".join(
+        f'<body mocap="true" pos="{" ".join(f"{x:.3f}" for x in rng.uniform(-0.5, 0.5, 3))}">'
+        f'<geom type="box" size="0.08 0.05 0.1" group="1" material="paint" rgba="{rng.random():.2f} 0.5 0.4 1"/></body>'
+        for _ in range(BODIES)
+    )
+    return f"""
+    <mujoco>
+      <asset><material name="mirror" reflectance="0.5"/><material name="paint" specular="0.8"/></asset>
+      <worldbody>
+        <light pos="0.5 0 3" dir="0 0 -1" castshadow="false"/>
+        <geom type="plane" size="3 3 0.1" pos="0 0 -0.7" group="1" rgba="0.5 0.5 0.5 1"/>
+        <geom type="box" size="0.3 0.3 0.01" pos="0.2 0.5 -0.5" group="1" material="mirror"/>
+        <geom type="box" size="0.01 0.2 0.2" pos="0.7 -0.6 0" group="1" rgba="0.2 0.4 0.9 0.3"/>
+        {SITES}
+        {bodies}
+        <camera name="fixed" pos="2 0 0.4" xyaxes="0 1 0 -0.2 0 1"/>
+        <body mocap="true" pos="0 2 0.5"><camera name="moving" xyaxes="-1 0 0 0 -0.2 1"/></body>
+      </worldbody>
+    </mujoco>"""
+
+
+@pytest.fixture
+def renderer() -> Iterator[Renderer]:
+    opened = Renderer(scene())
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def drawn(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many bodies' geoms each call to OpenGL had to draw."""
+    counts: list[int] = []
+    draw = renderer._draw_geoms
+
+    def counted(geoms: NDArray[np.bool_], reflections: bool, camera: str, sites: bool = True) -> None:
+        counts.append(int(geoms[-BODIES:].sum()))
+        draw(geoms, reflections, camera, sites)
+
+    monkeypatch.setattr(renderer, "_draw_geoms", counted)
+    return counts
+
+
+def assert_as_plain(renderer: Renderer, *cameras: str) -> None:
+    mujoco.mj_forward(renderer.model, renderer.data)
+    for camera in cameras:
+        assert np.array_equal(renderer.frame(camera), plain(renderer, camera)), camera
+
+
+def test_the_same_pixels_whatever_moves(renderer: Renderer) -> None:
+    rng = seeding.rng("test_layers", "moves")
+    for step in range(80):
+        # Now one of them moves, now several, now none; the last is the camera's body.
+        for body in rng.choice(BODIES, rng.integers(0, 3), replace=False):
+            renderer.data.mocap_pos[body] += rng.normal(0, 0.05, 3)
+        if step % 10 > 5:
+            renderer.data.mocap_pos[-1] += rng.normal(0, 0.05, 3)
+        if step % 20 == 19:
+            renderer.model.site_rgba[2, :3] = rng.random(3)
+        assert_as_plain(renderer, *CAMERAS)
+
+
+def test_what_stands_still_is_drawn_once(renderer: Renderer, drawn: list[int]) -> None:
+    for step in range(30):
+        renderer.data.mocap_pos[0, 2] = 0.01 * step
+        mujoco.mj_forward(renderer.model, renderer.data)
+        if step == 10:
+            drawn.clear()
+        renderer.frame("fixed")
+    assert len(renderer._layers) == 2, "what stands still, and the mirror"
+    assert sum(drawn) < 20 * BODIES
+
+
+def test_what_trembles_is_left_out_of_the_layer(renderer: Renderer, drawn: list[int]) -> None:
+    for step in range(90):
+        renderer.data.mocap_pos[:3, 2] += 1e-5 * (step % 5 == 0)
+        mujoco.mj_forward(renderer.model, renderer.data)
+        if step == 40:
+            drawn.clear()
+        renderer.frame("fixed")
+    assert max(drawn) < BODIES, "the layer of those that stand still is as it was"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("light_diffuse", 0.2),
+        ("light_pos", 1.0),
+        ("cam_fovy", 60.0),
+        ("mat_specular", 0.1),
+        ("geom_rgba", 0.7),
+        ("geom_matid", 1),
+    ],
+)
+def test_a_changed_look_is_seen(renderer: Renderer, field: str, value: float) -> None:
+    for _ in range(4):
+        mujoco.mj_forward(renderer.model, renderer.data)
+        before = renderer.frame("fixed")
+    array = getattr(renderer.model, field)
+    array[..., -1 if field == "geom_rgba" else slice(None)] = value
+    assert_as_plain(renderer, "fixed")
+    assert not np.array_equal(renderer.frame("fixed"), before)
