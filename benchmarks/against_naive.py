@@ -27,6 +27,7 @@ from pipeline import gl
 gl.choose()
 
 import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer  # noqa: E402
@@ -128,16 +129,26 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
     if not (textures == model.tex_data).all():
         for texture in range(model.ntex):
             mujoco.mjr_uploadTexture(model, context.con, texture)
-    observation = env.set_init_state(trajectory.states[0])
+    # Left to themselves, LIBERO's observations are rendered a substep before the state that a step ends in.
+    for spec in SCHEMA.views.values():
+        env.env.modify_observable(f"{spec.camera}_image", "enabled", False)
+    # What a replay restores beside the state, see pipeline/physics/environment.py.
+    robot = env.env.robots[0]
+    robot.gripper.current_action = np.zeros(robot.gripper.dof)
+    env.set_init_state(trajectory.states[0])
+    robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
     frames: dict[str, list[bytes]] = {view: [] for view in SCHEMA.views}
     for step, action in enumerate(trajectory.actions):
         for view, spec in SCHEMA.views.items():
-            frame = observation[f"{spec.camera}_image"]
+            frame = env.sim.render(width=width, height=height, camera_name=spec.camera)
             for noise in of_layer(perturbations, PixelPerturbation):
                 if view in noise.views:
                     frame = noise.apply(frame, step)
             frames[view].append(encode(to_policy(frame), config.render))
-        observation, *_ = env.step(action)
+        env.step(action)
+        # A step ends with positions that are integrated, and bodies and cameras that are a substep behind them.
+        mujoco.mj_kinematics(model, env.sim.data._data)
+        mujoco.mj_camlight(model, env.sim.data._data)
     env.close()
     return frames
 
