@@ -4,13 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import arenas
 import mujoco
 import numpy as np
 import pytest
+from arenas import TASKS
 from numpy.typing import NDArray
 from test_culling import plain
 
 from pipeline import seeding
+from pipeline.axes.background import BackgroundAxis
+from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.renderer import Renderer
 
 BODIES = 12
@@ -126,3 +130,34 @@ def test_a_changed_look_is_seen(renderer: Renderer, field: str, value: float) ->
     array[..., -1 if field == "geom_rgba" else slice(None)] = value
     assert_as_plain(renderer, "fixed")
     assert not np.array_equal(renderer.frame("fixed"), before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arena", TASKS)
+def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(arena: str) -> None:
+    rng = seeding.rng("test_layers", arena)
+    axis = BackgroundAxis(image_share=0.0)
+    choices = [[], *([axis.sample(rng, TASKS[arena], place)] for place in range(3))]
+    opened = arenas.renderer(arena)
+    cameras = [view.camera for view in SCHEMA.views.values()]
+    states = [np.concatenate([[0.0], opened.data.qpos, opened.data.qvel]) for _ in range(4)]
+    site_alpha = opened.model.site_rgba[:, 3].astype(np.float32)
+    for step, state in enumerate(states):
+        state[1:8] += 0.1 * step
+    try:
+        with opened.painted(choices) as shows:
+            assert opened._painted.any()
+            made = []
+            for state in states:
+                opened.restore(state, site_alpha)
+                for show in shows:
+                    show()
+                    made.append([opened.frame(camera) for camera in cameras])
+        for number, choice in enumerate(choices):
+            with opened.perturbed(choice):
+                for step, state in enumerate(states):
+                    opened.restore(state, site_alpha)
+                    expected = [plain(opened, camera) for camera in cameras]
+                    assert np.array_equal(made[step * len(choices) + number], expected), (number, step)
+    finally:
+        opened.close()

@@ -157,6 +157,11 @@ class RenderPerturbation(Perturbation):
         """Write the change into the model's ``fields``."""
         raise NotImplementedError
 
+    @property
+    def paints(self) -> bool:
+        """Whether it writes textures and nothing else."""
+        return self.fields == ("tex_data",)
+
 
 class PhysicsPerturbation(Perturbation):
     """Changes what happens: the scene before the first step, and so the whole replay."""

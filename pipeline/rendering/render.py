@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import gl
-from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
+from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer, to_json
 from pipeline.axes.light import exposure
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA, named
@@ -46,11 +46,12 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
     Streams that differ in pixel noise alone share the clean frames they are made from. A perturbed scene whose first
     frame is black or blown out is not rendered any further, nor one whose agent view does not show what it should (see
     ``Sight``): a moved camera the task, any camera the objects that were added. Streams that differ in colours alone
-    share their geometry.
+    share their geometry. Scenes that differ in textures alone are rendered side by side, so that what is the same in
+    them is drawn once.
     """
-    variants: dict[str, list[Stream]] = {}
+    scenes: dict[str, dict[str, list[Stream]]] = {}
     for stream in streams:
-        variants.setdefault(_scene(stream), []).append(stream)
+        scenes.setdefault(_scene(stream, textures=False), {}).setdefault(_scene(stream), []).append(stream)
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     refused: dict[str, str] = {}
     proprioceptions: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
@@ -67,28 +68,35 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
         hand_m = np.array([state[:3] for state, _ in proprioceptions], float)
         renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
         original = Sight.of(renderer, task, hand_m)
-        for perturbations, members in variants.items():
-            changes = of_layer(from_json(perturbations), RenderPerturbation)
-            moved = any("cam_pos" in change.fields for change in changes)
-            with renderer.perturbed(changes):
+        for shared in scenes.values():
+            variants = list(shared.values())
+            changes = [of_layer(members[0].perturbations, RenderPerturbation) for members in variants]
+            common = [change for change in changes[0] if not change.paints]
+            moved = any("cam_pos" in change.fields for change in common)
+            painted = [[change for change in each if change.paints] for each in changes]
+            with renderer.perturbed(common), renderer.painted(painted) as shows:
                 for step in range(steps):
                     renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
-                    clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
-                    if step == 0:
-                        faults = [fault for frame in clean.values() if changes and (fault := exposure(frame))]
-                        if any(SCHEMA.views[view].camera == CAMERA for view in clean):
-                            sight = Sight.of(renderer, task, hand_m) if moved else original
-                            faults += sight.faults(original)
-                        if faults:
-                            refused |= {stream.stream_id: faults[0] for stream in members}
-                            break
-                    for stream in members:
-                        frame = clean[stream.view]
-                        for noise in of_layer(stream.perturbations, PixelPerturbation):
-                            frame = noise.apply(frame, step)
-                        encoded[stream.stream_id].append(encode(to_policy(frame), config))
-        shared = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in refused)
-        geometry = {view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in shared}
+                    for show, members, perturbed in zip(shows, variants, changes, strict=True):
+                        if members[0].stream_id in refused:
+                            continue
+                        show()
+                        clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
+                        if step == 0:
+                            faults = [fault for frame in clean.values() if perturbed and (fault := exposure(frame))]
+                            if any(SCHEMA.views[view].camera == CAMERA for view in clean):
+                                sight = Sight.of(renderer, task, hand_m) if moved else original
+                                faults += sight.faults(original)
+                            if faults:
+                                refused |= {stream.stream_id: faults[0] for stream in members}
+                                continue
+                        for stream in members:
+                            frame = clean[stream.view]
+                            for noise in of_layer(stream.perturbations, PixelPerturbation):
+                                frame = noise.apply(frame, step)
+                            encoded[stream.stream_id].append(encode(to_policy(frame), config))
+        views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in refused)
+        geometry = {view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in views}
     finally:
         renderer.close()
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
@@ -185,15 +193,16 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
         planned: stream id to each stream that an episode of the plan shows, reserves included.
         needed: ids of those that are to be rendered.
     """
-    ordered = sorted(planned.items(), key=lambda item: (_scene(item[1]), item[0]))
+    ordered = sorted(planned.items(), key=lambda item: (_scene(item[1], textures=False), _scene(item[1]), item[0]))
     cut = [int(end) for end in np.linspace(0, len(ordered), math.ceil(len(ordered) / STREAMS_OF_A_JOB) + 1)]
     wanted = [tuple(stream for name, stream in ordered[a:b] if name in needed) for a, b in pairwise(cut)]
     return [portion for portion in wanted if portion]
 
 
-def _scene(stream: Stream) -> str:
-    """What streams have in common that are made from the same scene."""
-    return to_json(of_layer(stream.perturbations, RenderPerturbation))
+def _scene(stream: Stream, textures: bool = True) -> str:
+    """What streams have in common that are made from the same scene, or from the same one but for its textures."""
+    changes = of_layer(stream.perturbations, RenderPerturbation)
+    return to_json([change for change in changes if textures or not change.paints])
 
 
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, run: Run) -> set[str]:

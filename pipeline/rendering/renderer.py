@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import NamedTuple
 
 import mujoco
@@ -75,7 +76,9 @@ class Renderer:
         self._renderer._gl_context.make_current()
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
         self._still: dict[str, Still] = {}
-        self._layers: dict[tuple[str, int], Layer] = {}
+        self._layers: dict[tuple[str, str], Layer] = {}
+        self._painted: NDArray[np.bool_] = np.zeros(self.model.ngeom, np.bool_)
+        self._paint = b""
 
     def adopted(self, model: mujoco.MjModel) -> bool:
         """Go on with a copy of another model, where its meshes and textures are those in the GL context already.
@@ -129,32 +132,54 @@ class Renderer:
         frame[::-1][part.rows, part.columns] = drawn[::-1][part.rows, part.columns]
 
     def _draw_layers(self, parts: list[Part], camera: str) -> None:
-        """Draw a picture of layers: the first part, whose geoms that stand still are a layer too, and its mirrors."""
-        view, places = self._view(camera), self._places()
+        """Draw a picture of layers: what no texture that is chosen is on, what is, and what is reflected."""
         first, *mirrors = parts
-        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, first.geoms)
-        layers = []
-        for number, part in enumerate([first._replace(geoms=still), *mirrors]):
-            content = b"".join([view, part.geoms.tobytes(), places[part.geoms].tobytes()])
-            if part.reflections:
-                content += self._sites()
-            if part.geoms.any():
-                layers.append((self._layer(camera, number, part, content), part))
-        self._pieces.show(first.boxes)
-        self._draw_geoms(first.geoms & ~still, False, camera)
+        view, places = self._view(camera), self._places()
+
+        def content(part: Part) -> bytes:
+            return b"".join([view, part.geoms.tobytes(), places[part.geoms].tobytes(), self._sites()])
+
+        def draw_mirror(mirror: Part) -> None:
+            self._pieces.show(mirror.boxes)
+            self._draw_geoms(mirror.geoms, True, camera)
+
+        layers = [
+            (self._layer(camera, f"mirror {number}", content(part) + self._paint, partial(draw_mirror, part)), part)
+            for number, part in enumerate(mirrors)
+        ]
+        painted = first.geoms & self._painted
+        if painted.any():
+            rest = first._replace(geoms=first.geoms & ~painted)
+            draw = partial(self._draw_first, rest, camera, view, places)
+            layers.insert(0, (self._layer(camera, "not painted", content(rest), draw), first))
+            self._pieces.show(first.boxes)
+            self._draw_geoms(painted, False, camera, sites=False)
+        else:
+            self._draw_first(first, camera, view + self._paint, places)
         for layer, part in layers:
             layer.put(part.rows, part.columns)
 
-    def _layer(self, camera: str, number: int, part: Part, content: bytes) -> Layer:
-        """A layer of a camera's picture; it is drawn if its content is not what it was."""
-        if (camera, number) not in self._layers:
+    def _draw_first(self, part: Part, camera: str, view: bytes, places: NDArray[np.float32]) -> None:
+        """Draw a part in which nothing reflects: what stands still is a layer."""
+        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, part.geoms)
+        layers = []
+        self._pieces.show(part.boxes)
+        if still.any():
+            content = b"".join([view, still.tobytes(), places[still].tobytes()])
+            draw = partial(self._draw_geoms, still, False, camera, sites=False)
+            layers.append(self._layer(camera, "still", content, draw))
+        self._draw_geoms(part.geoms & ~still, False, camera)
+        for layer in layers:
+            layer.put(part.rows, part.columns)
+
+    def _layer(self, camera: str, name: str, content: bytes, draw: Callable[[], None]) -> Layer:
+        """A layer of a camera's pictures; it is drawn if its content is not what it was."""
+        if (camera, name) not in self._layers:
             context, height, width = self._renderer._mjr_context, self._renderer.height, self._renderer.width
-            self._layers[camera, number] = Layer(context, height, width)
-        layer = self._layers[camera, number]
+            self._layers[camera, name] = Layer(context, height, width)
+        layer = self._layers[camera, name]
         if layer.content != content:
-            self._pieces.show(part.boxes)
-            # What reflects mirrors the sites too; otherwise they are drawn with what moves.
-            self._draw_geoms(part.geoms, part.reflections, camera, sites=part.reflections)
+            draw()
             layer.keep(content)
         return layer
 
@@ -239,6 +264,65 @@ class Renderer:
             for texture, value in replaced.items():
                 self.model.tex_data[self._texels()[texture]] = value
             self._upload(replaced)
+
+    @contextmanager
+    def painted(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[Callable[[], None]]]:
+        """Hold the textures of several choices at once; what they are not on is drawn once for all of them.
+
+        Args:
+            choices: for each, perturbations that write textures and nothing else.
+
+        Returns:
+            A function for each choice, after which frames show it.
+        """
+        from OpenGL import GL
+
+        context = self._renderer._mjr_context
+        before = context.texture.copy()
+        self._renderer._gl_context.make_current()
+        held: list[dict[int, int]] = []
+
+        def show(textures: dict[int, int]) -> None:
+            context.texture[:] = before
+            context.texture[[*textures]] = [*textures.values()]
+            self._paint = repr(textures).encode()
+
+        try:
+            for perturbations in choices:
+                held.append(self._held(perturbations))
+                context.texture[:] = before
+            changed = [texture for textures in held for texture in textures]
+            if len(choices) > 1:
+                of_material = np.isin(self.model.mat_texid, changed).reshape(self.model.nmat, -1).any(axis=1)
+                self._painted = np.append(of_material, False)[self.model.geom_matid]
+            yield [partial(show, textures) for textures in held]
+        finally:
+            context.texture[:] = before
+            self._painted, self._paint = np.zeros_like(self._painted), b""
+            self._forget_layers()
+            self._renderer._gl_context.make_current()
+            # Else PyOpenGL would raise here what MuJoCo's own calls have left.
+            GL.glGetError()
+            GL.glDeleteTextures([name for textures in held for name in textures.values()])
+
+    def _held(self, perturbations: Sequence[RenderPerturbation]) -> dict[int, int]:
+        """Textures that perturbations change, by number in the model, to OpenGL's name of what they are changed to."""
+        from OpenGL import GL
+
+        if not perturbations:
+            return {}
+        context, pixels = self._renderer._mjr_context, self.model.tex_data.copy()
+        try:
+            for perturbation in perturbations:
+                perturbation.apply(self.model)
+            changed = list(self._changed(pixels))
+            for texture in changed:
+                GL.glGetError()
+                context.texture[texture] = GL.glGenTextures(1)
+                mujoco.mjr_uploadTexture(self.model, context, texture)
+        finally:
+            self.model.tex_data[:] = pixels
+        return {texture: int(context.texture[texture]) for texture in changed}
 
     def _forget_layers(self) -> None:
         self._still.clear()
