@@ -28,10 +28,15 @@ class Layer:
     Args:
         context: of MuJoCo, in whose off-screen buffer the pictures are drawn.
         height, width: of the pictures, which begin in that buffer's corner.
-
-    Raises:
-        OpenGL.error.Error: when this OpenGL has no shaders that run once for each sample (version 4.0).
     """
+
+    @staticmethod
+    def possible() -> bool:
+        """Whether the current OpenGL has shaders that run once for each sample."""
+        from OpenGL import GL
+
+        GL.glGetError()
+        return bool(GL.glGetIntegerv(GL.GL_MAJOR_VERSION) >= 4)
 
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
         from OpenGL import GL

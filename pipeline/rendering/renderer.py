@@ -61,8 +61,7 @@ class Renderer:
     """
 
     def __init__(self, scene: str | mujoco.MjModel):
-        # On a GPU the geoms are no effort, and what would spare them is.
-        layers = gl.prepare().software
+        software = gl.prepare().software
         height, width, _ = SCHEMA.frame.shape
         self.model = _compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         self.data = mujoco.MjData(self.model)
@@ -72,8 +71,9 @@ class Renderer:
         self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
         self._option.geomgroup[_CULLED] = 0
         hidden = np.flatnonzero(np.logical_not(self._option.geomgroup))
-        self._culling = Culling(self.model, height, width, hidden.tolist(), layers)
         self._renderer._gl_context.make_current()
+        # On a GPU the geoms are no effort, and what would spare them is.
+        self._culling = Culling(self.model, height, width, hidden.tolist(), software and Layer.possible())
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
         self._still: dict[str, Still] = {}
         self._layers: dict[tuple[str, str], Layer] = {}
