@@ -10,7 +10,8 @@ from arenas import TASKS, frames
 
 from pipeline.axes.light import LightPerturbation
 from pipeline.physics.environment import Environment
-from pipeline.rendering.renderer import LastScene, Renderer
+from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame
 
 SHADOWS = LightPerturbation(component="shadows", level=5, shadows=True)

@@ -14,7 +14,8 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.settings import VIEWS
 from pipeline.evaluation.simulator import Observed
 from pipeline.rendering.jpeg import to_policy
-from pipeline.rendering.renderer import LastScene, Renderer
+from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame
 
 

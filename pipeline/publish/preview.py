@@ -36,7 +36,7 @@ from pipeline.physics.environment import Environment
 from pipeline.physics.roll_out import roll_out
 from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
 from pipeline.rendering.jpeg import to_policy
-from pipeline.rendering.renderer import LastScene
+from pipeline.rendering.last_scene import LastScene
 from pipeline.run.compute import Run
 from pipeline.run.plan import draws_of
 from pipeline.testset import benchmark

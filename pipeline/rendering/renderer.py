@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from pipeline.rendering.culling import Culling, Part
 from pipeline.rendering.layer import Layer
 from pipeline.rendering.mesh_pieces import MeshPieces
 from pipeline.rendering.still import Still
+from pipeline.rendering.textures import Textures
 from pipeline.types import Frame
 
 _UPLOADED = (
@@ -35,6 +36,11 @@ _LOOK = (
 
 _CULLED = mujoco.mjNGROUP - 1
 """A group of geoms that nothing in LIBERO is in, and that is not drawn."""
+
+
+def compiled(scene: str | mujoco.MjModel) -> mujoco.MjModel:
+    """The model of a scene that is given by its MJCF, or as a model already."""
+    return mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else scene
 
 
 class Surfaces(NamedTuple):
@@ -63,7 +69,7 @@ class Renderer:
     def __init__(self, scene: str | mujoco.MjModel):
         software = gl.prepare().software
         height, width, _ = SCHEMA.frame.shape
-        self.model = _compiled(scene) if isinstance(scene, str) else copy.copy(scene)
+        self.model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         self.data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()
@@ -77,6 +83,7 @@ class Renderer:
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
         self._still: dict[str, Still] = {}
         self._layers: dict[tuple[str, str], Layer] = {}
+        self._textures = Textures(self.model, self._renderer._mjr_context)
         self._painted: NDArray[np.bool_] = np.zeros(self.model.ngeom, np.bool_)
         self._paint = b""
 
@@ -92,6 +99,7 @@ class Renderer:
         self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
         self._culling = self._culling.of(model)
         self._forget_layers()
+        self._textures = Textures(model, self._renderer._mjr_context)
         context = self._renderer._mjr_context
         # What a context keeps of a model's size, as mjr_makeContext works it out.
         context.shadowClip = model.stat.extent * model.vis.map.shadowclip
@@ -247,23 +255,28 @@ class Renderer:
         saved = {name: getattr(self.model, name).copy() for name in written}
         # Textures are a hundred megabytes and more, and copied to the GL context: keep only those that change.
         pixels = saved.pop("tex_data", None)
-        replaced: dict[int, NDArray[np.uint8]] = {}
+        former: dict[int, NDArray[np.uint8]] = {}
         try:
             try:
                 for perturbation in perturbations:
                     perturbation.apply(self.model)
             finally:
                 if pixels is not None:
-                    replaced = self._changed(pixels)
+                    former = self._textures.former(pixels)
                     del pixels
-            self._upload(replaced)
+            self._upload(former)
             yield
         finally:
             for name, value in saved.items():
                 getattr(self.model, name)[:] = value
-            for texture, value in replaced.items():
-                self.model.tex_data[self._texels()[texture]] = value
-            self._upload(replaced)
+            self._textures.write(former)
+            self._upload(former)
+
+    def _upload(self, textures: Collection[int]) -> None:
+        if textures:
+            self._renderer._gl_context.make_current()
+            self._textures.upload(textures)
+            self._forget_layers()
 
     @contextmanager
     def painted(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[Callable[[], None]]]:
@@ -275,118 +288,26 @@ class Renderer:
         Returns:
             A function for each choice, after which frames show it.
         """
-        from OpenGL import GL
 
-        context = self._renderer._mjr_context
-        before = context.texture.copy()
+        def show(names: Mapping[int, int]) -> None:
+            self._textures.show(names)
+            self._paint = repr(names).encode()
+
         self._renderer._gl_context.make_current()
-        held: list[dict[int, int]] = []
-
-        def show(textures: dict[int, int]) -> None:
-            context.texture[:] = before
-            context.texture[[*textures]] = [*textures.values()]
-            self._paint = repr(textures).encode()
-
-        try:
-            for perturbations in choices:
-                held.append(self._held(perturbations))
-                context.texture[:] = before
-            changed = [texture for textures in held for texture in textures]
+        with self._textures.held(choices) as held:
             if len(choices) > 1:
-                of_material = np.isin(self.model.mat_texid, changed).reshape(self.model.nmat, -1).any(axis=1)
-                self._painted = np.append(of_material, False)[self.model.geom_matid]
-            yield [partial(show, textures) for textures in held]
-        finally:
-            context.texture[:] = before
-            self._painted, self._paint = np.zeros_like(self._painted), b""
-            self._forget_layers()
-            self._renderer._gl_context.make_current()
-            # Else PyOpenGL would raise here what MuJoCo's own calls have left.
-            GL.glGetError()
-            GL.glDeleteTextures([name for textures in held for name in textures.values()])
-
-    def _held(self, perturbations: Sequence[RenderPerturbation]) -> dict[int, int]:
-        """Textures that perturbations change, by number in the model, to OpenGL's name of what they are changed to."""
-        from OpenGL import GL
-
-        if not perturbations:
-            return {}
-        context, pixels = self._renderer._mjr_context, self.model.tex_data.copy()
-        try:
-            for perturbation in perturbations:
-                perturbation.apply(self.model)
-            changed = list(self._changed(pixels))
-            for texture in changed:
-                GL.glGetError()
-                context.texture[texture] = GL.glGenTextures(1)
-                mujoco.mjr_uploadTexture(self.model, context, texture)
-        finally:
-            self.model.tex_data[:] = pixels
-        return {texture: int(context.texture[texture]) for texture in changed}
+                self._painted = self._textures.geoms_with({texture for names in held for texture in names})
+            try:
+                yield [partial(show, names) for names in held]
+            finally:
+                self._painted, self._paint = np.zeros_like(self._painted), b""
+                self._forget_layers()
+                self._renderer._gl_context.make_current()
 
     def _forget_layers(self) -> None:
         self._still.clear()
         for layer in self._layers.values():
             layer.content = b""
 
-    def _texels(self) -> list[slice]:
-        """Where each texture's bytes lie in the model's ``tex_data``."""
-        starts = self.model.tex_adr
-        sizes = self.model.tex_height * self.model.tex_width * self.model.tex_nchannel
-        return [slice(start, start + size) for start, size in zip(starts.tolist(), sizes.tolist(), strict=True)]
-
-    def _changed(self, pixels: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
-        """The former bytes of the textures that differ from ``pixels``, an earlier copy of ``tex_data``."""
-        return {
-            texture: pixels[texels].copy()
-            for texture, texels in enumerate(self._texels())
-            if not np.array_equal(pixels[texels], self.model.tex_data[texels])
-        }
-
-    def _upload(self, textures: Iterable[int]) -> None:
-        """Copy textures of the model to the GL context."""
-        self._renderer._gl_context.make_current()
-        for texture in textures:
-            mujoco.mjr_uploadTexture(self.model, self._renderer._mjr_context, texture)
-            self._forget_layers()
-
     def close(self) -> None:
         self._renderer.close()
-
-
-def _compiled(scene: str | mujoco.MjModel) -> mujoco.MjModel:
-    return mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else scene
-
-
-class LastScene:
-    """Keeps the renderer of the last scene open for whoever asks for the same scene next, or for one of the same
-    meshes and textures; only one is open at a time.
-
-    To compile a scene takes a second on one core, and to open its context two.
-    """
-
-    def __init__(self) -> None:
-        self._renderer: Renderer | None = None
-        self._scene: str | mujoco.MjModel | None = None
-
-    def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
-        """The renderer of a scene, by its MJCF or by a compiled model, which must not change meanwhile.
-
-        Raises:
-            PipelineError: when nothing renders on this machine.
-        """
-        if self._renderer is None or not self._is_last(scene):
-            model = _compiled(scene)
-            if self._renderer is None or not self._renderer.adopted(model):
-                self.close()
-                self._renderer = Renderer(model)
-            self._scene = scene
-        return self._renderer
-
-    def _is_last(self, scene: str | mujoco.MjModel) -> bool:
-        return scene is self._scene or (isinstance(scene, str) and scene == self._scene)
-
-    def close(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = self._scene = None

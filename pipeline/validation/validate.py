@@ -18,7 +18,7 @@ from pipeline.files import read_json, scratch
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import formats_of
-from pipeline.rendering.renderer import LastScene
+from pipeline.rendering.last_scene import LastScene
 from pipeline.run import manifest
 from pipeline.run.compute import Run
 from pipeline.run.episode_loader import EpisodeLoader

@@ -1,0 +1,93 @@
+"""The textures of a model in an OpenGL context of MuJoCo, some of them changed for a while."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.axes import RenderPerturbation
+
+
+class Textures:
+    """By their numbers in the model; MuJoCo's OpenGL context must be the current one."""
+
+    def __init__(self, model: mujoco.MjModel, context: mujoco.MjrContext):
+        self._model, self._context = model, context
+        self._own = context.texture.copy()
+        sizes = model.tex_height * model.tex_width * model.tex_nchannel
+        # Where each texture's bytes lie in the model's ``tex_data``.
+        self._texels = [
+            slice(start, start + size) for start, size in zip(model.tex_adr.tolist(), sizes.tolist(), strict=True)
+        ]
+
+    def former(self, pixels: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
+        """The former bytes of the textures that differ from ``pixels``, an earlier copy of the model's ``tex_data``."""
+        return {
+            texture: pixels[texels].copy()
+            for texture, texels in enumerate(self._texels)
+            if not np.array_equal(pixels[texels], self._model.tex_data[texels])
+        }
+
+    def write(self, textures: Mapping[int, NDArray[np.uint8]]) -> None:
+        """Write bytes of textures into the model."""
+        for texture, value in textures.items():
+            self._model.tex_data[self._texels[texture]] = value
+
+    def upload(self, textures: Iterable[int]) -> None:
+        """Copy textures of the model to the context."""
+        for texture in textures:
+            mujoco.mjr_uploadTexture(self._model, self._context, texture)
+
+    @contextmanager
+    def held(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[dict[int, int]]]:
+        """Have the context hold what each choice of perturbations makes of the model's textures.
+
+        Returns:
+            For each choice, the textures that it changes and OpenGL's names of what they are changed to.
+        """
+        from OpenGL import GL
+
+        held: list[dict[int, int]] = []
+        try:
+            for perturbations in choices:
+                held.append(self._changed(perturbations))
+            yield held
+        finally:
+            self.show({})
+            # Else PyOpenGL would raise here what MuJoCo's own calls have left.
+            GL.glGetError()
+            GL.glDeleteTextures([name for names in held for name in names.values()])
+
+    def _changed(self, perturbations: Sequence[RenderPerturbation]) -> dict[int, int]:
+        from OpenGL import GL
+
+        if not perturbations:
+            return {}
+        names: dict[int, int] = {}
+        pixels = self._model.tex_data.copy()
+        try:
+            for perturbation in perturbations:
+                perturbation.apply(self._model)
+            GL.glGetError()
+            for texture in self.former(pixels):
+                names[texture] = int(GL.glGenTextures(1))
+            self.show(names)
+            self.upload(names)
+        finally:
+            self._model.tex_data[:] = pixels
+            self.show({})
+        return names
+
+    def show(self, names: Mapping[int, int]) -> None:
+        """Have textures drawn with what OpenGL holds under other names, and all others with what is their own."""
+        self._context.texture[:] = self._own
+        self._context.texture[[*names]] = [*names.values()]
+
+    def geoms_with(self, textures: Collection[int]) -> NDArray[np.bool_]:
+        """(ngeom,) which geoms have one of the textures."""
+        of_material = np.isin(self._model.mat_texid, [*textures]).reshape(self._model.nmat, -1).any(axis=1)
+        return np.asarray(np.append(of_material, False)[self._model.geom_matid])
