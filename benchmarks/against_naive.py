@@ -135,6 +135,7 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
     # What a replay restores beside the state, see pipeline/physics/environment.py.
     robot = env.env.robots[0]
     robot.gripper.current_action = np.zeros(robot.gripper.dof)
+    env.sim.reset()
     env.set_init_state(trajectory.states[0])
     robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
     frames: dict[str, list[bytes]] = {view: [] for view in SCHEMA.views}
