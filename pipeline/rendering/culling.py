@@ -97,9 +97,9 @@ class Culling:
         clear = self._see_through()
         clear_seen = np.unique(boxes.geom[clear & seen]) if self._layers else ()
         windows = [view.rectangle(corners_m[boxes.geom == geom].reshape(-1, 3)) or whole for geom in clear_seen]
-        layers = self._layers and whole not in windows and not self._sites_see_through()
+        layers = self._layers and whole not in (*windows, *rectangles) and not self._sites_see_through()
         parts = [] if whole in rectangles else [self._part(seen & ~(clear & layers), False, layers, *whole)]
-        for rectangle in windows if parts and layers else []:
+        for rectangle in windows if layers else []:
             parts.append(self._part(unbounded | view.shows(corners_m, *rectangle), False, False, *rectangle))
         for rectangle in [whole] if whole in rectangles else rectangles:
             reflected = unbounded.copy()
@@ -108,7 +108,7 @@ class Culling:
             for mirrored, image_m in images:
                 reflected |= mirrored & view.shows(image_m, *rectangle)
             before = view.shows(corners_m, *rectangle)
-            layer = layers and bool(parts) and not (clear & (reflected | before)).any()
+            layer = layers and not (clear & (reflected | before)).any()
             parts.append(self._part(reflected if layer else reflected | before, True, layer, *rectangle))
         return parts
 

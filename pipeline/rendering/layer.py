@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import mujoco
 
+from pipeline import gl
+
 VERTICES = "#version 400 compatibility\nvoid main() { gl_Position = gl_Vertex; }"
 
 # The far end of MuJoCo's depth is 0: nothing was drawn there, and what was is the sky, which is in every picture.
@@ -33,41 +35,37 @@ class Layer:
     @staticmethod
     def possible() -> bool:
         """Whether the current OpenGL has shaders that run once for each sample."""
-        from OpenGL import GL
-
-        GL.glGetError()
-        return bool(GL.glGetIntegerv(GL.GL_MAJOR_VERSION) >= 4)
+        opengl = gl.calls()
+        return bool(opengl.glGetIntegerv(opengl.GL_MAJOR_VERSION) >= 4)
 
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
-        from OpenGL import GL
-
-        self._gl, self._buffer, self._height, self._width = GL, context.offFBO, height, width
-        self._forget_errors()
+        opengl = gl.calls()
+        self._buffer, self._height, self._width = context.offFBO, height, width
         self._textures = [
             self._texture(context.offColor, context.offSamples),
             self._texture(context.offDepthStencil, context.offSamples),
         ]
-        self._kept = GL.glGenFramebuffers(1)
-        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._kept)
-        for place, texture in zip(
-            (GL.GL_COLOR_ATTACHMENT0, GL.GL_DEPTH_STENCIL_ATTACHMENT), self._textures, strict=True
-        ):
-            GL.glFramebufferTexture2D(GL.GL_FRAMEBUFFER, place, GL.GL_TEXTURE_2D_MULTISAMPLE, texture, 0)
-        GL.glBindFramebuffer(GL.GL_FRAMEBUFFER, self._buffer)
+        self._kept = opengl.glGenFramebuffers(1)
+        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._kept)
+        places = opengl.GL_COLOR_ATTACHMENT0, opengl.GL_DEPTH_STENCIL_ATTACHMENT
+        for place, texture in zip(places, self._textures, strict=True):
+            opengl.glFramebufferTexture2D(opengl.GL_FRAMEBUFFER, place, opengl.GL_TEXTURE_2D_MULTISAMPLE, texture, 0)
+        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
         self._program = self._shaders()
         self.content = b""
 
     def keep(self, content: bytes) -> None:
         """Copy what is drawn in the off-screen buffer."""
-        gl, rectangle = self._gl, (0, 0, self._width, self._height)
-        self._forget_errors()
-        gl.glPushAttrib(gl.GL_SCISSOR_BIT)
-        gl.glDisable(gl.GL_SCISSOR_TEST)
-        gl.glBindFramebuffer(gl.GL_READ_FRAMEBUFFER, self._buffer)
-        gl.glBindFramebuffer(gl.GL_DRAW_FRAMEBUFFER, self._kept)
-        gl.glBlitFramebuffer(*rectangle, *rectangle, gl.GL_COLOR_BUFFER_BIT | gl.GL_DEPTH_BUFFER_BIT, gl.GL_NEAREST)
-        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._buffer)
-        gl.glPopAttrib()
+        opengl, rectangle = gl.calls(), (0, 0, self._width, self._height)
+        opengl.glPushAttrib(opengl.GL_SCISSOR_BIT)
+        opengl.glDisable(opengl.GL_SCISSOR_TEST)
+        opengl.glBindFramebuffer(opengl.GL_READ_FRAMEBUFFER, self._buffer)
+        opengl.glBindFramebuffer(opengl.GL_DRAW_FRAMEBUFFER, self._kept)
+        opengl.glBlitFramebuffer(
+            *rectangle, *rectangle, opengl.GL_COLOR_BUFFER_BIT | opengl.GL_DEPTH_BUFFER_BIT, opengl.GL_NEAREST
+        )
+        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
+        opengl.glPopAttrib()
         self.content = content
 
     def put(self, rows: slice, columns: slice) -> None:
@@ -78,55 +76,56 @@ class Layer:
         Args:
             rows, columns: of the picture, the first row at the top.
         """
-        gl = self._gl
-        self._forget_errors()
-        gl.glBindFramebuffer(gl.GL_FRAMEBUFFER, self._buffer)
-        gl.glPushAttrib(gl.GL_ALL_ATTRIB_BITS)
-        for setting in (gl.GL_ALPHA_TEST, gl.GL_BLEND, gl.GL_CULL_FACE, gl.GL_POLYGON_OFFSET_FILL, gl.GL_STENCIL_TEST):
-            gl.glDisable(setting)
-        gl.glEnable(gl.GL_DEPTH_TEST)
+        opengl = gl.calls()
+        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
+        opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)
+        for setting in (
+            opengl.GL_ALPHA_TEST,
+            opengl.GL_BLEND,
+            opengl.GL_CULL_FACE,
+            opengl.GL_POLYGON_OFFSET_FILL,
+            opengl.GL_STENCIL_TEST,
+        ):
+            opengl.glDisable(setting)
+        opengl.glEnable(opengl.GL_DEPTH_TEST)
         # MuJoCo's depth grows towards the camera.
-        gl.glDepthFunc(gl.GL_GEQUAL)
-        gl.glDepthMask(True)
-        gl.glColorMask(True, True, True, True)
-        gl.glPolygonMode(gl.GL_FRONT_AND_BACK, gl.GL_FILL)
-        gl.glViewport(0, 0, self._width, self._height)
-        gl.glEnable(gl.GL_SCISSOR_TEST)
-        gl.glScissor(columns.start, self._height - rows.stop, columns.stop - columns.start, rows.stop - rows.start)
+        opengl.glDepthFunc(opengl.GL_GEQUAL)
+        opengl.glDepthMask(True)
+        opengl.glColorMask(True, True, True, True)
+        opengl.glPolygonMode(opengl.GL_FRONT_AND_BACK, opengl.GL_FILL)
+        opengl.glViewport(0, 0, self._width, self._height)
+        opengl.glEnable(opengl.GL_SCISSOR_TEST)
+        opengl.glScissor(columns.start, self._height - rows.stop, columns.stop - columns.start, rows.stop - rows.start)
         for unit, texture in enumerate(self._textures):
-            gl.glActiveTexture(gl.GL_TEXTURE0 + unit)
-            gl.glBindTexture(gl.GL_TEXTURE_2D_MULTISAMPLE, texture)
-        gl.glUseProgram(self._program)
-        gl.glRectf(-1, -1, 1, 1)
-        gl.glUseProgram(0)
-        gl.glPopAttrib()
+            opengl.glActiveTexture(opengl.GL_TEXTURE0 + unit)
+            opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, texture)
+        opengl.glUseProgram(self._program)
+        opengl.glRectf(-1, -1, 1, 1)
+        opengl.glUseProgram(0)
+        opengl.glPopAttrib()
 
     def _texture(self, renderbuffer: int, samples: int) -> int:
         """A texture for as many samples as a renderbuffer has, in its format: others cannot be copied as they are."""
-        gl = self._gl
-        gl.glBindRenderbuffer(gl.GL_RENDERBUFFER, renderbuffer)
-        kind = gl.glGetRenderbufferParameteriv(gl.GL_RENDERBUFFER, gl.GL_RENDERBUFFER_INTERNAL_FORMAT)
-        texture: int = gl.glGenTextures(1)
-        gl.glBindTexture(gl.GL_TEXTURE_2D_MULTISAMPLE, texture)
-        gl.glTexImage2DMultisample(gl.GL_TEXTURE_2D_MULTISAMPLE, samples, kind, self._width, self._height, True)
-        gl.glBindTexture(gl.GL_TEXTURE_2D_MULTISAMPLE, 0)
+        opengl = gl.calls()
+        opengl.glBindRenderbuffer(opengl.GL_RENDERBUFFER, renderbuffer)
+        kind = opengl.glGetRenderbufferParameteriv(opengl.GL_RENDERBUFFER, opengl.GL_RENDERBUFFER_INTERNAL_FORMAT)
+        texture: int = opengl.glGenTextures(1)
+        opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, texture)
+        opengl.glTexImage2DMultisample(opengl.GL_TEXTURE_2D_MULTISAMPLE, samples, kind, self._width, self._height, True)
+        opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, 0)
         return texture
 
     def _shaders(self) -> int:
         from OpenGL.GL import shaders
 
-        gl = self._gl
+        opengl = gl.calls()
         program: int = shaders.compileProgram(
-            shaders.compileShader(VERTICES, gl.GL_VERTEX_SHADER),
-            shaders.compileShader(SAMPLES, gl.GL_FRAGMENT_SHADER),
+            shaders.compileShader(VERTICES, opengl.GL_VERTEX_SHADER),
+            shaders.compileShader(SAMPLES, opengl.GL_FRAGMENT_SHADER),
             validate=False,
         )
-        gl.glUseProgram(program)
+        opengl.glUseProgram(program)
         for unit, name in enumerate(("colours", "depths")):
-            gl.glUniform1i(gl.glGetUniformLocation(program, name), unit)
-        gl.glUseProgram(0)
+            opengl.glUniform1i(opengl.glGetUniformLocation(program, name), unit)
+        opengl.glUseProgram(0)
         return program
-
-    def _forget_errors(self) -> None:
-        """Else PyOpenGL would raise here what MuJoCo's own calls have left."""
-        self._gl.glGetError()

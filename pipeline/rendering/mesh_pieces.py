@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import gl
 from pipeline.types import Floats
 
 PIECE_FACES = 1024
@@ -83,11 +84,7 @@ class MeshPieces:
     """
 
     def __init__(self, model: mujoco.MjModel, context: mujoco.MjrContext, boxes: Boxes):
-        # Chooses its platform when it is imported, as MuJoCo's context does.
-        from OpenGL import GL
-
-        self._gl, self._base = GL, context.baseMesh
-        self._forget_errors()
+        self._base = context.baseMesh
         meshes = model.geom_dataid[boxes.geom]
         counts = {int(mesh): int(boxes.piece[meshes == mesh].max()) + 1 for mesh in meshes[boxes.piece > 0]}
         self._boxes = {mesh: np.flatnonzero(meshes == mesh) for mesh in counts}
@@ -107,31 +104,25 @@ class MeshPieces:
         Args:
             seen: (N,) which of the boxes.
         """
-        self._forget_errors()
+        opengl = gl.calls()
         for mesh, boxes in self._boxes.items():
             lists = self._lists[mesh]
             pieces = np.zeros(len(lists), np.bool_)
             pieces[self._piece[boxes[seen[boxes]]]] = True
             called = lists[pieces] if pieces.mean() <= MOST_PARTS else np.array([self._whole[mesh]], np.uint32)
             if self._shown.get(mesh) != called.tobytes():
-                self._gl.glNewList(self._base + 2 * mesh, self._gl.GL_COMPILE)
-                self._gl.glCallLists(called)
-                self._gl.glEndList()
+                opengl.glNewList(self._base + 2 * mesh, opengl.GL_COMPILE)
+                opengl.glCallLists(called)
+                opengl.glEndList()
                 self._shown[mesh] = called.tobytes()
-
-    def _forget_errors(self) -> None:
-        """Else PyOpenGL would raise here what MuJoCo's own calls have left."""
-        self._gl.glGetError()
 
 
 def _upload(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, first: int, faces: int) -> int:
     """Have MuJoCo write some of a mesh's faces into a display list of their own; returns its number."""
-    from OpenGL import GL
-
     start, count, graph = (int(field[mesh]) for field in (model.mesh_faceadr, model.mesh_facenum, model.mesh_graphadr))
     base = context.baseMesh
     # A list for the faces, and one for the convex hull, which is drawn for collision geometry.
-    number: int = GL.glGenLists(2)
+    number: int = gl.calls().glGenLists(2)
     try:
         model.mesh_faceadr[mesh], model.mesh_facenum[mesh] = start + first, min(faces, count - first)
         model.mesh_graphadr[mesh] = -1

@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import gl
 from pipeline.axes import RenderPerturbation
 
 
@@ -49,8 +50,6 @@ class Textures:
         Returns:
             For each choice, the textures that it changes and OpenGL's names of what they are changed to.
         """
-        from OpenGL import GL
-
         held: list[dict[int, int]] = []
         try:
             for perturbations in choices:
@@ -58,13 +57,9 @@ class Textures:
             yield held
         finally:
             self.show({})
-            # Else PyOpenGL would raise here what MuJoCo's own calls have left.
-            GL.glGetError()
-            GL.glDeleteTextures([name for names in held for name in names.values()])
+            gl.calls().glDeleteTextures([name for names in held for name in names.values()])
 
     def _changed(self, perturbations: Sequence[RenderPerturbation]) -> dict[int, int]:
-        from OpenGL import GL
-
         if not perturbations:
             return {}
         names: dict[int, int] = {}
@@ -72,9 +67,9 @@ class Textures:
         try:
             for perturbation in perturbations:
                 perturbation.apply(self._model)
-            GL.glGetError()
+            opengl = gl.calls()
             for texture in self.former(pixels):
-                names[texture] = int(GL.glGenTextures(1))
+                names[texture] = int(opengl.glGenTextures(1))
             self.show(names)
             self.upload(names)
         finally:
