@@ -181,7 +181,9 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
                 encoder.feed_frame(view.lerobot_key, pixels)
     ours = {view.lerobot_key: statistics(counts[name]) for name, view in SCHEMA.views.items()}
     described = partial(_episode_statistics, frames=ours)
-    with _set(lerobot.datasets.lerobot_dataset, "compute_episode_stats", described):
+    saving = lerobot.datasets.lerobot_dataset
+    # The columns hold whole files already; lerobot would go through all rows of each episode to look for paths.
+    with _set(saving, "compute_episode_stats", described), _set(saving, "embed_images", lambda columns: columns):
         dataset.save_episode(columns)
     return counts
 
