@@ -11,6 +11,7 @@ import argparse
 import json
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 
 from pipeline import gl
@@ -19,6 +20,7 @@ from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
+from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.render import render
 from pipeline.run.frame_store import Rendered
 from pipeline.run.streams import streams_of
@@ -52,7 +54,9 @@ def main() -> None:
 def measure(trajectory: Trajectory, task: Task, extras: Sequence[Extra]) -> dict[str, float]:
     """Of rendering both views with extras: seconds by the clock and of all cores, bytes of frames and of extras."""
     clock_s, cpu_s = time.perf_counter(), time.process_time()
-    rendered = render(trajectory, task, list(streams_of("[]").values()), RenderConfig(extras=tuple(extras)))
+    with closing(LastScene()) as opened:
+        streams = list(streams_of("[]").values())
+        rendered = render(trajectory, task, streams, RenderConfig(extras=tuple(extras)), opened)
     return {
         "seconds": round(time.perf_counter() - clock_s, 2),
         "cpu_seconds": round(time.process_time() - cpu_s, 2),

@@ -64,7 +64,9 @@ def replay(
     )
 
 
-def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
+def render(
+    trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig, opened: object
+) -> Rendered:
     """A pattern of its own for each stream and step."""
     steps = len(trajectory.actions)
     state = np.zeros((steps, 8), np.float32)

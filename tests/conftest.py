@@ -10,12 +10,12 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from http.server import ThreadingHTTPServer
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 import yaml
@@ -32,6 +32,9 @@ from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import fetch_testset
 from pipeline.types import Demo, Task, Trajectory
+
+if TYPE_CHECKING:  # the tests that render choose what renders
+    from pipeline.rendering.last_scene import LastScene
 
 Result = TypeVar("Result")
 
@@ -73,6 +76,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if isinstance(item, pytest.Function) and SLOW_FIXTURES.intersection(item.fixturenames):
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+
+
+@pytest.fixture(scope="module")
+def opened() -> Iterator[LastScene]:
+    """What the tests of a file render with."""
+    from pipeline.rendering.last_scene import LastScene
+
+    with closing(LastScene()) as opened:
+        yield opened
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -30,6 +30,7 @@ from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.physics.replay import replay_plan
 from pipeline.rendering.instances import COMMON
+from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.render import render, render_plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import plan
@@ -64,8 +65,8 @@ def middle(whole: dict[Task, Trajectory]) -> Trajectory:
 
 
 @pytest.fixture(scope="module")
-def rendered(middle: Trajectory) -> Rendered:
-    return render(middle, STOVE, list(STREAMS.values()), RenderConfig(extras=EXTRAS))
+def rendered(middle: Trajectory, opened: LastScene) -> Rendered:
+    return render(middle, STOVE, list(STREAMS.values()), RenderConfig(extras=EXTRAS), opened)
 
 
 def pixels(file: bytes) -> NDArray[Any]:
@@ -118,8 +119,8 @@ def test_streams_that_differ_in_colours_share_their_geometry(rendered: Rendered)
     assert ids["image"] == STREAMS["image"].stream_id
 
 
-def test_extras_change_no_frame_and_need_asking_for(rendered: Rendered, middle: Trajectory) -> None:
-    plain = render(middle, STOVE, list(STREAMS.values()), RenderConfig())
+def test_extras_change_no_frame_and_need_asking_for(rendered: Rendered, middle: Trajectory, opened: LastScene) -> None:
+    plain = render(middle, STOVE, list(STREAMS.values()), RenderConfig(), opened)
     assert plain.streams == rendered.streams
     assert (plain.object_poses, plain.instances) == (None, ())
     for name, geometry in plain.geometry.items():

@@ -205,9 +205,9 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
     )
     environment.close()
     shown = stage.frames(VIEWS)
-    stage.opened.close()
     streams = streams_of("[]")
-    rendered = render(begun, STOVE, list(streams.values()), STARTER.render)
+    rendered = render(begun, STOVE, list(streams.values()), STARTER.render, stage.opened)
+    stage.opened.close()
     for view, frame in zip(VIEWS, shown, strict=True):
         compressed = decode(rendered.streams[streams[view].stream_id][0])
         assert np.abs(compressed.astype(int) - frame).mean() < 2

@@ -26,6 +26,7 @@ from pipeline.axes.noise import NoiseAxis  # noqa: E402
 from pipeline.config import RenderConfig  # noqa: E402
 from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.rendering.jpeg import decode, encode, to_policy  # noqa: E402
+from pipeline.rendering.last_scene import LastScene  # noqa: E402
 from pipeline.rendering.render import render  # noqa: E402
 from pipeline.rendering.renderer import Renderer  # noqa: E402
 from pipeline.rendering.sight import LEAST_PX, MOST_OUTSIDE, Sight  # noqa: E402
@@ -137,7 +138,7 @@ def test_streams_are_shared_where_nothing_shows() -> None:
         assert changed["image"].stream_id != clean["image"].stream_id
 
 
-def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path) -> None:
+def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path, opened: LastScene) -> None:
     """Noise is laid on the clean frame of its own camera, in the simulator's orientation, then the frame is turned."""
     del short_demos
     source = whole[MILK]
@@ -152,7 +153,7 @@ def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path
         Stream("wrist_image", ()),
     ]
     config = RenderConfig()
-    rendered = render(trajectory, MILK, streams, config)
+    rendered = render(trajectory, MILK, streams, config, opened)
     assert set(rendered.streams) == {stream.stream_id for stream in streams}
     assert rendered.state.shape == (steps, 8)
     assert rendered.joint_state.shape == (steps, 7)
@@ -173,7 +174,7 @@ def test_turned_by_half_a_turn() -> None:
 
 
 def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
-    whole: dict[Task, Trajectory], tmp_path: Path
+    whole: dict[Task, Trajectory], tmp_path: Path, opened: LastScene
 ) -> None:
     source = whole[MILK]
     trajectory = replace(source, states=source.states[:9], actions=source.actions[:8])
@@ -182,7 +183,7 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     # LIBERO's head light keeps frames from being black, so put it out as no draw can.
     dark = '<visual><headlight diffuse="0 0 0" ambient="0 0 0" specular="0 0 0"/></visual>'
     unlit = trajectory.model_xml.replace("<worldbody>", f"{dark}<worldbody>", 1)
-    rendered = render(replace(trajectory, model_xml=unlit), MILK, streams, RenderConfig())
+    rendered = render(replace(trajectory, model_xml=unlit), MILK, streams, RenderConfig(), opened)
     assert rendered.rejected == {streams[1].stream_id: "too_dark"}
     assert set(rendered.streams) == {streams[0].stream_id, streams[2].stream_id}
     store = FrameStore(tmp_path, RenderConfig())
@@ -209,7 +210,9 @@ def test_geoms_are_those_that_pixels_show(whole: dict[Task, Trajectory]) -> None
     assert (gone & ~shown).sum() < 0.1 * shown.sum()
 
 
-def test_a_camera_that_loses_sight_of_the_task_is_rejected_with_its_reason(whole: dict[Task, Trajectory]) -> None:
+def test_a_camera_that_loses_sight_of_the_task_is_rejected_with_its_reason(
+    whole: dict[Task, Trajectory], opened: LastScene
+) -> None:
     source = whole[MILK]
     trajectory = replace(source, states=source.states[:9], actions=source.actions[:8])
     cameras = {
@@ -219,7 +222,7 @@ def test_a_camera_that_loses_sight_of_the_task_is_rejected_with_its_reason(whole
         "hand_not_seen": CameraPerturbation(component="orientation", level=5, pitch_deg=16.0),
     }
     streams = {name: Stream("image", (camera,)) for name, camera in cameras.items()}
-    rendered = render(trajectory, MILK, list(streams.values()), RenderConfig())
+    rendered = render(trajectory, MILK, list(streams.values()), RenderConfig(), opened)
     assert rendered.rejected == {streams[name].stream_id: name for name in cameras if name != "seen"}
     assert set(rendered.streams) == {streams["seen"].stream_id}
 

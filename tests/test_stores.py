@@ -230,9 +230,9 @@ def test_a_plan_that_grows_or_shrinks_has_the_files_of_a_first_run_and_renders_w
     monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", streams_of_a_job)
     made: list[str] = []
 
-    def noted(trajectory: Any, task: Any, streams: Sequence[Stream], render_config: Any) -> Any:
+    def noted(trajectory: Any, task: Any, streams: Sequence[Stream], render_config: Any, opened: Any) -> Any:
         made.extend(stream.stream_id for stream in streams)
-        return render(trajectory, task, streams, render_config)
+        return render(trajectory, task, streams, render_config, opened)
 
     monkeypatch.setattr("pipeline.rendering.render.render", noted)
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+import functools
+
 import mujoco
 
-from pipeline.rendering.renderer import Renderer, compiled
+from pipeline.rendering.renderer import Renderer
 
 
 class LastScene:
@@ -25,7 +28,7 @@ class LastScene:
             PipelineError: when nothing renders on this machine.
         """
         if self._renderer is None or not self._is_last(scene):
-            model = compiled(scene)
+            model = mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else copy.copy(scene)
             if self._renderer is None or not self._renderer.adopted(model):
                 self.close()
                 self._renderer = Renderer(model)
@@ -39,3 +42,9 @@ class LastScene:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = self._scene = None
+
+
+@functools.cache
+def scene_of_process() -> LastScene:
+    """The one that this process keeps open from one piece of work to the next; whoever is done closes it."""
+    return LastScene()

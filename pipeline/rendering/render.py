@@ -22,7 +22,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.rendering.geometry import see
 from pipeline.rendering.instances import Instances
 from pipeline.rendering.jpeg import encode, to_policy
-from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.last_scene import LastScene, scene_of_process
 from pipeline.rendering.sight import CAMERA, Sight
 from pipeline.run.compute import LOST, Expendable, Run
 from pipeline.run.frame_store import FrameStore, Rendered, file_name, joined, shown_of
@@ -36,11 +36,13 @@ from pipeline.types import Task, Trajectory
 STREAMS_OF_A_JOB = 64
 """Bounds a render job: minutes of a core, which a kill loses at most, and some 200 MB of encoded frames.
 
-A trajectory's second job opens its scene once more, which takes some seconds.
+A trajectory's second job may have to open its scene once more, which takes some seconds.
 """
 
 
-def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig) -> Rendered:
+def render(
+    trajectory: Trajectory, task: Task, streams: Sequence[Stream], config: RenderConfig, opened: LastScene
+) -> Rendered:
     """Render the streams of one trajectory of a task: the frame before each executed action.
 
     Streams that differ in pixel noise alone share the clean frames they are made from. A perturbed scene whose first
@@ -57,48 +59,45 @@ def render(trajectory: Trajectory, task: Task, streams: Sequence[Stream], config
     proprioceptions: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
     poses: list[NDArray[np.float32]] = []
     steps = len(trajectory.actions)
-    renderer = Renderer(trajectory.model_xml)
-    try:
-        instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
-        for step in range(steps):
-            renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
-            proprioceptions.append(proprioception(renderer.data))
-            if instances:
-                poses.append(instances.poses(renderer.data))
-        hand_m = np.array([state[:3] for state, _ in proprioceptions], float)
-        renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
-        original = Sight.of(renderer, task, hand_m)
-        for shared in scenes.values():
-            variants = list(shared.values())
-            changes = [of_layer(members[0].perturbations, RenderPerturbation) for members in variants]
-            common = [change for change in changes[0] if not change.paints]
-            moved = any("cam_pos" in change.fields for change in common)
-            painted = [[change for change in each if change.paints] for each in changes]
-            with renderer.perturbed(common), renderer.painted(painted) as shows:
-                for step in range(steps):
-                    renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
-                    for show, members, perturbed in zip(shows, variants, changes, strict=True):
-                        if members[0].stream_id in refused:
+    renderer = opened.renderer(trajectory.model_xml)
+    instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
+    for step in range(steps):
+        renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+        proprioceptions.append(proprioception(renderer.data))
+        if instances:
+            poses.append(instances.poses(renderer.data))
+    hand_m = np.array([state[:3] for state, _ in proprioceptions], float)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    original = Sight.of(renderer, task, hand_m)
+    for shared in scenes.values():
+        variants = list(shared.values())
+        changes = [of_layer(members[0].perturbations, RenderPerturbation) for members in variants]
+        common = [change for change in changes[0] if not change.paints]
+        moved = any("cam_pos" in change.fields for change in common)
+        painted = [[change for change in each if change.paints] for each in changes]
+        with renderer.perturbed(common), renderer.painted(painted) as shows:
+            for step in range(steps):
+                renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+                for show, members, perturbed in zip(shows, variants, changes, strict=True):
+                    if members[0].stream_id in refused:
+                        continue
+                    show()
+                    clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
+                    if step == 0:
+                        faults = [fault for frame in clean.values() if perturbed and (fault := exposure(frame))]
+                        if any(SCHEMA.views[view].camera == CAMERA for view in clean):
+                            sight = Sight.of(renderer, task, hand_m) if moved else original
+                            faults += sight.faults(original)
+                        if faults:
+                            refused |= {stream.stream_id: faults[0] for stream in members}
                             continue
-                        show()
-                        clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in {s.view for s in members}}
-                        if step == 0:
-                            faults = [fault for frame in clean.values() if perturbed and (fault := exposure(frame))]
-                            if any(SCHEMA.views[view].camera == CAMERA for view in clean):
-                                sight = Sight.of(renderer, task, hand_m) if moved else original
-                                faults += sight.faults(original)
-                            if faults:
-                                refused |= {stream.stream_id: faults[0] for stream in members}
-                                continue
-                        for stream in members:
-                            frame = clean[stream.view]
-                            for noise in of_layer(stream.perturbations, PixelPerturbation):
-                                frame = noise.apply(frame, step)
-                            encoded[stream.stream_id].append(encode(to_policy(frame), config))
-        views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in refused)
-        geometry = {view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in views}
-    finally:
-        renderer.close()
+                    for stream in members:
+                        frame = clean[stream.view]
+                        for noise in of_layer(stream.perturbations, PixelPerturbation):
+                            frame = noise.apply(frame, step)
+                        encoded[stream.stream_id].append(encode(to_policy(frame), config))
+    views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in refused)
+    geometry = {view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in views}
     state, joint_state = (np.stack(column) for column in zip(*proprioceptions, strict=True))
     shown = {stream_id: frames for stream_id, frames in encoded.items() if stream_id not in refused}
     return Rendered(
@@ -152,7 +151,7 @@ class RenderJob:
         trajectory = TrajectoryStore(self.trajectories).load(self.trajectory_id)
         parts, missing = self._stored(device)
         if missing:
-            parts = [*parts, render(trajectory, self.task, missing, self.config)]
+            parts = [*parts, render(trajectory, self.task, missing, self.config, scene_of_process())]
         FrameStore(self.frames, self.config).save(self.trajectory_id, joined(parts), device)
 
     def frames_at_most(self) -> int:
@@ -220,7 +219,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     store = FrameStore(folder, config.render)
     judged = verdicts_of(replayed(rows, trajectories))
     steps = {row.trajectory_id: row.demo_steps for row in rows}
-    tasks = {row.trajectory_id: (row.suite, row.task) for row in rows}
+    demos = {row.trajectory_id: (row.suite, row.task, row.demo_id) for row in rows}
     planned: dict[str, dict[str, Stream]] = {row.trajectory_id: {} for row in rows}
     shown: dict[str, set[str]] = {}
     for row in rows:
@@ -245,7 +244,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
         jobs = [
             RenderJob(
                 trajectory_id,
-                find_task(*tasks[trajectory_id]),
+                find_task(*demos[trajectory_id][:2]),
                 portion,
                 steps[trajectory_id],
                 trajectories,
@@ -266,7 +265,11 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
                 remedy="check that all workers see this folder and have the same versions and OpenGL device",
             )
         undone = jobs
-        # The longest first, so that no worker is left alone with one at the end.
-        longest_first = sorted(jobs, key=RenderJob.frames_at_most, reverse=True)
+        # Those of many streams first, so that no worker is left alone with one at the end. Those of few, to which the
+        # scene matters, by task and demonstration: what their scenes have in common, a worker keeps.
+        in_turn = sorted(jobs, key=lambda job: (-len(job.streams), demos[job.trajectory_id]))
         work = Expendable(RenderJob.__call__, RenderJob.limit_s, RenderJob.lost, RenderJob.frames_at_most)
-        run(work, longest_first, "render, frames")
+        try:
+            run(work, in_turn, "render, frames")
+        finally:
+            scene_of_process().close()

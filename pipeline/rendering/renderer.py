@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -38,11 +37,6 @@ _CULLED = mujoco.mjNGROUP - 1
 """A group of geoms that nothing in LIBERO is in, and that is not drawn."""
 
 
-def compiled(scene: str | mujoco.MjModel) -> mujoco.MjModel:
-    """The model of a scene that is given by its MJCF, or as a model already."""
-    return mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else scene
-
-
 class Surfaces(NamedTuple):
     """What each pixel shows, in the orientation of LIBERO's raw observations.
 
@@ -60,7 +54,7 @@ class Renderer:
     """Renders one scene through one GL context; close it before the next is made.
 
     Args:
-        scene: its MJCF, or a compiled model, of which a copy is taken.
+        scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
 
     Raises:
         PipelineError: when nothing renders on this machine.
@@ -69,7 +63,7 @@ class Renderer:
     def __init__(self, scene: str | mujoco.MjModel):
         software = gl.prepare().software
         height, width, _ = SCHEMA.frame.shape
-        self.model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
+        self.model = mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else scene
         self.data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()
@@ -88,14 +82,13 @@ class Renderer:
         self._paint = b""
 
     def adopted(self, model: mujoco.MjModel) -> bool:
-        """Go on with a copy of another model, where its meshes and textures are those in the GL context already.
+        """Go on with another model, where its meshes and textures are those in the GL context already.
 
         Returns:
-            Whether it is so; else nothing is changed.
+            Whether it is so, and the model belongs to the renderer now; else nothing is changed.
         """
         if not all(np.array_equal(getattr(self.model, name), getattr(model, name)) for name in _UPLOADED):
             return False
-        model = copy.copy(model)
         self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
         self._culling = self._culling.of(model)
         self._forget_layers()

@@ -18,7 +18,7 @@ from pipeline.files import read_json, scratch
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import formats_of
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.last_scene import scene_of_process
 from pipeline.run import manifest
 from pipeline.run.compute import Run
 from pipeline.run.episode_loader import EpisodeLoader
@@ -86,8 +86,11 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
             total.note("readable", [fault for check, fault in found if check == "readable"], 0)
         again = frozenset(witnesses(rows))
         job = EpisodesJob(config, data, opened, cache, again)
-        for results in run(job, _slices(kept, again, opened), "validate"):
-            total.add(results)
+        try:
+            for results in run(job, _slices(kept, again, opened), "validate"):
+                total.add(results)
+        finally:
+            scene_of_process().close()
     if not any(fault.dataset == "rlds" for check in ("readable", "checksums") for fault in total.findings[check]):
         # OFT's reader stops at what is damaged.
         sets = oft.datasets(data / "rlds")
@@ -103,11 +106,12 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
 def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[Format[Any]]) -> list[list[Row]]:
     """All episodes, those that are checked in one call together.
 
-    Those to render anew come by trajectory, as each has one scene to open; the others as they lie in the datasets.
+    Those to render anew come by trajectory and task, as those have a scene in common; the others as they lie in the
+    datasets.
     """
     by_trajectory: dict[str, list[Row]] = defaultdict(list)
     others: list[Row] = []
-    for episode_id, row in kept.items():
+    for episode_id, row in sorted(kept.items(), key=lambda item: (item[1]["suite"], item[1]["task"])):
         (by_trajectory[row["trajectory_id"]] if episode_id in again else others).append(row)
     columns = [column.name for one in formats for column in one.columns]
     others.sort(key=lambda row: [str(row[column]) for column in columns])
@@ -133,15 +137,12 @@ class EpisodesJob:
     witnesses: frozenset[str]
 
     def __call__(self, rows: Sequence[Row]) -> Results:
-        results, scene = Results(), LastScene()
-        try:
-            for row in rows:
-                self._check(row, results, scene)
-        finally:
-            scene.close()
+        results = Results()
+        for row in rows:
+            self._check(row, results)
         return results
 
-    def _check(self, row: Row, results: Results, scene: LastScene) -> None:
+    def _check(self, row: Row, results: Results) -> None:
         episode_id = row["episode_id"]
         copies, missing, unreadable = [], [], []
         for one in self.formats:
@@ -172,4 +173,4 @@ class EpisodesJob:
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:
-            results.note("rendered", rendered(case, self.config.render, scene))
+            results.note("rendered", rendered(case, self.config.render, scene_of_process()))
