@@ -15,9 +15,10 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+from episode_slice import sliced
 
 os.environ |= {"LP_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
@@ -31,7 +32,7 @@ import numpy as np  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer  # noqa: E402
-from pipeline.config import Config, DemosConfig, load  # noqa: E402
+from pipeline.config import Config, load  # noqa: E402
 from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.libero.tasks import find_task, select_tasks  # noqa: E402
 from pipeline.physics.replay import replay_plan  # noqa: E402
@@ -45,7 +46,6 @@ from pipeline.run.streams import streams_of  # noqa: E402
 from pipeline.run.trajectory_store import TrajectoryStore  # noqa: E402
 from pipeline.testset import benchmark  # noqa: E402
 from pipeline.types import Trajectory  # noqa: E402
-from pipeline.validation.doctor import DEMOS_PER_TASK  # noqa: E402
 
 
 def main() -> None:
@@ -96,20 +96,6 @@ def main() -> None:
                 "naive_against_ours": round(naive_s / (rendered - begun), 2),
             }
         )
-    )
-
-
-def sliced(config: Config, tasks: Sequence[str] | None) -> Config:
-    """One demonstration of each task, and its share of the episodes."""
-    patterns = tuple(tasks or config.demos.tasks)
-    chosen = len(select_tasks(patterns))
-    whole = len(select_tasks(config.demos.tasks)) * (config.demos.per_task or DEMOS_PER_TASK[config.demos.source])
-    episodes = {name: max(1, round(number * chosen / whole)) for name, number in config.plan.episodes.items()}
-    return config.model_copy(
-        update={
-            "demos": DemosConfig(source="starter", tasks=patterns),
-            "plan": config.plan.model_copy(update={"episodes": episodes}),
-        }
     )
 
 

@@ -1,12 +1,14 @@
 """The render stage by one worker and by several, beside the bare drawing of its frames.
 
-    python benchmarks/render_workers.py [--config configs/starter.yaml] [--tasks 'libero_goal/put_the_bowl_*']
+    python benchmarks/render_workers.py [--config configs/starter.yaml] [--tasks 'libero_goal/put_the_bowl_*' ...]
 
 Takes a demonstration of the starter set for each task, and as many episodes as the configuration asks for each
 demonstration. They are replayed once. Then the frames are rendered three times: in this process, where the time within
-``Renderer.frame`` is counted, by one worker process, and by several. Run it on a machine that does nothing else. The
-last line is JSON: seconds by the clock, the start of the workers left out; what the workers together take against the
-bare drawing (1 is the least); and how many times faster several are than one.
+``Renderer.frame`` is counted, by one worker process, and by several, each drawing with one thread. Run it on a machine
+that does nothing else, with tasks of scenes that are alike: the streams of a demonstration are one job, and of two jobs
+that differ, one worker waits for the other. The last line is JSON: seconds by the clock, the start of the workers left
+out, and of CPU time for the bare drawing, as one process draws on little more than one core; what the workers together
+take against both; and how many times faster several are than one.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from unittest.mock import patch
 
-from against_naive import sliced
+os.environ |= {"LP_NUM_THREADS": "1"}
+
+from episode_slice import sliced
 
 from pipeline.config import ComputeConfig, load
 from pipeline.physics.replay import replay_plan
@@ -49,32 +53,36 @@ def main() -> None:
             render_plan(rows, config, trajectories, root / name, run)
             return time.perf_counter() - start
 
-        drawn_s: list[float] = []
+        drawn_s: list[tuple[float, float]] = []
         draw = Renderer.frame
 
         def timed(renderer: Renderer, camera: str) -> Frame:
-            start = time.perf_counter()
+            start_s, start_cpu_s = time.perf_counter(), time.process_time()
             frame = draw(renderer, camera)
-            drawn_s.append(time.perf_counter() - start)
+            drawn_s.append((time.perf_counter() - start_s, time.process_time() - start_cpu_s))
             return frame
 
         with patch.object(Renderer, "frame", timed):
             here_s = rendered(loop, "here")
         by_workers = {}
         for workers in (1, arguments.workers):
-            with runner(ComputeConfig(cluster="local", workers=workers), root) as run:
+            config_of_workers = ComputeConfig(cluster="local", workers=workers)
+            # A worker that has cores to spare would draw with as many threads.
+            with patch("dask.system.CPU_COUNT", workers), runner(config_of_workers, root) as run:
                 run(_warm, range(4 * workers), "workers")
                 by_workers[workers] = rendered(run, f"by_{workers}")
-    bare_s, several_s = sum(drawn_s), by_workers[arguments.workers]
+    (bare_s, bare_cpu_s), several_s = map(sum, zip(*drawn_s, strict=True)), by_workers[arguments.workers]
     print(
         json.dumps(
             {
                 "config": str(arguments.config),
                 "frames_drawn": len(drawn_s),
                 "bare_s": round(bare_s, 1),
+                "bare_cpu_s": round(bare_cpu_s, 1),
                 "one_process_s": round(here_s, 1),
                 "s_by_workers": {workers: round(seconds, 1) for workers, seconds in by_workers.items()},
                 "workers_against_bare": round(arguments.workers * several_s / bare_s, 2),
+                "workers_against_bare_cpu": round(arguments.workers * several_s / bare_cpu_s, 2),
                 "several_against_one": round(by_workers[1] / several_s, 2),
             }
         )

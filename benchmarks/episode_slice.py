@@ -1,0 +1,23 @@
+"""A part of a configuration that is small enough to be measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pipeline.config import Config, DemosConfig
+from pipeline.libero.tasks import select_tasks
+from pipeline.validation.doctor import DEMOS_PER_TASK
+
+
+def sliced(config: Config, tasks: Sequence[str] | None) -> Config:
+    """One demonstration of each task, and its share of the episodes."""
+    patterns = tuple(tasks or config.demos.tasks)
+    chosen = len(select_tasks(patterns))
+    whole = len(select_tasks(config.demos.tasks)) * (config.demos.per_task or DEMOS_PER_TASK[config.demos.source])
+    episodes = {name: max(1, round(number * chosen / whole)) for name, number in config.plan.episodes.items()}
+    return config.model_copy(
+        update={
+            "demos": DemosConfig(source="starter", tasks=patterns),
+            "plan": config.plan.model_copy(update={"episodes": episodes}),
+        }
+    )
