@@ -242,12 +242,15 @@ def _write_provenance(root: Path, rows: Sequence[Mapping[str, str]]) -> None:
 def _videos_joined_once() -> Iterator[None]:
     """Write each video file of a merge in one go: lerobot rewrites it for each source that it appends."""
     sources: defaultdict[Path, list[Path]] = defaultdict(list)
-
-    def append(paths: Sequence[Path], joined: Path) -> None:
-        sources[joined].append(paths[-1])
+    # Of the files with sources: to add up the sources' again for each that comes would take time with their square.
+    sizes_mb: dict[Path, float] = {}
 
     def size_mb(file: Path) -> float:
-        return float(sum(map(get_file_size_in_mb, (file, *sources.get(file, ())))))
+        return sizes_mb[file] if file in sizes_mb else float(get_file_size_in_mb(file))
+
+    def append(paths: Sequence[Path], joined: Path) -> None:
+        sizes_mb[joined] = size_mb(joined) + size_mb(paths[-1])
+        sources[joined].append(paths[-1])
 
     merging = lerobot.datasets.aggregate
     with _set(merging, "concatenate_video_files", append), _set(merging, "get_file_size_in_mb", size_mb):
