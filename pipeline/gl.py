@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -32,11 +33,13 @@ class GlChoice:
         backend: ``egl`` or ``osmesa``.
         device: the renderer and its driver, as OpenGL names them.
         reason: why this one.
+        asked: whether ``MUJOCO_EGL_DEVICE_ID`` named the device, so that no other may be used.
     """
 
     backend: str
     device: str
     reason: str
+    asked: bool = False
 
     @property
     def software(self) -> bool:
@@ -56,6 +59,7 @@ def choose() -> GlChoice:
         PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does.
     """
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
+    device_asked = "MUJOCO_EGL_DEVICE_ID" in os.environ
     faults = {}
     for backend in BACKENDS:
         if asked not in ("", backend):
@@ -68,7 +72,8 @@ def choose() -> GlChoice:
         os.environ.update(MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
         if index is not None:
             os.environ["MUJOCO_EGL_DEVICE_ID"] = index
-        return GlChoice(backend, device, "MUJOCO_GL asks for it" if asked else _reason(backend, device, faults))
+        reason = "MUJOCO_GL asks for it" if asked else _reason(backend, device, faults)
+        return GlChoice(backend, device, reason, device_asked)
 
     what = "; ".join(f"{backend} fails: {fault}" for backend, fault in faults.items())
     if not asked:
@@ -80,6 +85,29 @@ def choose() -> GlChoice:
         expected=" or ".join(working) or f"{' or '.join(BACKENDS)}, though neither works on this machine",
         remedy="unset MUJOCO_GL" if working else REMEDY,
     )
+
+
+@functools.cache
+def gpus() -> tuple[str, ...]:
+    """EGL's indices of all GPUs like the chosen one, for worker processes to share; none where there is no choice.
+
+    Raises:
+        PipelineError: when nothing renders here, as in ``choose``.
+    """
+    choice = choose()
+    if choice.software or choice.asked or choice.backend != "egl":
+        return ()
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    found = []
+    for index in visible if visible[0].isdigit() else map(str, count()):
+        try:
+            device = _probe("egl", index)
+        except _NoDeviceError:
+            # There is none of that number: EGL counts without gaps.
+            break
+        if device == choice.device:
+            found.append(index)
+    return tuple(found)
 
 
 def prepare() -> GlChoice:

@@ -2,6 +2,7 @@
 
 from rich.console import Console
 
+from pipeline import gl
 from pipeline.config import Config
 from pipeline.publish import preview, sheets
 from pipeline.run import manifest
@@ -14,7 +15,7 @@ def run(config: Config) -> None:
     rows = manifest.read(config.data / "manifest.parquet")
     load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
     drawn = sheets.draw(rows, load, config.data / "sheets")
-    with runner(config.compute, config.data) as workers:
+    with runner(config.compute, config.data, gl.gpus()) as workers:
         previews = preview.for_run(config, config.data / "previews", workers)
     console = Console()
     console.print(manifest.counts_table(rows))

@@ -55,6 +55,20 @@ def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == []
 
 
+def gpu(_: int) -> tuple[int, str | None]:
+    time.sleep(0.1)
+    return os.getpid(), os.environ.get("MUJOCO_EGL_DEVICE_ID")
+
+
+@pytest.mark.slow
+def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(tmp_path: Path) -> None:
+    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, ("0", "2")) as run:
+        assert sorted(index or "" for _, index in set(run(gpu, range(30), "GPUs"))) == ["0", "0", "2"]
+        with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
+            run(die, [1], "deaths")
+        assert {index for _, index in run(gpu, range(30), "GPUs")} <= {"0", "2"}
+
+
 def die(_: int) -> int:
     os._exit(1)
 

@@ -128,6 +128,31 @@ def test_picks_the_egl_device(
     assert os.environ.get("MUJOCO_EGL_DEVICE_ID") == index
 
 
+@pytest.mark.parametrize(
+    ("environment", "renderers", "shared"),
+    [
+        pytest.param({}, {"0": GPU, "1": GPU, "2": CPU}, ("0", "1"), id="all of a kind"),
+        pytest.param({}, {"0": GPU, "1": "NVIDIA T4, 4.6.0", "2": GPU}, ("0", "2"), id="frames come from one kind"),
+        pytest.param({"CUDA_VISIBLE_DEVICES": "2,3"}, dict.fromkeys("0123", GPU), ("2", "3"), id="the job's own"),
+        pytest.param({"MUJOCO_EGL_DEVICE_ID": "1"}, {"0": GPU, "1": GPU}, (), id="the one that is asked for"),
+        pytest.param({}, {"0": CPU}, (), id="software"),
+    ],
+)
+def test_workers_share_the_gpus(
+    monkeypatch: pytest.MonkeyPatch,
+    devices: dict[tuple[str, str | None], str],
+    environment: dict[str, str],
+    renderers: dict[str, str],
+    shared: tuple[str, ...],
+) -> None:
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    devices.update({("egl", number): name for number, name in renderers.items()})
+    devices["egl", None] = renderers["0"]
+    monkeypatch.setattr(gl, "choose", choose)
+    assert gl.gpus.__wrapped__() == shared
+
+
 def test_an_idle_gpu_is_said_aloud(monkeypatch: pytest.MonkeyPatch, devices: dict[tuple[str, str | None], str]) -> None:
     devices["egl", None] = CPU
     monkeypatch.setattr(gl, "has_nvidia_gpu", lambda: True)

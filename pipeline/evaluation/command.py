@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from pipeline import gl
 from pipeline.arguments import positive
 from pipeline.config import ComputeConfig
 from pipeline.run.compute import runner
@@ -140,7 +141,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     )
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
-    with runner(compute, arguments.out) as run:
+    with runner(compute, arguments.out, gl.gpus()) as run:
         found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
     return 0

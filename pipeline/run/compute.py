@@ -89,12 +89,13 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 
 
 @contextmanager
-def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
+def runner(config: ComputeConfig, folder: Path, gpus: Sequence[str] = ()) -> Iterator[Run]:
     """Open what ``config.cluster`` names and yield the function that runs work on it.
 
     Args:
         config: where to run.
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
+        gpus: EGL's indices of those that the worker processes of this machine render with, in turn.
 
     Raises:
         PipelineError: when no scheduler answers, or a worker cannot work for this run.
@@ -124,6 +125,8 @@ def runner(config: ComputeConfig, folder: Path) -> Iterator[Run]:
         os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
         with _local_cluster(workers) as cluster, Client(cluster) as client:
             client.run(_leave_interrupts_to_the_run)
+            if gpus:
+                _share(gpus, client)
             # A worker that dies while it starts is not replaced by Dask alone.
             yield _on(client, refill=partial(cluster.scale, workers))
     elif config.cluster == "slurm":
@@ -169,6 +172,18 @@ def _local_cluster(workers: int) -> Any:
         expected="workers that live: the system may have ended them because memory ran out",
         remedy=f"see the system's log, use fewer workers, and {GO_ON}",
     ) from failure
+
+
+def _share(gpus: Sequence[str], client: Any) -> None:
+    """Give each worker of this machine one of the GPUs, also those that come later."""
+    from distributed import Worker, WorkerPlugin
+
+    class Share(WorkerPlugin):  # type: ignore[misc]
+        def setup(self, worker: Worker) -> None:
+            # Workers of this machine are numbered. MuJoCo looks when it opens its first context.
+            os.environ["MUJOCO_EGL_DEVICE_ID"] = gpus[int(worker.name) % len(gpus)]
+
+    client.register_plugin(Share())
 
 
 def _leave_interrupts_to_the_run() -> None:
