@@ -115,6 +115,8 @@ def runner(config: ComputeConfig, folder: Path, gpus: Sequence[str] = ()) -> Ite
         {
             "distributed.worker.multiprocessing-method": "spawn",
             "distributed.admin.tick.limit": "60s",
+            # The rows of 28,000 episodes, which the checks are sent, have 33 MB.
+            "distributed.admin.large-graph-warning-threshold": "1GB",
             "distributed.scheduler.allowed-failures": TRIES - 1,
             "distributed.deploy.lost-worker-timeout": "5s",
         }
