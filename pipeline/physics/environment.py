@@ -22,7 +22,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.stepping import ControlStep
-from pipeline.scenes.compiled import fixed_pose
+from pipeline.scenes.compiled import fixed_pose, physics_of
 from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Task
 
@@ -77,15 +77,6 @@ def _turn_off_rendering() -> None:
     spec.loader.exec_module(macros)
     macros.MUJOCO_GPU_RENDERING = False  # type: ignore[attr-defined]
     sys.modules[spec.name] = macros
-
-
-def _without_textures(model_xml: str) -> str:
-    """The scene with plain colours for images: nothing is rendered here, and images are half of the compilation."""
-    scene = ET.fromstring(model_xml)
-    for texture in scene.iterfind("asset/texture[@name][@file]"):
-        del texture.attrib["file"]
-        texture.attrib.update(builtin="flat", width="1", height="1")
-    return ET.tostring(scene, encoding="unicode")
 
 
 def _until_placed(reset: Callable[[], Any], task: Task) -> Any:
@@ -177,7 +168,7 @@ class Environment:
         if model_xml != self._scene:
             self._scene = None
             try:
-                env.reset_from_xml_string(_without_textures(model_xml))
+                self._open(model_xml)
             except (ValueError, KeyError, mujoco.FatalError) as error:
                 # What MuJoCo raises when it compiles, and robosuite when a name that it looks up is not in the model.
                 env.deterministic_reset = False
@@ -204,6 +195,19 @@ class Environment:
         robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
         env._post_process()
         self._control_step = ControlStep(env)
+
+    def _open(self, model_xml: str) -> None:
+        """As robosuite's ``reset_from_xml_string``, but a scene that was compiled lately is not compiled again."""
+        from robosuite.utils.binding_utils import MjSim
+
+        env, model = self._env.env, physics_of(model_xml)
+        env.close()
+        env.deterministic_reset = True
+        env.sim = MjSim(model)
+        env.sim.forward()
+        env.initialize_time(env.control_freq)
+        env.reset()
+        env.deterministic_reset = False
 
     def _check_names(self) -> None:
         """What is looked up by name later, besides what LIBERO's own reset has looked up already."""
