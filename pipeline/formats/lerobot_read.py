@@ -10,12 +10,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av
 import datasets
+import lerobot.datasets.video_utils
 import numpy as np
 import pyarrow.parquet as pq
+import torchvision
 from datasets.exceptions import DatasetsError
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -23,7 +26,7 @@ from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import INSTANCES, OBJECT_POSES, camera_column, geometry_columns
-from pipeline.formats.lerobot_write import local_only
+from pipeline.formats.lerobot_write import local_only, temporarily
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.types import Extra, Geometry
 
@@ -40,6 +43,7 @@ UNREADABLE = (
 )
 """What lerobot raises on files that are damaged, missing or do not belong together."""
 
+VECTORS = ("action", "state", "joint_state")
 MARKS = ("frame_index", "timestamp")
 """LeRobot's columns that tell steps apart."""
 
@@ -94,7 +98,7 @@ def read(root: Path, cache: Path, episode_id: str, extras: tuple[Extra, ...]) ->
     Raises:
         PipelineError: when it cannot be read.
     """
-    with _readable(root):
+    with _readable(root), temporarily(lerobot.datasets.video_utils, "torchvision", _TORCHVISION):
         opened = _open(root, cache)
         return _copy(opened, episode_id, extras) if episode_id in opened.provenance else None
 
@@ -124,17 +128,50 @@ def _opened(root: Path, cache: Path, modified_ns: int) -> LeRobotSet:
     return LeRobotSet(data, {row["episode_id"]: row for row in rows})
 
 
+class _KeptOpen:
+    """A video file that stays open when lerobot closes it: it opens the file anew for each frame that it decodes, which
+    takes 14 times as long as the frame where the file has 200 MB."""
+
+    def __init__(self, file: Any):
+        self._file = file
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+    def close(self) -> None:
+        pass
+
+
+def _video(path: str, stream: str) -> torchvision.io.VideoReader:
+    return _opened_video(path, stream, Path(path).stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def _opened_video(path: str, stream: str, modified_ns: int) -> torchvision.io.VideoReader:
+    reader = torchvision.io.VideoReader(path, stream)
+    reader.container = _KeptOpen(reader.container)
+    return reader
+
+
+_TORCHVISION = SimpleNamespace(io=SimpleNamespace(VideoReader=_video), set_video_backend=torchvision.set_video_backend)
+"""What lerobot uses of torchvision to decode."""
+
+
+@lru_cache(maxsize=1)
+def _steps(data: LeRobotDataset, extras: tuple[Extra, ...]) -> datasets.Dataset:
+    """The rows of all steps, without the images where they are not videos."""
+    vectors = [getattr(SCHEMA, name).lerobot_key for name in VECTORS]
+    plain = [*vectors, "episode_index", "task_index", *MARKS, *geometry_columns(extras)]
+    return data.hf_dataset.select_columns(plain).with_format("numpy")
+
+
 def _copy(opened: LeRobotSet, episode_id: str, extras: tuple[Extra, ...]) -> Copy:
     data = opened.data
     provenance = opened.provenance[episode_id]
     index = provenance["episode_index"]
     rows = data.meta.episodes[index]
     start, stop = rows["dataset_from_index"], rows["dataset_to_index"]
-    vectors = {"action": SCHEMA.action, "state": SCHEMA.state, "joint_state": SCHEMA.joint_state}
-    # Without the images of every step, where they are not videos.
-    plain = [*(spec.lerobot_key for spec in vectors.values()), "episode_index", "task_index", *MARKS]
-    plain += geometry_columns(extras)
-    table = data.hf_dataset.select_columns(plain).with_format("numpy")[start:stop]
+    table = _steps(data, extras)[start:stop]
     if set(table["episode_index"].tolist()) != {index} or len(table["action"]) != rows["length"]:
         raise ValueError(f"rows {start} to {stop} are not the {rows['length']} steps of episode {index}")
     frames = {}
@@ -146,7 +183,7 @@ def _copy(opened: LeRobotSet, episode_id: str, extras: tuple[Extra, ...]) -> Cop
             frames[view, step] = np.ascontiguousarray(pixels, np.uint8)
     return Copy(
         dataset="lerobot",
-        motion={name: table[spec.lerobot_key] for name, spec in vectors.items()},
+        motion={name: table[getattr(SCHEMA, name).lerobot_key] for name in VECTORS},
         instructions=[str(data.meta.tasks.iloc[task].name) for task in table["task_index"].tolist()],
         provenance=provenance,
         frames=frames,

@@ -117,7 +117,7 @@ def merge(parts: Sequence[Path], root: Path, cache: Path, *, repo_id: str) -> No
     """
     with (
         local_only(cache),
-        _set(lerobot.datasets.aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_MB),
+        temporarily(lerobot.datasets.aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_MB),
         _videos_joined_once(),
     ):
         aggregate_datasets(
@@ -183,7 +183,10 @@ def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
     described = partial(_episode_statistics, frames=ours)
     saving = lerobot.datasets.lerobot_dataset
     # The columns hold whole files already; lerobot would go through all rows of each episode to look for paths.
-    with _set(saving, "compute_episode_stats", described), _set(saving, "embed_images", lambda columns: columns):
+    with (
+        temporarily(saving, "compute_episode_stats", described),
+        temporarily(saving, "embed_images", lambda columns: columns),
+    ):
         dataset.save_episode(columns)
     return counts
 
@@ -253,7 +256,7 @@ def _videos_joined_once() -> Iterator[None]:
         sources[joined].append(paths[-1])
 
     merging = lerobot.datasets.aggregate
-    with _set(merging, "concatenate_video_files", append), _set(merging, "get_file_size_in_mb", size_mb):
+    with temporarily(merging, "concatenate_video_files", append), temporarily(merging, "get_file_size_in_mb", size_mb):
         yield
     for joined, rest in sources.items():
         concatenate_video_files([joined, *rest], joined)
@@ -263,17 +266,17 @@ def _videos_joined_once() -> Iterator[None]:
 def local_only(cache: Path) -> Iterator[None]:
     """Keep the copies that ``datasets`` makes of what lerobot reads out of the home folder, and lerobot off the hub."""
     with (
-        _set(datasets.config, "HF_DATASETS_CACHE", cache),
-        _set(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
+        temporarily(datasets.config, "HF_DATASETS_CACHE", cache),
+        temporarily(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
         # lerobot would turn the bars of ``datasets`` on after each file that it reads.
-        _set(lerobot.utils.utils, "enable_progress_bar", datasets.disable_progress_bars),
+        temporarily(lerobot.utils.utils, "enable_progress_bar", datasets.disable_progress_bars),
     ):
         datasets.disable_progress_bars()
         yield
 
 
 @contextmanager
-def _set(owner: object, name: str, value: object) -> Iterator[None]:
+def temporarily(owner: object, name: str, value: object) -> Iterator[None]:
     """Give an attribute another value for a while: where a library has no argument for it."""
     saved = getattr(owner, name)
     setattr(owner, name, value)
