@@ -89,7 +89,8 @@ def choose() -> GlChoice:
 
 @functools.cache
 def gpus() -> tuple[str, ...]:
-    """EGL's indices of all GPUs like the chosen one, for worker processes to share; none where there is no choice.
+    """EGL's indices of all GPUs like the chosen one, for worker processes to share; none where there is no choice, or
+    where ``CUDA_VISIBLE_DEVICES`` names them otherwise than by numbers.
 
     Raises:
         PipelineError: when nothing renders here, as in ``choose``.
@@ -97,9 +98,11 @@ def gpus() -> tuple[str, ...]:
     choice = choose()
     if choice.software or choice.asked or choice.backend != "egl":
         return ()
-    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    if visible and not visible[0].isdigit():
+        return ()
     found = []
-    for index in visible if visible[0].isdigit() else map(str, count()):
+    for index in visible.split(",") if visible else map(str, count()):
         try:
             device = _probe("egl", index)
         except _NoDeviceError:
