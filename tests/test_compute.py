@@ -62,7 +62,7 @@ def gpu(_: int) -> tuple[int, str | None]:
 
 @pytest.mark.slow
 def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(tmp_path: Path) -> None:
-    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, ("0", "2")) as run:
+    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, lambda: ("0", "2")) as run:
         assert sorted(index or "" for _, index in set(run(gpu, range(30), "GPUs"))) == ["0", "0", "2"]
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
             run(die, [1], "deaths")

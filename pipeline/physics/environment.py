@@ -171,7 +171,6 @@ class Environment:
                 self._open(model_xml)
             except (ValueError, KeyError, mujoco.FatalError) as error:
                 # What MuJoCo raises when it compiles, and robosuite when a name that it looks up is not in the model.
-                env.deterministic_reset = False
                 raise UnusableSceneError(
                     "scene_refused", f"the scene is refused ({error!s:.300})", self.task
                 ) from error
@@ -180,9 +179,7 @@ class Environment:
         else:
             # The part of the model that LIBERO changes while it steps: the site that shows a lit burner.
             env.sim.model.site_rgba[:] = self._site_rgba
-            env.deterministic_reset = True
-            env.reset()
-            env.deterministic_reset = False
+            self._reset_in_place()
         # The gripper model survives the reset with its last command, which the next command is added to.
         env.robots[0].gripper.current_action = np.zeros(env.robots[0].gripper.dof)
         env.sim.reset()
@@ -202,12 +199,19 @@ class Environment:
 
         env, model = self._env.env, physics_of(model_xml)
         env.close()
-        env.deterministic_reset = True
         env.sim = MjSim(model)
         env.sim.forward()
         env.initialize_time(env.control_freq)
-        env.reset()
-        env.deterministic_reset = False
+        self._reset_in_place()
+
+    def _reset_in_place(self) -> None:
+        """LIBERO's reset of the scene that is there, which otherwise would draw one anew."""
+        env = self._env.env
+        env.deterministic_reset = True
+        try:
+            env.reset()
+        finally:
+            env.deterministic_reset = False
 
     def _check_names(self) -> None:
         """What is looked up by name later, besides what LIBERO's own reset has looked up already."""

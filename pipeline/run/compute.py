@@ -89,13 +89,14 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 
 
 @contextmanager
-def runner(config: ComputeConfig, folder: Path, gpus: Sequence[str] = ()) -> Iterator[Run]:
+def runner(config: ComputeConfig, folder: Path, gpus: Callable[[], Sequence[str]] = tuple) -> Iterator[Run]:
     """Open what ``config.cluster`` names and yield the function that runs work on it.
 
     Args:
         config: where to run.
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
-        gpus: EGL's indices of those that the worker processes of this machine render with, in turn.
+        gpus: gives EGL's indices of those that worker processes of this machine render with, in turn; asked for local
+            workers only.
 
     Raises:
         PipelineError: when no scheduler answers, or a worker cannot work for this run.
@@ -127,8 +128,8 @@ def runner(config: ComputeConfig, folder: Path, gpus: Sequence[str] = ()) -> Ite
         os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
         with _local_cluster(workers) as cluster, Client(cluster) as client:
             client.run(_leave_interrupts_to_the_run)
-            if gpus:
-                _share(gpus, client)
+            if found := gpus():
+                _share(found, client)
             # A worker that dies while it starts is not replaced by Dask alone.
             yield _on(client, refill=partial(cluster.scale, workers))
     elif config.cluster == "slurm":
