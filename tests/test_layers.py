@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import arenas
 import mujoco
@@ -63,9 +64,9 @@ def drawn(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     counts: list[int] = []
     draw = renderer._draw_geoms
 
-    def counted(geoms: NDArray[np.bool_], reflections: bool, camera: str, sites: bool = True) -> None:
+    def counted(geoms: NDArray[np.bool_], *how: Any, **more: Any) -> None:
         counts.append(int(geoms[-BODIES:].sum()))
-        draw(geoms, reflections, camera, sites)
+        draw(geoms, *how, **more)
 
     monkeypatch.setattr(renderer, "_draw_geoms", counted)
     return counts

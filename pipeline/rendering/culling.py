@@ -29,7 +29,7 @@ class Part(NamedTuple):
         geoms: (ngeom,) which geoms.
         boxes: (N,) which of the model's boxes (``Boxes``): of large geoms, the pieces.
         reflections: whether one of them reflects.
-        layer: whether it can be drawn by itself and then be laid over the other layers, as each sample of it is at its
+        layer: whether what is opaque in it can be drawn by itself and laid over the other layers, each sample at its
             depth. Else it takes the place of what the parts before it show there.
         rows, columns: of the picture, the first row at the top.
     """
@@ -71,8 +71,7 @@ class Culling:
         to date.
 
         The first part is all of the picture. Where a box reflects, a further part is the rectangle around it, for which
-        mirror images are drawn too; in the first part nothing reflects. Where the first part is a layer, a geom that
-        can be seen through has a part too and is not in the first: it is drawn after what is behind it.
+        mirror images are drawn too; in the first part nothing reflects.
         """
         model, boxes = self._model, self.boxes
         whole = slice(0, self._height), slice(0, self._width)
@@ -94,13 +93,9 @@ class Culling:
             for mirror, box in zip(seen_mirrors, mirror_boxes[seen[mirror_boxes]], strict=True)
         ]
         images = [self._mirrored(data, corners_m, mirror) for mirror in seen_mirrors]
-        clear = self._see_through()
-        clear_seen = np.unique(boxes.geom[clear & seen]) if self._layers else ()
-        windows = [view.rectangle(corners_m[boxes.geom == geom].reshape(-1, 3)) or whole for geom in clear_seen]
-        layers = self._layers and whole not in (*windows, *rectangles) and not self._sites_see_through()
-        parts = [] if whole in rectangles else [self._part(seen & ~(clear & layers), False, layers, *whole)]
-        for rectangle in windows if layers else []:
-            parts.append(self._part(unbounded | view.shows(corners_m, *rectangle), False, False, *rectangle))
+        clear = self.see_through()[boxes.geom]
+        layers = self._layers and whole not in rectangles and not self._sites_see_through()
+        parts = [] if whole in rectangles else [self._part(seen, False, layers, *whole)]
         for rectangle in [whole] if whole in rectangles else rectangles:
             reflected = unbounded.copy()
             # MuJoCo has the first of them reflect: without it, that would be another.
@@ -108,16 +103,16 @@ class Culling:
             for mirrored, image_m in images:
                 reflected |= mirrored & view.shows(image_m, *rectangle)
             before = view.shows(corners_m, *rectangle)
-            layer = layers and not (clear & (reflected | before)).any()
+            layer = layers and not (clear & reflected).any()
             parts.append(self._part(reflected if layer else reflected | before, True, layer, *rectangle))
         return parts
 
-    def _see_through(self) -> NDArray[np.bool_]:
-        """(N,) boxes of geoms that may show what is behind them: by their own colour, or by their material's."""
+    def see_through(self) -> NDArray[np.bool_]:
+        """(ngeom,) which geoms may show what is behind them: by their own colour, or by their material's."""
         model, materials = self._model, self._model.geom_matid
         opacity = np.minimum(model.geom_rgba[:, 3], np.append(model.mat_rgba[:, 3], 1)[materials])
         shown = ~np.isin(model.geom_group, self._hidden_groups)
-        return np.asarray((shown & (opacity < 1))[self.boxes.geom])
+        return np.asarray(shown & (opacity < 1))
 
     def _sites_see_through(self) -> bool:
         opacity = self._model.site_rgba[:, 3]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mujoco
+import numpy as np
 
 from pipeline import gl
 
@@ -40,7 +41,9 @@ class Layer:
 
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
         opengl = gl.calls()
-        self._buffer, self._height, self._width = context.offFBO, height, width
+        self._context, self._buffer, self._height, self._width = context, context.offFBO, height, width
+        self._list: int = opengl.glGenLists(1)
+        self._rectangle: tuple[slice, slice] | None = None
         self._textures = [
             self._texture(context.offColor, context.offSamples),
             self._texture(context.offDepthStencil, context.offSamples),
@@ -68,16 +71,30 @@ class Layer:
         opengl.glPopAttrib()
         self.content = content
 
-    def put(self, rows: slice, columns: slice) -> None:
-        """Draw what was kept into a rectangle of the off-screen buffer, where nothing nearer is drawn.
+    def put(self, scene: mujoco.MjvScene, rows: slice, columns: slice) -> None:
+        """Have what was kept drawn into a rectangle of a picture of a scene, where nothing nearer is drawn.
 
-        What is at the same depth is drawn over: a mirror by the same mirror with its images.
+        To MuJoCo it is one more mesh, drawn after all that is opaque and before what can be seen through. What is at
+        the same depth is drawn over: a mirror by the same mirror with its images.
 
         Args:
             rows, columns: of the picture, the first row at the top.
         """
+        if self._rectangle != (rows, columns):
+            opengl = gl.calls()
+            opengl.glNewList(self._list, opengl.GL_COMPILE)
+            self._draw(rows, columns)
+            opengl.glEndList()
+            self._rectangle = rows, columns
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(
+            geom, mujoco.mjtGeom.mjGEOM_MESH, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.ones(4, np.float32)
+        )
+        geom.dataid = self._list - self._context.baseMesh
+        scene.ngeom += 1
+
+    def _draw(self, rows: slice, columns: slice) -> None:
         opengl = gl.calls()
-        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
         opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)
         for setting in (
             opengl.GL_ALPHA_TEST,

@@ -133,45 +133,51 @@ class Renderer:
         frame[::-1][part.rows, part.columns] = drawn[::-1][part.rows, part.columns]
 
     def _draw_layers(self, parts: list[Part], camera: str) -> None:
-        """Draw a picture of layers: what no texture that is chosen is on, what is, and what is reflected."""
+        """Draw a picture of layers: what no chosen texture is on, or what stands still, and what is reflected."""
         first, *mirrors = parts
         view, places = self._view(camera), self._places()
-
-        def content(part: Part) -> bytes:
-            return b"".join([view, part.geoms.tobytes(), places[part.geoms].tobytes(), self._sites()])
 
         def draw_mirror(mirror: Part) -> None:
             self._pieces.show(mirror.boxes)
             self._draw_geoms(mirror.geoms, True, camera)
 
-        layers = [
-            (self._layer(camera, f"mirror {number}", content(part) + self._paint, partial(draw_mirror, part)), part)
-            for number, part in enumerate(mirrors)
-        ]
-        painted = first.geoms & self._painted
-        if painted.any():
-            rest = first._replace(geoms=first.geoms & ~painted)
-            draw = partial(self._draw_first, rest, camera, view, places)
-            layers.insert(0, (self._layer(camera, "not painted", content(rest), draw), first))
-            self._pieces.show(first.boxes)
-            self._draw_geoms(painted, False, camera, sites=False)
-        else:
-            self._draw_first(first, camera, view + self._paint, places)
-        for layer, part in layers:
-            layer.put(part.rows, part.columns)
-
-    def _draw_first(self, part: Part, camera: str, view: bytes, places: NDArray[np.float32]) -> None:
-        """Draw a part in which nothing reflects: what stands still is a layer."""
-        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, part.geoms)
         layers = []
+        for number, part in enumerate(mirrors):
+            content = view + part.geoms.tobytes() + places[part.geoms].tobytes() + self._sites() + self._paint
+            layers.append((self._layer(camera, f"mirror {number}", content, partial(draw_mirror, part)), part))
+        # What can be seen through is no layer: it is drawn last, and shows the layers.
+        clear = first.geoms & self._culling.see_through()
+        opaque = first.geoms & ~clear
+        painted = opaque & self._painted
+        if not painted.any():
+            self._draw_beside_still(first, opaque, clear, layers, camera, view + self._paint, places)
+            return
+        rest = opaque & ~painted
+        draw = partial(self._draw_beside_still, first, rest, np.zeros_like(rest), [], camera, view, places, sites=False)
+        content = view + rest.tobytes() + places[rest].tobytes()
+        layers.insert(0, (self._layer(camera, "not painted", content, draw), first))
+        self._pieces.show(first.boxes)
+        self._draw_geoms(painted | clear, False, camera, layers)
+
+    def _draw_beside_still(
+        self,
+        part: Part,
+        opaque: NDArray[np.bool_],
+        clear: NDArray[np.bool_],
+        layers: list[tuple[Layer, Part]],
+        camera: str,
+        view: bytes,
+        places: NDArray[np.float32],
+        sites: bool = True,
+    ) -> None:
+        """Draw geoms of a part in which nothing reflects, with layers; what is opaque and stands still is one more."""
+        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, opaque)
         self._pieces.show(part.boxes)
         if still.any():
             content = b"".join([view, still.tobytes(), places[still].tobytes()])
             draw = partial(self._draw_geoms, still, False, camera, sites=False)
-            layers.append(self._layer(camera, "still", content, draw))
-        self._draw_geoms(part.geoms & ~still, False, camera)
-        for layer in layers:
-            layer.put(part.rows, part.columns)
+            layers = [(self._layer(camera, "still", content, draw), part), *layers]
+        self._draw_geoms(opaque & ~still | clear, False, camera, layers, sites)
 
     def _layer(self, camera: str, name: str, content: bytes, draw: Callable[[], None]) -> Layer:
         """A layer of a camera's pictures; it is drawn if its content is not what it was."""
@@ -184,8 +190,15 @@ class Renderer:
             layer.keep(content)
         return layer
 
-    def _draw_geoms(self, geoms: NDArray[np.bool_], reflections: bool, camera: str, sites: bool = True) -> None:
-        """Draw geoms (ngeom,), and the sites, into the emptied off-screen buffer."""
+    def _draw_geoms(
+        self,
+        geoms: NDArray[np.bool_],
+        reflections: bool,
+        camera: str,
+        layers: Sequence[tuple[Layer, Part]] = (),
+        sites: bool = True,
+    ) -> None:
+        """Draw geoms (ngeom,), layers in their parts' rectangles, and the sites, into the emptied off-screen buffer."""
         groups = self.model.geom_group.copy()
         site_groups = self._option.sitegroup.copy()
         try:
@@ -193,6 +206,8 @@ class Renderer:
             self._option.sitegroup *= sites
             self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
             self._renderer.update_scene(self.data, camera, self._option)
+            for layer, part in layers:
+                layer.put(self._renderer.scene, part.rows, part.columns)
             mujoco.mjr_render(self._renderer._rect, self._renderer.scene, self._renderer._mjr_context)
         finally:
             self.model.geom_group[:] = groups
