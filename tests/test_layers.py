@@ -16,6 +16,7 @@ from test_culling import plain
 from pipeline import seeding
 from pipeline.axes.background import BackgroundAxis
 from pipeline.episode_schema import SCHEMA
+from pipeline.rendering.culling import Part
 from pipeline.rendering.renderer import Renderer
 
 BODIES = 12
@@ -62,13 +63,13 @@ def renderer() -> Iterator[Renderer]:
 def drawn(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many bodies' geoms each call to OpenGL had to draw."""
     counts: list[int] = []
-    draw = renderer._draw_geoms
+    draw = renderer._draw
 
-    def counted(geoms: NDArray[np.bool_], *how: Any, **more: Any) -> None:
+    def counted(part: Part, geoms: NDArray[np.bool_], *how: Any, **more: Any) -> None:
         counts.append(int(geoms[-BODIES:].sum()))
-        draw(geoms, *how, **more)
+        draw(part, geoms, *how, **more)
 
-    monkeypatch.setattr(renderer, "_draw_geoms", counted)
+    monkeypatch.setattr(renderer, "_draw", counted)
     return counts
 
 

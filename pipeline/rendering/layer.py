@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import mujoco
-import numpy as np
 
 from pipeline import gl
+from pipeline.rendering import display_list
 
 VERTICES = "#version 400 compatibility\nvoid main() { gl_Position = gl_Vertex; }"
 
@@ -42,7 +42,7 @@ class Layer:
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
         opengl = gl.calls()
         self._context, self._buffer, self._height, self._width = context, context.offFBO, height, width
-        self._list: int = opengl.glGenLists(1)
+        self._list = display_list.new()
         self._rectangle: tuple[slice, slice] | None = None
         self._textures = [
             self._texture(context.offColor, context.offSamples),
@@ -81,17 +81,10 @@ class Layer:
             rows, columns: of the picture, the first row at the top.
         """
         if self._rectangle != (rows, columns):
-            opengl = gl.calls()
-            opengl.glNewList(self._list, opengl.GL_COMPILE)
-            self._draw(rows, columns)
-            opengl.glEndList()
+            with display_list.recorded(self._list):
+                self._draw(rows, columns)
             self._rectangle = rows, columns
-        geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(
-            geom, mujoco.mjtGeom.mjGEOM_MESH, np.zeros(3), np.zeros(3), np.eye(3).ravel(), np.ones(4, np.float32)
-        )
-        geom.dataid = self._list - self._context.baseMesh
-        scene.ngeom += 1
+        display_list.add(self._list, scene, self._context)
 
     def _draw(self, rows: slice, columns: slice) -> None:
         opengl = gl.calls()

@@ -1,13 +1,13 @@
 """Large meshes in pieces, so that what lies outside of a picture is not even handed to OpenGL.
 
 MuJoCo's context has a display list for each mesh. Here each large mesh gets one more for every piece of it, and its own
-list is written anew to call those that can be seen. A piece is a run of the mesh's faces in their order, so everything
-is drawn in MuJoCo's order.
+list calls those that can be seen. A piece is a run of the mesh's faces in their order, so everything is drawn in
+MuJoCo's order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Hashable, Sequence
 from itertools import product
 from typing import NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline import gl
+from pipeline.rendering import display_list
 from pipeline.types import Floats
 
 PIECE_FACES = 1024
@@ -77,44 +78,87 @@ def _corners(bounds: Floats) -> Floats:
 
 
 class MeshPieces:
-    """The display lists of a model's large meshes in a context of MuJoCo, which must be the current one.
+    """The display lists of a model's meshes in a context of MuJoCo, which must be the current one.
+
+    The list that MuJoCo calls for a mesh calls another one: the mesh's own in a set of lists that begins at OpenGL's
+    list base. So one call of ``mjr_render`` can draw other pieces in each of its passes. The last mesh of every pass is
+    one of ours (:meth:`show`), and sets the list base for the next.
 
     Args:
         boxes: of the model.
     """
 
     def __init__(self, model: mujoco.MjModel, context: mujoco.MjrContext, boxes: Boxes):
-        self._base = context.baseMesh
-        meshes = model.geom_dataid[boxes.geom]
-        counts = {int(mesh): int(boxes.piece[meshes == mesh].max()) + 1 for mesh in meshes[boxes.piece > 0]}
-        self._boxes = {mesh: np.flatnonzero(meshes == mesh) for mesh in counts}
-        self._piece = boxes.piece
-        self._whole = {mesh: _upload(model, context, mesh, 0, model.mesh_facenum[mesh]) for mesh in counts}
-        self._lists = {
-            mesh: np.array(
-                [_upload(model, context, mesh, piece * PIECE_FACES, PIECE_FACES) for piece in range(count)], np.uint32
-            )
-            for mesh, count in counts.items()
-        }
-        self._shown: dict[int, bytes] = {}
+        self._context = context
+        meshes = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)[boxes.geom]
+        self._boxes = np.flatnonzero(meshes >= 0)
+        drawn, self._mesh = np.unique(meshes[self._boxes], return_inverse=True)
+        self._piece = boxes.piece[self._boxes]
+        counts = [int(self._piece[self._mesh == number].max()) + 1 for number in range(len(drawn))]
+        self._whole = [_upload(model, context, mesh, 0, model.mesh_facenum[mesh]) for mesh in drawn.tolist()]
+        self._pieces = [
+            [_upload(model, context, mesh, piece * PIECE_FACES, PIECE_FACES) for piece in range(count)]
+            if count > 1
+            else [whole]
+            for mesh, count, whole in zip(drawn.tolist(), counts, self._whole, strict=True)
+        ]
+        for number, mesh in enumerate(drawn.tolist()):
+            with display_list.recorded(context.baseMesh + 2 * mesh):
+                _call_from_base(number)
+        self._turn = display_list.new()
+        with display_list.recorded(self._turn):
+            _call_from_base(len(drawn))
+        self._passes: dict[Hashable, list[_Lists]] = {}
 
-    def show(self, seen: NDArray[np.bool_]) -> None:
-        """Have the pieces drawn of which a box is seen, of the geoms that are drawn.
+    def show(self, name: Hashable, passes: Sequence[NDArray[np.bool_]], scene: mujoco.MjvScene) -> None:
+        """Have the pieces drawn of which a box is wanted, of the geoms that are in a scene.
 
         Args:
-            seen: (N,) which of the boxes.
+            name: of what is drawn, for which most lists stay as they were the last time.
+            passes: (N,) which of the boxes each pass of ``mjr_render`` draws; those after the last draw the same.
+            scene: of all that is drawn; it gets one more mesh, the last.
         """
-        opengl = gl.calls()
-        for mesh, boxes in self._boxes.items():
-            lists = self._lists[mesh]
-            pieces = np.zeros(len(lists), np.bool_)
-            pieces[self._piece[boxes[seen[boxes]]]] = True
-            called = lists[pieces] if pieces.mean() <= MOST_PARTS else np.array([self._whole[mesh]], np.uint32)
-            if self._shown.get(mesh) != called.tobytes():
-                opengl.glNewList(self._base + 2 * mesh, opengl.GL_COMPILE)
-                opengl.glCallLists(called)
-                opengl.glEndList()
-                self._shown[mesh] = called.tobytes()
+        made = self._passes.setdefault(name, [])
+        while len(made) < len(passes):
+            made.append(_Lists(len(self._whole)))
+        for number, (lists, wanted) in enumerate(zip(made, passes, strict=False)):
+            self._write(lists, wanted)
+            then = made[number + 1] if number + 1 < len(passes) else lists
+            if lists.then != then.base:
+                with display_list.recorded(lists.base + len(self._whole)):
+                    gl.calls().glListBase(then.base)
+                lists.then = then.base
+        gl.calls().glListBase(made[0].base)
+        display_list.add(self._turn, scene, self._context, mujoco.mjtCatBit.mjCAT_DYNAMIC)
+
+    def _write(self, lists: _Lists, seen: NDArray[np.bool_]) -> None:
+        shown = seen[self._boxes]
+        for mesh in np.unique(self._mesh[shown != lists.shown]).tolist():
+            pieces = np.unique(self._piece[shown & (self._mesh == mesh)]).tolist()
+            most = len(pieces) > MOST_PARTS * len(self._pieces[mesh])
+            with display_list.recorded(lists.base + mesh):
+                for number in [self._whole[mesh]] if most else [self._pieces[mesh][piece] for piece in pieces]:
+                    gl.calls().glCallList(number)
+        lists.shown = shown
+
+
+class _Lists:
+    """A display list for each mesh and one more, which follow each other.
+
+    Attributes:
+        base: number of the first.
+        then: base of the lists that the last one turns to.
+        shown: of the boxes of meshes, those whose pieces the lists draw.
+    """
+
+    def __init__(self, meshes: int):
+        self.base = display_list.new(meshes + 1)
+        self.then = 0
+        self.shown: NDArray[np.bool_] = np.zeros(1, np.bool_)
+
+
+def _call_from_base(number: int) -> None:
+    gl.calls().glCallLists(np.array([number], np.uint32))
 
 
 def _upload(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, first: int, faces: int) -> int:
@@ -122,7 +166,7 @@ def _upload(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, first:
     start, count, graph = (int(field[mesh]) for field in (model.mesh_faceadr, model.mesh_facenum, model.mesh_graphadr))
     base = context.baseMesh
     # A list for the faces, and one for the convex hull, which is drawn for collision geometry.
-    number: int = gl.calls().glGenLists(2)
+    number = display_list.new(2)
     try:
         model.mesh_faceadr[mesh], model.mesh_facenum[mesh] = start + first, min(faces, count - first)
         model.mesh_graphadr[mesh] = -1

@@ -120,8 +120,7 @@ class Renderer:
             self._read(frame, layers[0])
         for part in parts:
             if not part.layer:
-                self._pieces.show(part.boxes)
-                self._draw_geoms(part.geoms, part.reflections, camera)
+                self._draw(part, part.geoms, camera)
                 self._read(frame, part)
         return frame
 
@@ -134,17 +133,13 @@ class Renderer:
 
     def _draw_layers(self, parts: list[Part], camera: str) -> None:
         """Draw a picture of layers: what no chosen texture is on, or what stands still, and what is reflected."""
-        first, *mirrors = parts
+        first, *mirror = parts
         view, places = self._view(camera), self._places()
-
-        def draw_mirror(mirror: Part) -> None:
-            self._pieces.show(mirror.boxes)
-            self._draw_geoms(mirror.geoms, True, camera)
-
         layers = []
-        for number, part in enumerate(mirrors):
+        for part in mirror:
             content = view + part.geoms.tobytes() + places[part.geoms].tobytes() + self._sites() + self._paint
-            layers.append((self._layer(camera, f"mirror {number}", content, partial(draw_mirror, part)), part))
+            draw = partial(self._draw, part, part.geoms, camera)
+            layers.append((self._layer(camera, part.name, content, draw), part))
         # What can be seen through is no layer: it is drawn last, and shows the layers.
         clear = first.geoms & self._culling.see_through()
         opaque = first.geoms & ~clear
@@ -156,8 +151,7 @@ class Renderer:
         draw = partial(self._draw_beside_still, first, rest, np.zeros_like(rest), [], camera, view, places, sites=False)
         content = view + rest.tobytes() + places[rest].tobytes()
         layers.insert(0, (self._layer(camera, "not painted", content, draw), first))
-        self._pieces.show(first.boxes)
-        self._draw_geoms(painted | clear, False, camera, layers)
+        self._draw(first, painted | clear, camera, layers)
 
     def _draw_beside_still(
         self,
@@ -172,12 +166,11 @@ class Renderer:
     ) -> None:
         """Draw geoms of a part in which nothing reflects, with layers; what is opaque and stands still is one more."""
         still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, opaque)
-        self._pieces.show(part.boxes)
         if still.any():
             content = b"".join([view, still.tobytes(), places[still].tobytes()])
-            draw = partial(self._draw_geoms, still, False, camera, sites=False)
+            draw = partial(self._draw, part, still, camera, sites=False)
             layers = [(self._layer(camera, "still", content, draw), part), *layers]
-        self._draw_geoms(opaque & ~still | clear, False, camera, layers, sites)
+        self._draw(part, opaque & ~still | clear, camera, layers, sites)
 
     def _layer(self, camera: str, name: str, content: bytes, draw: Callable[[], None]) -> Layer:
         """A layer of a camera's pictures; it is drawn if its content is not what it was."""
@@ -190,25 +183,27 @@ class Renderer:
             layer.keep(content)
         return layer
 
-    def _draw_geoms(
+    def _draw(
         self,
+        part: Part,
         geoms: NDArray[np.bool_],
-        reflections: bool,
         camera: str,
         layers: Sequence[tuple[Layer, Part]] = (),
         sites: bool = True,
     ) -> None:
-        """Draw geoms (ngeom,), layers in their parts' rectangles, and the sites, into the emptied off-screen buffer."""
+        """Draw some geoms (ngeom,) of a part, layers in their parts' rectangles, and the sites, and nothing else."""
         groups = self.model.geom_group.copy()
         site_groups = self._option.sitegroup.copy()
         try:
             self.model.geom_group[:] = np.where(geoms, groups, _CULLED)
             self._option.sitegroup *= sites
-            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
+            scene = self._renderer.scene
+            scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = part.reflections
             self._renderer.update_scene(self.data, camera, self._option)
-            for layer, part in layers:
-                layer.put(self._renderer.scene, part.rows, part.columns)
-            mujoco.mjr_render(self._renderer._rect, self._renderer.scene, self._renderer._mjr_context)
+            for layer, of in layers:
+                layer.put(scene, of.rows, of.columns)
+            self._pieces.show((camera, part.name), part.passes, scene)
+            mujoco.mjr_render(self._renderer._rect, scene, self._renderer._mjr_context)
         finally:
             self.model.geom_group[:] = groups
             self._option.sitegroup[:] = site_groups
@@ -242,9 +237,10 @@ class Renderer:
         """What each pixel of :meth:`frame` shows of the restored state."""
         self._renderer.enable_segmentation_rendering()
         self._renderer._gl_context.make_current()
-        self._pieces.show(self._culling.everything().boxes)
+        everything = self._culling.everything()
         try:
             self._renderer.update_scene(self.data, camera, self._option)
+            self._pieces.show(everything.name, everything.passes, self._renderer.scene)
             number, kind = np.moveaxis(self._renderer.render()[::-1], -1, 0)
         finally:
             self._renderer.disable_segmentation_rendering()

@@ -1,0 +1,48 @@
+"""Display lists of OpenGL, and how MuJoCo is made to call them; its context must be the current one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mujoco
+import numpy as np
+
+from pipeline import gl
+
+
+def new(count: int = 1) -> int:
+    """The first number of so many new lists, which do nothing yet."""
+    number: int = gl.calls().glGenLists(count)
+    return number
+
+
+@contextmanager
+def recorded(number: int) -> Iterator[None]:
+    """Have a list do, whenever it is called, what OpenGL is asked to do meanwhile."""
+    gl.calls().glNewList(number, gl.calls().GL_COMPILE)
+    try:
+        yield
+    finally:
+        gl.calls().glEndList()
+
+
+def add(
+    number: int,
+    scene: mujoco.MjvScene,
+    context: mujoco.MjrContext,
+    category: mujoco.mjtCatBit = mujoco.mjtCatBit.mjCAT_DECOR,
+) -> None:
+    """Have a list called by MuJoCo as if it were one more mesh of a scene, after all others that are opaque.
+
+    Args:
+        number: of the list.
+        category: what MuJoCo takes the mesh for; the default casts no shadow, so the list is not called for that.
+    """
+    geom = scene.geoms[scene.ngeom]
+    white, nowhere, straight = np.ones(4, np.float32), np.zeros(3), np.eye(3).ravel()
+    mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_MESH, nowhere, nowhere, straight, white)
+    geom.category, geom.dataid = category, number - context.baseMesh
+    # What mjv_initGeom leaves as it was: nothing to write beside it, and nothing to show of it in a segmentation.
+    geom.label, geom.segid = "", -1
+    scene.ngeom += 1
