@@ -59,6 +59,7 @@ class Layer:
 
     def keep(self, content: bytes) -> None:
         """Copy what is drawn in the off-screen buffer."""
+        # Of less than all, OpenGL here does not copy each sample by itself.
         opengl, rectangle = gl.calls(), (0, 0, self._width, self._height)
         opengl.glPushAttrib(opengl.GL_SCISSOR_BIT)
         opengl.glDisable(opengl.GL_SCISSOR_TEST)

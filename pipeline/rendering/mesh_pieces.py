@@ -44,14 +44,12 @@ class Boxes(NamedTuple):
 
 
 def boxes_of(model: mujoco.MjModel, hidden_groups: Collection[int]) -> Boxes:
-    """The boxes of a model's geoms; those of ``hidden_groups``, which are not drawn, have one each."""
-    shown = (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH) & ~np.isin(model.geom_group, list(hidden_groups))
+    """The boxes of a model's geoms; those of ``hidden_groups``, which are not drawn, have none."""
     corners: list[Floats] = []
     numbers: list[tuple[int, int]] = []
-    for geom in range(model.ngeom):
-        bounds = (
-            _piece_bounds(model, model.geom_dataid[geom]) if shown[geom] else model.geom_aabb[geom].reshape(1, 2, 3)
-        )
+    for geom in np.flatnonzero(~np.isin(model.geom_group, list(hidden_groups))).tolist():
+        mesh = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
+        bounds = _piece_bounds(model, model.geom_dataid[geom]) if mesh else model.geom_aabb[geom].reshape(1, 2, 3)
         corners.append(_corners(bounds))
         numbers += [(geom, piece) for piece in range(len(bounds))]
     geoms, pieces = np.array(numbers, np.intp).reshape(-1, 2).T

@@ -139,7 +139,7 @@ class Renderer:
         for part in mirror:
             content = view + part.geoms.tobytes() + places[part.geoms].tobytes() + self._sites() + self._paint
             draw = partial(self._draw, part, part.geoms, camera)
-            layers.append((self._layer(camera, part.name, content, draw), part))
+            layers.append(self._layer(camera, part.name, part, content, draw))
         # What can be seen through is no layer: it is drawn last, and shows the layers.
         clear = first.geoms & self._culling.see_through()
         opaque = first.geoms & ~clear
@@ -150,7 +150,7 @@ class Renderer:
         rest = opaque & ~painted
         draw = partial(self._draw_beside_still, first, rest, np.zeros_like(rest), [], camera, view, places, sites=False)
         content = view + rest.tobytes() + places[rest].tobytes()
-        layers.insert(0, (self._layer(camera, "not painted", content, draw), first))
+        layers.insert(0, self._layer(camera, "not painted", first, content, draw))
         self._draw(first, painted | clear, camera, layers)
 
     def _draw_beside_still(
@@ -169,19 +169,26 @@ class Renderer:
         if still.any():
             content = b"".join([view, still.tobytes(), places[still].tobytes()])
             draw = partial(self._draw, part, still, camera, sites=False)
-            layers = [(self._layer(camera, "still", content, draw), part), *layers]
+            layers = [self._layer(camera, "still", part, content, draw), *layers]
         self._draw(part, opaque & ~still | clear, camera, layers, sites)
 
-    def _layer(self, camera: str, name: str, content: bytes, draw: Callable[[], None]) -> Layer:
-        """A layer of a camera's pictures; it is drawn if its content is not what it was."""
+    def _layer(
+        self, camera: str, name: str, part: Part, content: bytes, draw: Callable[[], None]
+    ) -> tuple[Layer, Part]:
+        """A layer of a camera's pictures, for a part of them; it is drawn if its content is not what it was."""
         if (camera, name) not in self._layers:
             context, height, width = self._renderer._mjr_context, self._renderer.height, self._renderer.width
             self._layers[camera, name] = Layer(context, height, width)
-        layer = self._layers[camera, name]
+        layer, flags = self._layers[camera, name], self._renderer.scene.flags
         if layer.content != content:
-            draw()
+            # The sky is behind all layers.
+            sky, flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = flags[mujoco.mjtRndFlag.mjRND_SKYBOX], False
+            try:
+                draw()
+            finally:
+                flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
             layer.keep(content)
-        return layer
+        return layer, part
 
     def _draw(
         self,
