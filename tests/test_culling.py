@@ -97,3 +97,32 @@ def test_the_same_pixels_in_every_arena(arena: str) -> None:
         assert min(left_out) > 30, "pieces of meshes that are in the picture, or that the last lamp lights"
     finally:
         opened.close()
+
+
+BEHIND = """
+    <mujoco>
+      <asset><mesh name="stone" vertex="0 0 0  0.1 0 0  0 0.1 0  0 0 0.1  0.08 0.08 0.08"/></asset>
+      <worldbody>
+        <light pos="0.5 0 3" dir="0 0 -1" castshadow="false"/>
+        <geom type="box" size="0.3 0.4 0.02" group="1" rgba="0.6 0.4 0.2 1" euler="5 10 20"/>
+        <body mocap="true"><geom type="mesh" mesh="stone" group="1" rgba="0.2 0.8 0.3 1"/></body>
+        <camera name="eye" pos="0.1 -0.2 1" euler="10 5 0"/>
+      </worldbody>
+    </mujoco>"""
+
+
+def test_what_is_behind_a_table_is_not_drawn() -> None:
+    rng = seeding.rng("test_culling", "behind")
+    renderer = Renderer(BEHIND)
+    drawn = []
+    try:
+        for _ in range(60):
+            renderer.data.mocap_pos[0] = rng.uniform((-0.4, -0.5, -0.5), (0.4, 0.5, -0.25))
+            mujoco.mj_forward(renderer.model, renderer.data)
+            (part,) = renderer._culling.parts(renderer.data, "eye")
+            drawn.append(bool(part.geoms[1]))
+            assert np.array_equal(renderer.frame("eye"), plain(renderer, "eye"))
+            assert drawn[-1] or not (renderer.geoms("eye") == 1).any()
+    finally:
+        renderer.close()
+    assert 10 < sum(drawn) < 50

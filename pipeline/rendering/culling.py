@@ -22,6 +22,9 @@ EDGE_PX = 3
 """How much wider than a reflecting box its rectangle is, for the smoothing of edges."""
 
 
+LEAST_SCREEN_M = 0.1
+"""Half the width of the boxes that are looked behind, and more of their length."""
+
 WIDEST_CONE_DEG = 80.0
 """Half the opening angle of lamps' cones up to which it is worked out what is in them."""
 
@@ -68,6 +71,9 @@ class Culling:
         self.boxes = boxes_of(model, hidden_groups)
         # A plane has no bound: it is drawn wherever it is.
         self._planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        self._of_mesh = (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)[self.boxes.geom]
+        boxlike = self._shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
+        self._screens = np.flatnonzero(boxlike & (np.sort(model.geom_size, axis=1)[:, 1] > LEAST_SCREEN_M))
         flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
         self._flat = np.flatnonzero(flat & (model.geom_matid >= 0))
 
@@ -94,6 +100,8 @@ class Culling:
         turns = data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
         corners_m = data.geom_xpos[boxes.geom, None] + boxes.corners_m @ turns[boxes.geom]
         seen = self._planes[boxes.geom] | view.shows(corners_m, *whole)
+        near = np.flatnonzero(seen & self._of_mesh)
+        seen[near] = ~self._hidden(data, view, corners_m[near])
         none, clear = np.zeros_like(seen), self.see_through()[boxes.geom]
         lit = [reached & seen for reached in self._lit(data, corners_m)]
         # A shadow may come from outside of the picture, and out of a lamp's cone onto a triangle that reaches into it.
@@ -122,6 +130,30 @@ class Culling:
             return [first, self._part("mirror", images, [images, none], True, True, *rectangle)]
         before = view.shows(corners_m, *rectangle) | clear
         return [first, self._part("mirror", images | before, [images | clear, before], True, False, *rectangle)]
+
+    def _hidden(self, data: mujoco.MjData, view: _View, corners_m: Floats) -> NDArray[np.bool_]:
+        """(K,) whether all that is in a box of ``corners_m`` (K, 8, 3) is behind one large box, such as a table's top.
+
+        What a convex body hides is convex: it has all of a box where it has its corners.
+        """
+        hidden = np.zeros(len(corners_m), np.bool_)
+        for screen in self._screens[~self.see_through()[self._screens]]:
+            axes, half_m = data.geom_xmat[screen].reshape(3, 3), self._model.geom_size[screen] - MARGIN_M
+            eye_m = (view.position_m - data.geom_xpos[screen]) @ axes
+            thin = int(half_m.argmin())
+            beyond_m = (corners_m - data.geom_xpos[screen]) @ axes[:, thin] * np.sign(eye_m[thin])
+            behind = np.flatnonzero((beyond_m < half_m[thin]).all(axis=1))
+            if not len(behind):
+                continue
+            ways_m = (corners_m[behind] - data.geom_xpos[screen]) @ axes - eye_m
+            # Where each line of sight, 0 at the eye and 1 at the corner, is between two opposite faces.
+            with np.errstate(divide="ignore", invalid="ignore"):
+                crossed = np.stack([(-half_m - eye_m) / ways_m, (half_m - eye_m) / ways_m])
+            enters, leaves = crossed.min(axis=0).max(axis=-1), crossed.max(axis=0).min(axis=-1)
+            # What is nearer than the near plane is not drawn, and hides nothing.
+            drawn = enters * view.depths(corners_m[behind]) > view.near_m
+            hidden[behind] |= ((enters < leaves) & (enters < 1) & drawn).all(axis=1)
+        return hidden
 
     def _lit(self, data: mujoco.MjData, corners_m: Floats) -> list[NDArray[np.bool_]]:
         """For each lamp with shadows, in MuJoCo's order, (N,) which boxes its light may reach: all but those out of its
@@ -210,9 +242,16 @@ class _View:
         number = model.camera(camera).id
         self._model, self._height, self._width = model, height, width
         self.position_m, self._axes = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
+        # Some way behind the plane before which nothing is drawn.
+        self.near_m = 1.1 * model.vis.map.znear * model.stat.extent
         half_tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
         # Pixels for each metre to the side at a metre of depth.
         self._scale_px = height / 2 / half_tangent
+
+    def depths(self, corners_m: Floats) -> Floats:
+        """(...) of ``corners_m`` (..., 3), along the axis that the camera looks along."""
+        depths_m: Floats = -(corners_m - self.position_m) @ self._axes[:, 2]
+        return depths_m
 
     def shows(self, corners_m: Floats, rows: slice, columns: slice) -> NDArray[np.bool_]:
         """(N,) whether boxes with ``corners_m`` (N, 8, 3) may be in what a rectangle shows."""
