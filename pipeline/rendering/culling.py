@@ -1,8 +1,9 @@
 """What a picture cannot show and need not draw: the same pixels for less work.
 
-MuJoCo draws every geom of a scene whether it is in the picture or not, and all of them once more where a box or a plane
-reflects. In LIBERO's wrist view most of the robot, which has more than half of a scene's triangles, is behind the
-camera; what reflects is a plate of the stove, around which little is to be seen.
+MuJoCo draws every geom of a scene whether it is in the picture or not, all of them once more where a box or a plane
+reflects, and for each lamp with shadows. In LIBERO's wrist view most of the robot, which has more than half of the
+triangles, is behind the camera, and its pedestal below the table; what reflects is a plate of the stove, around which
+little is to be seen; of the lamps, one lights no object.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ from pipeline.types import Floats
 
 EDGE_PX = 3
 """How much wider than a reflecting box its rectangle is, for the smoothing of edges."""
-
 
 LEAST_SCREEN_M = 0.1
 """Half the width of the boxes that are looked behind, and more of their length."""
@@ -72,8 +72,10 @@ class Culling:
         # A plane has no bound: it is drawn wherever it is.
         self._planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         self._of_mesh = (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)[self.boxes.geom]
-        boxlike = self._shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX)
-        self._screens = np.flatnonzero(boxlike & (np.sort(model.geom_size, axis=1)[:, 1] > LEAST_SCREEN_M))
+        # What moves is left out, as layers are kept while what they show stands still.
+        fixed = ((model.body_weldid == 0) & (model.body_mocapid[model.body_rootid] < 0))[model.geom_bodyid]
+        wide = (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX) & (np.sort(model.geom_size)[:, 1] > LEAST_SCREEN_M)
+        self._screens = np.flatnonzero(self._shown & fixed & wide)
         flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
         self._flat = np.flatnonzero(flat & (model.geom_matid >= 0))
 
