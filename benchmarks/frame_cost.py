@@ -79,7 +79,7 @@ def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool) ->
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             ours, seconds = timed()
             ours_s += seconds
-            with patch.object(Culling, "parts", lambda culling, *_: [culling.everything()]):
+            with patch.object(Culling, "picture", lambda culling, *_: culling.everything()):
                 plain, seconds = timed()
             plain_s += seconds
             same += np.array_equal(ours, plain)

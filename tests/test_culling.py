@@ -53,27 +53,26 @@ def renderer(request: pytest.FixtureRequest) -> Iterator[Renderer]:
 def plain(renderer: Renderer, camera: str) -> Frame:
     """A frame for which everything is drawn."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Culling, "parts", lambda culling, *_: [culling.everything()])
+        patch.setattr(Culling, "picture", lambda culling, *_: culling.everything())
         return renderer.frame(camera)
 
 
 def test_the_same_pixels_with_less_drawn(renderer: Renderer) -> None:
     rng = seeding.rng("test_culling", "eyes")
-    left_out, reflecting_parts = 0, []
+    left_out, reflecting = 0, []
     for _ in range(40):
         quat_wxyz = rng.normal(size=4)
         renderer.data.mocap_quat[0] = quat_wxyz / np.linalg.norm(quat_wxyz)
         mujoco.mj_forward(renderer.model, renderer.data)
-        parts = renderer._culling.parts(renderer.data, "eye")
-        left_out += int((~parts[0].geoms).sum())
-        reflecting_parts.append(len(parts) - 1 if not parts[0].reflections else -1)
+        picture = renderer._culling.picture(renderer.data, "eye")
+        left_out += int((~picture.opaque).sum())
+        reflecting.append(bool(picture.mirror.any()))
         assert np.array_equal(renderer.frame("eye"), plain(renderer, "eye"))
+    assert set(reflecting) == {False, True}
     if renderer.model.light_castshadow.any():
         assert left_out == 0, "what is not in the picture may cast a shadow into it"
-        assert set(reflecting_parts) == {-1, 0}, "all in one part"
     else:
         assert left_out > 40 * GEOMS / 2
-        assert {0, 1} <= set(reflecting_parts), "no reflection, and one for which a rectangle is drawn"
 
 
 @pytest.mark.slow
@@ -89,8 +88,9 @@ def test_the_same_pixels_in_every_arena(arena: str) -> None:
             opened.model.light_castshadow[:] = number % 2
             mujoco.mj_forward(opened.model, opened.data)
             assert np.array_equal(opened.frame(camera), plain(opened, camera)), camera
-            for part in opened._culling.parts(opened.data, camera):
-                left_out[number % 2] += int((part.geoms[boxes.geom] & ~part.passes[-1]).sum())
+            picture = opened._culling.picture(opened.data, camera)
+            needed = picture.shadows[-1] if picture.shadows else picture.seen
+            left_out[number % 2] += int((picture.opaque[boxes.geom] & ~needed).sum())
             shown = opened.geoms(camera)
             opened.frame(camera)
             assert np.array_equal(opened.geoms(camera), shown), "which pieces a frame was drawn of does not matter"
@@ -119,8 +119,7 @@ def test_what_is_behind_a_table_is_not_drawn() -> None:
         for _ in range(60):
             renderer.data.mocap_pos[0] = rng.uniform((-0.4, -0.5, -0.5), (0.4, 0.5, -0.25))
             mujoco.mj_forward(renderer.model, renderer.data)
-            (part,) = renderer._culling.parts(renderer.data, "eye")
-            drawn.append(bool(part.geoms[1]))
+            drawn.append(bool(renderer._culling.picture(renderer.data, "eye").opaque[1]))
             assert np.array_equal(renderer.frame("eye"), plain(renderer, "eye"))
             assert drawn[-1] or not (renderer.geoms("eye") == 1).any()
     finally:

@@ -9,7 +9,7 @@ little is to be seen; of the lamps, one lights no object.
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import mujoco
@@ -18,9 +18,6 @@ from numpy.typing import NDArray
 
 from pipeline.rendering.mesh_pieces import MARGIN_M, boxes_of
 from pipeline.types import Floats
-
-EDGE_PX = 3
-"""How much wider than a reflecting box its rectangle is, for the smoothing of edges."""
 
 LEAST_SCREEN_M = 0.1
 """Half the width of the boxes that are looked behind, and more of their length."""
@@ -32,28 +29,25 @@ SQUARE = np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])
 """Corners of a box's upper z face, which is what reflects (``mjr_render``), in units of its half sizes."""
 
 
-class Part(NamedTuple):
-    """A rectangle of a picture, and what has to be drawn for it.
+class Picture(NamedTuple):
+    """What has to be drawn for a picture; of meshes, which of the model's boxes (``Boxes``), and so which pieces.
 
     Attributes:
-        name: tells it from the other parts of a picture.
-        geoms: (ngeom,) which geoms.
-        passes: (N,) which of the model's boxes (``Boxes``), for meshes in pieces, each pass of ``mjr_render`` needs:
-            where something reflects, the mirror images; what is before the camera; for each lamp with shadows, what
-            casts them and what it lights. Those after the last need the same.
-        reflections: whether one of the geoms reflects.
-        layer: whether what is opaque in it can be drawn by itself and laid over the other layers, each sample at its
-            depth. Else it takes the place of what the parts before it show there.
-        rows, columns: of the picture, the first row at the top.
+        opaque, clear: (ngeom,) which geoms; ``clear`` may show what is behind them.
+        mirror: (ngeom,) the opaque one that reflects, if there is one.
+        seen: (N,) which boxes are before the camera.
+        images: (N,) which show in the mirror.
+        shadows: (N,) for each lamp with shadows, which boxes cast them, and which are seen and lit.
+        layers: whether it can be put together of layers, of what is opaque and does not reflect.
     """
 
-    name: str
-    geoms: NDArray[np.bool_]
-    passes: tuple[NDArray[np.bool_], ...]
-    reflections: bool
-    layer: bool
-    rows: slice
-    columns: slice
+    opaque: NDArray[np.bool_]
+    clear: NDArray[np.bool_]
+    mirror: NDArray[np.bool_]
+    seen: NDArray[np.bool_]
+    images: NDArray[np.bool_]
+    shadows: tuple[NDArray[np.bool_], ...]
+    layers: bool
 
 
 class Culling:
@@ -85,53 +79,54 @@ class Culling:
         other._model = model
         return other
 
-    def parts(self, data: mujoco.MjData, camera: str) -> list[Part]:
-        """What a picture of the data's state is made of, in the order in which it is put together; positions must be up
-        to date.
-
-        The first part is all of the picture. Where a box reflects, a second part is the rectangle around it, for which
-        mirror images are drawn too; in the first part nothing reflects. With shadows there is one part.
-        """
-        model, boxes = self._model, self.boxes
-        whole = slice(0, self._height), slice(0, self._width)
-        view = _View(model, data, camera, self._height, self._width)
+    def picture(self, data: mujoco.MjData, camera: str) -> Picture:
+        """What has to be drawn of the data's state; positions must be up to date."""
+        view = _View(self._model, data, camera, self._height, self._width)
         try:
             mirror = self._mirror(data, view)
         except ValueError:
-            return [self.everything()]
+            return self.everything()
+        of = self.boxes.geom
         turns = data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
-        corners_m = data.geom_xpos[boxes.geom, None] + boxes.corners_m @ turns[boxes.geom]
-        seen = self._planes[boxes.geom] | view.shows(corners_m, *whole)
+        corners_m = data.geom_xpos[of, None] + self.boxes.corners_m @ turns[of]
+        seen = self._planes[of] | view.shows(corners_m)
         near = np.flatnonzero(seen & self._of_mesh)
         seen[near] = ~self._hidden(data, view, corners_m[near])
-        none, clear = np.zeros_like(seen), self.see_through()[boxes.geom]
-        lit = [reached & seen for reached in self._lit(data, corners_m)]
+        clear = self.see_through()
+        # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
+        lit = [reached & seen | clear[of] for reached in self._lit(data, corners_m)]
         # A shadow may come from outside of the picture, and out of a lamp's cone onto a triangle that reaches into it.
-        drawn = seen | bool(lit)
-        # What can be seen through is drawn last, with the pieces that are drawn then, and so are its mirror images.
-        shadows = [wanted for shown in lit for wanted in (np.full_like(seen, shown.any()), shown | clear)]
-        layers = self._layers and not lit and not self._sites_see_through()
-        # What reflects is no mesh, and so has one box.
-        box = None if mirror is None else np.searchsorted(boxes.geom, mirror)
-        if mirror is None or not seen[box]:
-            return [self._part("all", drawn, [seen, *shadows], False, layers, *whole)]
+        shadows = [wanted for shown in lit for wanted in (np.full_like(seen, shown.any()), shown)]
+        images = np.zeros_like(seen)
+        if mirror is not None and seen[np.searchsorted(of, mirror)]:
+            images = self._images(data, view, corners_m, mirror)
+        return Picture(
+            opaque=self._geoms(seen | bool(lit)) & ~clear,
+            clear=clear & self._geoms(seen | images | bool(lit)),
+            mirror=(np.arange(self._model.ngeom) == mirror) & images.any(),
+            seen=seen,
+            images=images,
+            shadows=tuple(shadows),
+            layers=self._layers and not lit and not self._sites_see_through(),
+        )
+
+    def _geoms(self, boxes: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(ngeom,) whose boxes (N,) are."""
+        geoms = np.zeros(self._model.ngeom, np.bool_)
+        geoms[self.boxes.geom[boxes]] = True
+        return geoms
+
+    def _images(self, data: mujoco.MjData, view: _View, corners_m: Floats, mirror: int) -> NDArray[np.bool_]:
+        """(N,) which boxes show in a mirror."""
         heights_m = self._heights(data, mirror, corners_m)
         image_m = corners_m - 2 * heights_m[..., None] * self._normal(data, mirror)
-        rectangle, imaged = whole, (heights_m > 0).any(axis=1) & view.shows(image_m, *whole)
+        images: NDArray[np.bool_] = (heights_m > 0).any(axis=1) & view.shows(image_m)
         if not self._planes[mirror]:
-            face_m = data.geom_xpos[mirror] + SQUARE * model.geom_size[mirror] @ data.geom_xmat[mirror].reshape(3, 3).T
-            rectangle = view.rectangle(face_m) or whole
-            imaged &= view.shows_through(image_m, face_m)
-        images = imaged | self._planes[boxes.geom]
-        images[box] = True
-        if lit or rectangle == whole:
-            passes = [images | clear, seen | clear, *shadows]
-            return [self._part("all", drawn | images | clear, passes, True, False, *whole)]
-        first = self._part("all", seen, [seen], False, layers, *whole)
-        if layers and not (clear & images).any():
-            return [first, self._part("mirror", images, [images, none], True, True, *rectangle)]
-        before = view.shows(corners_m, *rectangle) | clear
-        return [first, self._part("mirror", images | before, [images | clear, before], True, False, *rectangle)]
+            corners = SQUARE * self._model.geom_size[mirror]
+            images &= view.shows_through(
+                image_m, data.geom_xpos[mirror] + corners @ data.geom_xmat[mirror].reshape(3, 3).T
+            )
+        return np.asarray(images | self._planes[self.boxes.geom])
 
     def _hidden(self, data: mujoco.MjData, view: _View, corners_m: Floats) -> NDArray[np.bool_]:
         """(K,) whether all that is in a box of ``corners_m`` (K, 8, 3) is behind one large box, such as a table's top.
@@ -217,24 +212,12 @@ class Culling:
         opacity = self._model.site_rgba[:, 3]
         return bool(((opacity > 0) & (opacity < 1)).any())
 
-    def everything(self) -> Part:
-        """All of a picture, with all that there is."""
-        whole, every = (slice(0, self._height), slice(0, self._width)), np.ones(len(self.boxes.geom), np.bool_)
-        return self._part("everything", every, [every], True, False, *whole)
-
-    def _part(
-        self,
-        name: str,
-        drawn: NDArray[np.bool_],
-        passes: Sequence[NDArray[np.bool_]],
-        reflections: bool,
-        layer: bool,
-        rows: slice,
-        columns: slice,
-    ) -> Part:
-        geoms = np.zeros(self._model.ngeom, np.bool_)
-        geoms[self.boxes.geom[drawn]] = True
-        return Part(name, geoms, tuple(passes), reflections, layer, rows, columns)
+    def everything(self) -> Picture:
+        """All that there is, in every pass."""
+        every, clear = np.ones(len(self.boxes.geom), np.bool_), self.see_through()
+        reflecting = self._shown & False
+        reflecting[self._flat] = True
+        return Picture(self._shown & ~clear, clear, reflecting, every, every, (), False)
 
 
 class _View:
@@ -242,30 +225,26 @@ class _View:
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, camera: str, height: int, width: int):
         number = model.camera(camera).id
-        self._model, self._height, self._width = model, height, width
         self.position_m, self._axes = data.cam_xpos[number], data.cam_xmat[number].reshape(3, 3)
         # Some way behind the plane before which nothing is drawn.
         self.near_m = 1.1 * model.vis.map.znear * model.stat.extent
-        half_tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
-        # Pixels for each metre to the side at a metre of depth.
-        self._scale_px = height / 2 / half_tangent
+        tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
+        # Of half the angles of view, to the side and up.
+        self._tangents = tangent * width / height, tangent
 
     def depths(self, corners_m: Floats) -> Floats:
         """(...) of ``corners_m`` (..., 3), along the axis that the camera looks along."""
         depths_m: Floats = -(corners_m - self.position_m) @ self._axes[:, 2]
         return depths_m
 
-    def shows(self, corners_m: Floats, rows: slice, columns: slice) -> NDArray[np.bool_]:
-        """(N,) whether boxes with ``corners_m`` (N, 8, 3) may be in what a rectangle shows."""
+    def shows(self, corners_m: Floats) -> NDArray[np.bool_]:
+        """(N,) whether boxes with ``corners_m`` (N, 8, 3) may be in the picture."""
         right, up, back = np.moveaxis((corners_m - self.position_m) @ self._axes, -1, 0)
         inside = np.ones(len(corners_m), np.bool_)
-        for off_axis, low_px, high_px in (
-            (right, columns.start - self._width / 2, columns.stop - self._width / 2),
-            (up, self._height / 2 - rows.stop, self._height / 2 - rows.start),
-        ):
+        for off_axis, tangent in ((right, self._tangents[0]), (up, self._tangents[1])):
             # A box is outside when all of it is beyond one side; the sides pass through the camera.
-            inside &= ~(off_axis + high_px / self._scale_px * back > 0).all(axis=1)
-            inside &= ~(off_axis + low_px / self._scale_px * back < 0).all(axis=1)
+            inside &= ~(off_axis + tangent * back > 0).all(axis=1)
+            inside &= ~(off_axis - tangent * back < 0).all(axis=1)
         return inside
 
     def shows_through(self, corners_m: Floats, opening_m: Floats) -> NDArray[np.bool_]:
@@ -275,18 +254,3 @@ class _View:
         # Of each side, towards the middle of the opening.
         sides *= np.sign(sides @ rays_m.sum(axis=0))[:, None]
         return np.asarray(~((corners_m - self.position_m) @ sides.T < 0).all(axis=1).any(axis=1))
-
-    def rectangle(self, corners_m: Floats) -> tuple[slice, slice] | None:
-        """Rows and columns around ``corners_m`` (N, 3) of boxes, some pixels wider; None when it reaches behind the
-        camera."""
-        right, up, back = ((corners_m - self.position_m) @ self._axes).T
-        if (back >= -MARGIN_M).any():
-            return None
-        rows = self._height / 2 + up / back * self._scale_px
-        columns = self._width / 2 - right / back * self._scale_px
-        return _around(rows, self._height), _around(columns, self._width)
-
-
-def _around(places_px: Floats, size_px: int) -> slice:
-    low, high = np.clip((np.floor(places_px.min()) - EDGE_PX, np.ceil(places_px.max()) + EDGE_PX), 0, size_px)
-    return slice(int(low), int(high))

@@ -26,6 +26,8 @@ class Layer:
     """Colour and depth of every sample of a picture; MuJoCo's OpenGL context must be the current one.
 
     Attributes:
+        number: of the display list that draws it into the off-screen buffer, where nothing nearer is drawn; what is at
+            the same depth is drawn over. MuJoCo calls it after all that is opaque (``MeshPieces``).
         content: tells what was kept from anything else; empty at first.
 
     Args:
@@ -41,9 +43,7 @@ class Layer:
 
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
         opengl = gl.calls()
-        self._context, self._buffer, self._height, self._width = context, context.offFBO, height, width
-        self._list = display_list.new()
-        self._rectangle: tuple[slice, slice] | None = None
+        self._buffer, self._height, self._width = context.offFBO, height, width
         self._textures = [
             self._texture(context.offColor, context.offSamples),
             self._texture(context.offDepthStencil, context.offSamples),
@@ -55,6 +55,9 @@ class Layer:
             opengl.glFramebufferTexture2D(opengl.GL_FRAMEBUFFER, place, opengl.GL_TEXTURE_2D_MULTISAMPLE, texture, 0)
         opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
         self._program = self._shaders()
+        self.number = display_list.new()
+        with display_list.recorded(self.number):
+            self._draw()
         self.content = b""
 
     def keep(self, content: bytes) -> None:
@@ -72,22 +75,7 @@ class Layer:
         opengl.glPopAttrib()
         self.content = content
 
-    def put(self, scene: mujoco.MjvScene, rows: slice, columns: slice) -> None:
-        """Have what was kept drawn into a rectangle of a picture of a scene, where nothing nearer is drawn.
-
-        To MuJoCo it is one more mesh, drawn after all that is opaque and before what can be seen through. What is at
-        the same depth is drawn over: a mirror by the same mirror with its images.
-
-        Args:
-            rows, columns: of the picture, the first row at the top.
-        """
-        if self._rectangle != (rows, columns):
-            with display_list.recorded(self._list):
-                self._draw(rows, columns)
-            self._rectangle = rows, columns
-        display_list.add(self._list, scene, self._context)
-
-    def _draw(self, rows: slice, columns: slice) -> None:
+    def _draw(self) -> None:
         opengl = gl.calls()
         opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)
         for setting in (
@@ -105,8 +93,6 @@ class Layer:
         opengl.glColorMask(True, True, True, True)
         opengl.glPolygonMode(opengl.GL_FRONT_AND_BACK, opengl.GL_FILL)
         opengl.glViewport(0, 0, self._width, self._height)
-        opengl.glEnable(opengl.GL_SCISSOR_TEST)
-        opengl.glScissor(columns.start, self._height - rows.stop, columns.stop - columns.start, rows.stop - rows.start)
         for unit, texture in enumerate(self._textures):
             opengl.glActiveTexture(opengl.GL_TEXTURE0 + unit)
             opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, texture)

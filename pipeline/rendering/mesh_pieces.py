@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pipeline import gl
 from pipeline.rendering import display_list
+from pipeline.rendering.layer import Layer
 from pipeline.types import Floats
 
 PIECE_FACES = 1024
@@ -80,7 +81,7 @@ class MeshPieces:
 
     The list that MuJoCo calls for a mesh calls another one: the mesh's own in a set of lists that begins at OpenGL's
     list base. So one call of ``mjr_render`` can draw other pieces in each of its passes. The last mesh of every pass is
-    one of ours (:meth:`show`), and sets the list base for the next.
+    one of ours (:meth:`show`): it puts layers, and sets the list base for the next pass.
 
     Args:
         boxes: of the model.
@@ -108,24 +109,31 @@ class MeshPieces:
             _call_from_base(len(drawn))
         self._passes: dict[Hashable, list[_Lists]] = {}
 
-    def show(self, name: Hashable, passes: Sequence[NDArray[np.bool_]], scene: mujoco.MjvScene) -> None:
+    def show(
+        self, name: Hashable, passes: Sequence[NDArray[np.bool_]], scene: mujoco.MjvScene, layers: Sequence[Layer] = ()
+    ) -> None:
         """Have the pieces drawn of which a box is wanted, of the geoms that are in a scene.
 
         Args:
             name: of what is drawn, for which most lists stay as they were the last time.
             passes: (N,) which of the boxes each pass of ``mjr_render`` draws; those after the last draw the same.
             scene: of all that is drawn; it gets one more mesh, the last.
+            layers: put in the last of ``passes``.
         """
         made = self._passes.setdefault(name, [])
         while len(made) < len(passes):
             made.append(_Lists(len(self._whole)))
         for number, (lists, wanted) in enumerate(zip(made, passes, strict=False)):
             self._write(lists, wanted)
-            then = made[number + 1] if number + 1 < len(passes) else lists
-            if lists.then != then.base:
+            last = number + 1 == len(passes)
+            then = lists if last else made[number + 1]
+            end = then.base, *(layer.number for layer in layers if last)
+            if lists.end != end:
                 with display_list.recorded(lists.base + len(self._whole)):
+                    for layer in end[1:]:
+                        gl.calls().glCallList(layer)
                     gl.calls().glListBase(then.base)
-                lists.then = then.base
+                lists.end = end
         gl.calls().glListBase(made[0].base)
         display_list.add(self._turn, scene, self._context, mujoco.mjtCatBit.mjCAT_DYNAMIC)
 
@@ -145,13 +153,13 @@ class _Lists:
 
     Attributes:
         base: number of the first.
-        then: base of the lists that the last one turns to.
+        end: what the last one does: the base that it sets, and the lists that it calls before.
         shown: of the boxes of meshes, those whose pieces the lists draw.
     """
 
     def __init__(self, meshes: int):
         self.base = display_list.new(meshes + 1)
-        self.then = 0
+        self.end: tuple[int, ...] = ()
         self.shown: NDArray[np.bool_] = np.zeros(1, np.bool_)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pipeline import gl
 from pipeline.axes import RenderPerturbation
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.culling import Culling, Part
+from pipeline.rendering.culling import Culling, Picture
 from pipeline.rendering.layer import Layer
 from pipeline.rendering.mesh_pieces import MeshPieces
 from pipeline.rendering.still import Still
@@ -112,70 +112,47 @@ class Renderer:
     def frame(self, camera: str) -> Frame:
         """(H, W, 3) uint8 RGB of the restored state in the orientation of LIBERO's raw observations."""
         self._renderer._gl_context.make_current()
-        frame = np.empty((*SCHEMA.frame.shape,), np.uint8)
-        parts = self._culling.parts(self.data, camera)
-        layers = [part for part in parts if part.layer]
-        if layers:
-            self._draw_layers(layers, camera)
-            self._read(frame, layers[0])
-        for part in parts:
-            if not part.layer:
-                self._draw(part, part.geoms, camera)
-                self._read(frame, part)
+        picture = self._culling.picture(self.data, camera)
+        if picture.layers:
+            self._draw_layers(picture, camera)
+        else:
+            self._draw(picture, picture.opaque, camera)
+        frame = np.empty(SCHEMA.frame.shape, np.uint8)
+        mujoco.mjr_readPixels(frame, None, self._renderer._rect, self._renderer._mjr_context)
         return frame
 
-    def _read(self, frame: Frame, part: Part) -> None:
-        """Copy a part's rectangle of what is drawn into a frame."""
-        drawn = np.empty_like(frame)
-        mujoco.mjr_readPixels(drawn, None, self._renderer._rect, self._renderer._mjr_context)
-        # Both have the lowest row first.
-        frame[::-1][part.rows, part.columns] = drawn[::-1][part.rows, part.columns]
-
-    def _draw_layers(self, parts: list[Part], camera: str) -> None:
-        """Draw a picture of layers: what no chosen texture is on, or what stands still, and what is reflected."""
-        first, *mirror = parts
+    def _draw_layers(self, picture: Picture, camera: str) -> None:
+        """Draw a picture with a layer of what no chosen texture is on, or of what stands still."""
         view, places = self._view(camera), self._places()
-        layers = []
-        for part in mirror:
-            content = view + part.geoms.tobytes() + places[part.geoms].tobytes() + self._sites() + self._paint
-            draw = partial(self._draw, part, part.geoms, camera)
-            layers.append(self._layer(camera, part.name, part, content, draw))
-        # What can be seen through is no layer: it is drawn last, and shows the layers.
-        clear = first.geoms & self._culling.see_through()
-        opaque = first.geoms & ~clear
+        opaque = picture.opaque & ~picture.mirror
         painted = opaque & self._painted
-        if not painted.any():
-            self._draw_beside_still(first, opaque, clear, layers, camera, view + self._paint, places)
-            return
-        rest = opaque & ~painted
-        draw = partial(self._draw_beside_still, first, rest, np.zeros_like(rest), [], camera, view, places, sites=False)
-        content = view + rest.tobytes() + places[rest].tobytes()
-        layers.insert(0, self._layer(camera, "not painted", first, content, draw))
-        self._draw(first, painted | clear, camera, layers)
+        if painted.any():
+            rest = opaque & ~painted
+            content = view + rest.tobytes() + places[rest].tobytes()
+            draw = partial(self._draw_beside_still, picture, rest, camera, view, places, last=False)
+            self._draw(picture, painted, camera, [self._layer(camera, "not painted", content, draw)])
+        else:
+            self._draw_beside_still(picture, opaque, camera, view + self._paint, places)
 
     def _draw_beside_still(
         self,
-        part: Part,
+        picture: Picture,
         opaque: NDArray[np.bool_],
-        clear: NDArray[np.bool_],
-        layers: list[tuple[Layer, Part]],
         camera: str,
         view: bytes,
         places: NDArray[np.float32],
-        sites: bool = True,
+        last: bool = True,
     ) -> None:
-        """Draw geoms of a part in which nothing reflects, with layers; what is opaque and stands still is one more."""
-        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, opaque)
+        """Draw opaque geoms of a picture; those that stand still are a layer."""
+        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, opaque) & opaque
+        layers = []
         if still.any():
-            content = b"".join([view, still.tobytes(), places[still].tobytes()])
-            draw = partial(self._draw, part, still, camera, sites=False)
-            layers = [self._layer(camera, "still", part, content, draw), *layers]
-        self._draw(part, opaque & ~still | clear, camera, layers, sites)
+            content = view + still.tobytes() + places[still].tobytes()
+            layers = [self._layer(camera, "still", content, partial(self._draw, picture, still, camera, last=False))]
+        self._draw(picture, opaque & ~still, camera, layers, last)
 
-    def _layer(
-        self, camera: str, name: str, part: Part, content: bytes, draw: Callable[[], None]
-    ) -> tuple[Layer, Part]:
-        """A layer of a camera's pictures, for a part of them; it is drawn if its content is not what it was."""
+    def _layer(self, camera: str, name: str, content: bytes, draw: Callable[[], None]) -> Layer:
+        """A layer of a camera's pictures; it is drawn if its content is not what it was."""
         if (camera, name) not in self._layers:
             context, height, width = self._renderer._mjr_context, self._renderer.height, self._renderer.width
             self._layers[camera, name] = Layer(context, height, width)
@@ -188,28 +165,38 @@ class Renderer:
             finally:
                 flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
             layer.keep(content)
-        return layer, part
+        return layer
 
     def _draw(
         self,
-        part: Part,
-        geoms: NDArray[np.bool_],
+        picture: Picture,
+        opaque: NDArray[np.bool_],
         camera: str,
-        layers: Sequence[tuple[Layer, Part]] = (),
-        sites: bool = True,
+        layers: Sequence[Layer] = (),
+        last: bool = True,
     ) -> None:
-        """Draw some geoms (ngeom,) of a part, layers in their parts' rectangles, and the sites, and nothing else."""
-        groups = self.model.geom_group.copy()
-        site_groups = self._option.sitegroup.copy()
+        """Draw opaque geoms (ngeom,) of a picture, over layers, into the emptied off-screen buffer.
+
+        Args:
+            last: with what no layer has: the mirror and what shows in it, what can be seen through, and the sites.
+        """
+        of, passes, drawn = self._culling.boxes.geom, [picture.seen], opaque
+        reflections = last and bool(picture.mirror.any())
+        if last:
+            drawn = opaque | picture.mirror | picture.clear
+            passes = [picture.seen & drawn[of] | picture.clear[of], *picture.shadows]
+        if reflections:
+            # A geom that is there for its image alone has no piece before the camera to draw.
+            drawn = drawn.copy()
+            drawn[of[picture.images]] = True
+            passes.insert(0, picture.images | picture.clear[of])
+        groups, site_groups, scene = self.model.geom_group.copy(), self._option.sitegroup.copy(), self._renderer.scene
         try:
-            self.model.geom_group[:] = np.where(geoms, groups, _CULLED)
-            self._option.sitegroup *= sites
-            scene = self._renderer.scene
-            scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = part.reflections
+            self.model.geom_group[:] = np.where(drawn, groups, _CULLED)
+            self._option.sitegroup *= last
+            scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
             self._renderer.update_scene(self.data, camera, self._option)
-            for layer, of in layers:
-                layer.put(scene, of.rows, of.columns)
-            self._pieces.show((camera, part.name), part.passes, scene)
+            self._pieces.show((camera, last), passes, scene, layers)
             mujoco.mjr_render(self._renderer._rect, scene, self._renderer._mjr_context)
         finally:
             self.model.geom_group[:] = groups
@@ -222,13 +209,6 @@ class Renderer:
         fields += [data.cam_xpos[number], data.cam_xmat[number], data.light_xpos, data.light_xdir]
         fields += [headlight.ambient, headlight.diffuse, headlight.specular, np.array(headlight.active)]
         return b"".join(field.tobytes() for field in fields)
-
-    def _sites(self) -> bytes:
-        """Places and colours of the sites that can be seen."""
-        seen = self.model.site_rgba[:, 3] > 0
-        fields = self.data.site_xpos[seen], self.data.site_xmat[seen], self.model.site_rgba[seen]
-        sites: NDArray[np.float32] = np.concatenate(fields, axis=1).astype(np.float32)
-        return sites.tobytes()
 
     def _places(self) -> NDArray[np.float32]:
         """(ngeom, 12) position and rotation of each geom, in the precision in which it is drawn."""
@@ -244,10 +224,10 @@ class Renderer:
         """What each pixel of :meth:`frame` shows of the restored state."""
         self._renderer.enable_segmentation_rendering()
         self._renderer._gl_context.make_current()
-        everything = self._culling.everything()
+        everything = self._culling.everything().seen
         try:
             self._renderer.update_scene(self.data, camera, self._option)
-            self._pieces.show(everything.name, everything.passes, self._renderer.scene)
+            self._pieces.show("everything", [everything], self._renderer.scene)
             number, kind = np.moveaxis(self._renderer.render()[::-1], -1, 0)
         finally:
             self._renderer.disable_segmentation_rendering()
