@@ -82,17 +82,16 @@ class Culling:
     def picture(self, data: mujoco.MjData, camera: str) -> Picture:
         """What has to be drawn of the data's state; positions must be up to date."""
         view = _View(self._model, data, camera, self._height, self._width)
-        try:
-            mirror = self._mirror(data, view)
-        except ValueError:
+        clear = self._see_through()
+        mirror, sure = self._mirror(data, view, clear)
+        if not sure:
             return self.everything()
         of = self.boxes.geom
         turns = data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
         corners_m = data.geom_xpos[of, None] + self.boxes.corners_m @ turns[of]
         seen = self._planes[of] | view.shows(corners_m)
         near = np.flatnonzero(seen & self._of_mesh)
-        seen[near] = ~self._hidden(data, view, corners_m[near])
-        clear = self.see_through()
+        seen[near] = ~self._hidden(data, view, corners_m[near], clear)
         # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
         lit = [reached & seen | clear[of] for reached in self._lit(data, corners_m)]
         # A shadow may come from outside of the picture, and out of a lamp's cone onto a triangle that reaches into it.
@@ -128,13 +127,15 @@ class Culling:
             )
         return np.asarray(images | self._planes[self.boxes.geom])
 
-    def _hidden(self, data: mujoco.MjData, view: _View, corners_m: Floats) -> NDArray[np.bool_]:
+    def _hidden(
+        self, data: mujoco.MjData, view: _View, corners_m: Floats, clear: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
         """(K,) whether all that is in a box of ``corners_m`` (K, 8, 3) is behind one large box, such as a table's top.
 
         What a convex body hides is convex: it has all of a box where it has its corners.
         """
         hidden = np.zeros(len(corners_m), np.bool_)
-        for screen in self._screens[~self.see_through()[self._screens]]:
+        for screen in self._screens[~clear[self._screens]]:
             axes, half_m = data.geom_xmat[screen].reshape(3, 3), self._model.geom_size[screen] - MARGIN_M
             eye_m = (view.position_m - data.geom_xpos[screen]) @ axes
             thin = int(half_m.argmin())
@@ -172,25 +173,23 @@ class Culling:
             reached.append(near | self._planes[self.boxes.geom])
         return reached
 
-    def _mirror(self, data: mujoco.MjData, view: _View) -> int | None:
+    def _mirror(self, data: mujoco.MjData, view: _View, clear: NDArray[np.bool_]) -> tuple[int | None, bool]:
         """The geom whose mirror images MuJoCo draws: the first that reflects, if the camera is before it.
 
-        Raises:
-            ValueError: when the camera is about in its plane, or it can be seen through: what MuJoCo does is a matter
-                of rounding.
+        The second value is false when the camera is about in its plane, or when it can be seen through: what MuJoCo
+        does then is a matter of rounding.
         """
         reflects = self._model.mat_reflectance[self._model.geom_matid[self._flat]] > 0
-        mirrors = self._flat[reflects & self._shown[self._flat]]
-        for mirror in mirrors.tolist():
+        for mirror in self._flat[reflects & self._shown[self._flat]].tolist():
             height_m = float(self._heights(data, mirror, view.position_m))
-            if abs(height_m) < MARGIN_M or self.see_through()[mirror]:
-                raise ValueError(f"geom {mirror} may reflect or not")
+            if abs(height_m) < MARGIN_M or clear[mirror]:
+                return None, False
             if height_m > 0:
-                return int(mirror)
+                return mirror, True
             # From behind, a plane can be seen through, and so another one may reflect.
             if not self._planes[mirror]:
-                return None
-        return None
+                break
+        return None, True
 
     def _normal(self, data: mujoco.MjData, mirror: int) -> Floats:
         normal: Floats = data.geom_xmat[mirror].reshape(3, 3)[:, 2]
@@ -202,7 +201,7 @@ class Culling:
         heights_m: Floats = (places_m - data.geom_xpos[mirror]) @ self._normal(data, mirror) - face_m
         return heights_m
 
-    def see_through(self) -> NDArray[np.bool_]:
+    def _see_through(self) -> NDArray[np.bool_]:
         """(ngeom,) which geoms may show what is behind them: by their own colour, or by their material's."""
         model, materials = self._model, self._model.geom_matid
         opacity = np.minimum(model.geom_rgba[:, 3], np.append(model.mat_rgba[:, 3], 1)[materials])
@@ -214,7 +213,7 @@ class Culling:
 
     def everything(self) -> Picture:
         """All that there is, in every pass."""
-        every, clear = np.ones(len(self.boxes.geom), np.bool_), self.see_through()
+        every, clear = np.ones(len(self.boxes.geom), np.bool_), self._see_through()
         reflecting = self._shown & False
         reflecting[self._flat] = True
         return Picture(self._shown & ~clear, clear, reflecting, every, every, (), False)

@@ -27,22 +27,13 @@ def recorded(number: int) -> Iterator[None]:
         gl.calls().glEndList()
 
 
-def add(
-    number: int,
-    scene: mujoco.MjvScene,
-    context: mujoco.MjrContext,
-    category: mujoco.mjtCatBit = mujoco.mjtCatBit.mjCAT_DECOR,
-) -> None:
-    """Have a list called by MuJoCo as if it were one more mesh of a scene, after all others that are opaque.
-
-    Args:
-        number: of the list.
-        category: what MuJoCo takes the mesh for; the default casts no shadow, so the list is not called for that.
-    """
+def add(number: int, scene: mujoco.MjvScene, context: mujoco.MjrContext) -> None:
+    """Have a list called by MuJoCo as if it were one more mesh of a scene, after all others that are opaque."""
     geom = scene.geoms[scene.ngeom]
     white, nowhere, straight = np.ones(4, np.float32), np.zeros(3), np.eye(3).ravel()
     mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_MESH, nowhere, nowhere, straight, white)
-    geom.category, geom.dataid = category, number - context.baseMesh
+    # As mjCAT_DECOR, which mjv_initGeom makes it, it would not be called for shadows.
+    geom.category, geom.dataid = mujoco.mjtCatBit.mjCAT_DYNAMIC, number - context.baseMesh
     # What mjv_initGeom leaves as it was: nothing to write beside it, and nothing to show of it in a segmentation.
     geom.label, geom.segid = "", -1
     scene.ngeom += 1

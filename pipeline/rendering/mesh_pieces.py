@@ -135,7 +135,7 @@ class MeshPieces:
                     gl.calls().glListBase(then.base)
                 lists.end = end
         gl.calls().glListBase(made[0].base)
-        display_list.add(self._turn, scene, self._context, mujoco.mjtCatBit.mjCAT_DYNAMIC)
+        display_list.add(self._turn, scene, self._context)
 
     def _write(self, lists: _Lists, seen: NDArray[np.bool_]) -> None:
         shown = seen[self._boxes]

@@ -187,7 +187,6 @@ class Renderer:
             passes = [picture.seen & drawn[of] | picture.clear[of], *picture.shadows]
         if reflections:
             # A geom that is there for its image alone has no piece before the camera to draw.
-            drawn = drawn.copy()
             drawn[of[picture.images]] = True
             passes.insert(0, picture.images | picture.clear[of])
         groups, site_groups, scene = self.model.geom_group.copy(), self._option.sitegroup.copy(), self._renderer.scene
@@ -224,7 +223,7 @@ class Renderer:
         """What each pixel of :meth:`frame` shows of the restored state."""
         self._renderer.enable_segmentation_rendering()
         self._renderer._gl_context.make_current()
-        everything = self._culling.everything().seen
+        everything = np.ones(len(self._culling.boxes.geom), np.bool_)
         try:
             self._renderer.update_scene(self.data, camera, self._option)
             self._pieces.show("everything", [everything], self._renderer.scene)
