@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import socket
 import subprocess
 import sys
@@ -53,6 +54,25 @@ def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
         with runner(ComputeConfig(cluster=address), tmp_path) as elsewhere:
             assert set(elsewhere(process, numbers, "processes")) == workers
         assert list(tmp_path.iterdir()) == []
+
+
+BLOCK_BYTES = 2**19
+"""Of less than a megabyte: larger ones the tests give back, see conftest.py."""
+
+
+def pages_asked_for(times: int) -> int:
+    """So many pages the system had to give, while a block of memory was taken, filled and freed again and again."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(times):
+        b"x" * BLOCK_BYTES
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+@pytest.mark.slow
+def test_a_worker_keeps_the_memory_that_it_frees(tmp_path: Path) -> None:
+    with runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run:
+        (pages,) = run(pages_asked_for, [100], "pages")
+    assert pages < 10 * BLOCK_BYTES // resource.getpagesize(), "not anew each time"
 
 
 def gpu(_: int) -> tuple[int, str | None]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import arenas
 import mujoco
 import numpy as np
@@ -52,3 +55,22 @@ def test_a_scene_with_its_fixtures_elsewhere_takes_over_the_context() -> None:
     assert np.array_equal(frames(second)["agentview"], after["agentview"]), "what is refused changes nothing"
     assert opened.renderer(model_xml) is first
     opened.close()
+
+
+LEFT_OPEN = '''
+from pipeline.rendering.last_scene import scene_of_process
+
+scene = """
+<mujoco>
+    <asset><mesh name="pyramid" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/></asset>
+    <worldbody><camera name="agentview"/><geom type="mesh" mesh="pyramid" group="1"/></worldbody>
+</mujoco>
+"""
+renderer = scene_of_process().renderer(scene)
+renderer.frame("agentview")
+'''
+
+
+def test_a_process_that_leaves_its_scene_open_ends_without_a_word() -> None:
+    done = subprocess.run([sys.executable, "-c", LEFT_OPEN], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import copy
 import functools
 
@@ -32,6 +33,8 @@ class LastScene:
             if self._renderer is None or not self._renderer.adopted(model):
                 self.close()
                 self._renderer = Renderer(model)
+                # Of a process that ends before anyone is done, MuJoCo ends OpenGL, after what is registered later.
+                atexit.register(self.close)
             self._scene = scene
         return self._renderer
 
@@ -40,6 +43,7 @@ class LastScene:
 
     def close(self) -> None:
         if self._renderer is not None:
+            atexit.unregister(self.close)
             self._renderer.close()
             self._renderer = self._scene = None
 
