@@ -32,7 +32,7 @@ from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import replaced
 from pipeline.libero.demonstrations import Problem
 from pipeline.libero.tasks import select_tasks
-from pipeline.physics.environment import Environment
+from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import roll_out
 from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
 from pipeline.rendering.jpeg import to_policy
@@ -114,9 +114,7 @@ def staged(tasks: Iterable[Task], config: Config) -> Iterator[Stage]:
     demo = source.load(index.entries[0].demo_id)
     model_xml = demo.model_xml
     if model_xml is None:
-        environment = Environment(demo.task)
-        model_xml = environment.place_fixtures(config.replay.fixture_seed)
-        environment.close()
+        model_xml = shared(demo.task).place_fixtures(config.replay.fixture_seed)
     opened = LastScene()
     try:
         yield Stage(demo, Scene(model_xml, demo.init_state), opened, config.replay.noops)
@@ -207,7 +205,8 @@ def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     tasks, config, folder, test = job
     folder.mkdir(parents=True)
     with staged(tasks, config) as stage:
-        for name in Axes.model_fields:
+        # Layout last: each of its draws opens a scene of its own, after which the demonstration's would be opened anew.
+        for name in sorted(Axes.model_fields, key="layout".__eq__):
             axis: AnyAxis | None = getattr(config.plan.axes, name)
             if axis is not None and axis.applies(stage.demo.task):
                 draw(stage, name, config, test).save(folder / f"{name}.png")
