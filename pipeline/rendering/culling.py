@@ -9,7 +9,7 @@ little is to be seen; of the lamps, one lights no object.
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from typing import NamedTuple
 
 import mujoco
@@ -22,8 +22,11 @@ from pipeline.types import Floats
 LEAST_SCREEN_M = 0.1
 """Half the width of the boxes that are looked behind, and more of their length."""
 
-WIDEST_CONE_DEG = 80.0
-"""Half the opening angle of lamps' cones up to which it is worked out what is in them."""
+WIDEST_CONE = np.radians(80)
+"""Half the opening angle of cones up to which it is worked out what is in them."""
+
+WIDEST_MAP_DEG = 80.0
+"""Half the widest angle of MuJoCo's maps of what casts shadows (``mjr_render``)."""
 
 SQUARE = np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])
 """Corners of a box's upper z face, which is what reflects (``mjr_render``), in units of its half sizes."""
@@ -92,21 +95,25 @@ class Culling:
         seen = self._planes[of] | view.shows(corners_m)
         near = np.flatnonzero(seen & self._of_mesh)
         seen[near] = ~self._hidden(data, view, corners_m[near], clear)
-        # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
-        lit = [reached & seen | clear[of] for reached in self._lit(data, corners_m)]
-        # A shadow may come from outside of the picture, and out of a lamp's cone onto a triangle that reaches into it.
-        shadows = [wanted for shown in lit for wanted in (np.full_like(seen, shown.any()), shown)]
+        casting = np.zeros_like(seen)
+        shadows: list[NDArray[np.bool_]] = []
+        for casts, reached in self._lamps(data, corners_m):
+            # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
+            lit = reached & seen | clear[of]
+            # A shadow may come from outside of the picture.
+            shadows += [casts & lit.any(), lit]
+            casting |= casts
         images = np.zeros_like(seen)
         if mirror is not None and seen[np.searchsorted(of, mirror)]:
             images = self._images(data, view, corners_m, mirror)
         return Picture(
-            opaque=self._geoms(seen | bool(lit)) & ~clear,
-            clear=clear & self._geoms(seen | images | bool(lit)),
+            opaque=self._geoms(seen | casting) & ~clear,
+            clear=clear & self._geoms(seen | images | bool(shadows)),
             mirror=(np.arange(self._model.ngeom) == mirror) & images.any(),
             seen=seen,
             images=images,
             shadows=tuple(shadows),
-            layers=self._layers and not lit and not self._sites_see_through(),
+            layers=self._layers and not shadows and not self._sites_see_through(),
         )
 
     def _geoms(self, boxes: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -153,25 +160,32 @@ class Culling:
             hidden[behind] |= ((enters < leaves) & (enters < 1) & drawn).all(axis=1)
         return hidden
 
-    def _lit(self, data: mujoco.MjData, corners_m: Floats) -> list[NDArray[np.bool_]]:
-        """For each lamp with shadows, in MuJoCo's order, (N,) which boxes its light may reach: all but those out of its
-        cone."""
+    def _lamps(self, data: mujoco.MjData, corners_m: Floats) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+        """For each lamp with shadows, in MuJoCo's order, (N,) which boxes may be in its map of what casts them, and
+        which its light may reach: all but those out of its cone."""
         model = self._model
-        reached: list[NDArray[np.bool_]] = []
         for lamp in np.flatnonzero(model.light_castshadow & model.light_active):
-            if model.light_directional[lamp] or model.light_cutoff[lamp] > WIDEST_CONE_DEG:
-                reached.append(np.ones(len(corners_m), np.bool_))
+            if model.light_directional[lamp]:
+                yield np.ones(len(corners_m), np.bool_), np.ones(len(corners_m), np.bool_)
                 continue
-            middles_m = corners_m.mean(axis=1)
-            radii_m = np.linalg.norm(corners_m[:, 0] - middles_m, axis=1)
-            axis = data.light_xdir[lamp] / np.linalg.norm(data.light_xdir[lamp])
-            ways_m = middles_m - data.light_xpos[lamp]
-            along_m = ways_m @ axis
-            across_m = np.linalg.norm(ways_m - along_m[:, None] * axis, axis=1)
-            slope = np.radians(model.light_cutoff[lamp])
-            near = across_m * np.cos(slope) - along_m * np.sin(slope) < radii_m
-            reached.append(near | self._planes[self.boxes.geom])
-        return reached
+            # A square map of a part of the cone (`mjr_render`), within a cone through the square's corners.
+            map_deg = min(model.light_cutoff[lamp] * model.vis.map.shadowscale, WIDEST_MAP_DEG)
+            corner = np.arctan(np.sqrt(2) * np.tan(np.radians(map_deg)))
+            axis, origin_m = data.light_xdir[lamp] / np.linalg.norm(data.light_xdir[lamp]), data.light_xpos[lamp]
+            casts = self._in_cone(corners_m, origin_m, axis, corner)
+            yield casts, self._in_cone(corners_m, origin_m, axis, np.radians(model.light_cutoff[lamp]))
+
+    def _in_cone(self, corners_m: Floats, tip_m: Floats, axis: Floats, angle: float) -> NDArray[np.bool_]:
+        """(N,) which boxes may reach into a cone, by half its opening angle in radians."""
+        if angle > WIDEST_CONE:
+            return np.ones(len(corners_m), np.bool_)
+        middles_m = corners_m.mean(axis=1)
+        radii_m = np.linalg.norm(corners_m[:, 0] - middles_m, axis=1)
+        ways_m = middles_m - tip_m
+        along_m = ways_m @ axis
+        across_m = np.linalg.norm(ways_m - along_m[:, None] * axis, axis=1)
+        near = across_m * np.cos(angle) - along_m * np.sin(angle) < radii_m
+        return np.asarray(near | self._planes[self.boxes.geom])
 
     def _mirror(self, data: mujoco.MjData, view: _View, clear: NDArray[np.bool_]) -> tuple[int | None, bool]:
         """The geom whose mirror images MuJoCo draws: the first that reflects, if the camera is before it.

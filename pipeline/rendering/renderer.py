@@ -96,6 +96,7 @@ class Renderer:
         context = self._renderer._mjr_context
         # What a context keeps of a model's size, as mjr_makeContext works it out.
         context.shadowClip = model.stat.extent * model.vis.map.shadowclip
+        context.shadowScale = model.vis.map.shadowscale
         context.fogStart = model.stat.extent * model.vis.map.fogstart
         context.fogEnd = model.stat.extent * model.vis.map.fogend
         return True
