@@ -5,7 +5,7 @@ by the processor, and the last bits of a torque follow from that choice; a conta
 Every x86 processor with AVX2 uses the code for AVX2 here, so that one demonstration has one trajectory everywhere.
 
 It also fixes how much free memory a process keeps. Dask has its workers give back to the system every 64 KB that are
-free; where software renders, each frame then asks for thousands of pages anew, a fifth of a worker's time.
+free; where software renders, each frame may then ask for thousands of pages anew, up to a tenth of a worker's time.
 """
 
 import ctypes
