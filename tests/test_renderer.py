@@ -58,7 +58,7 @@ def test_a_scene_with_its_fixtures_elsewhere_takes_over_the_context() -> None:
 
 
 LEFT_OPEN = '''
-from pipeline.rendering.last_scene import scene_of_process
+from pipeline.rendering.last_scene import LastScene
 
 scene = """
 <mujoco>
@@ -66,8 +66,8 @@ scene = """
     <worldbody><camera name="agentview"/><geom type="mesh" mesh="pyramid" group="1"/></worldbody>
 </mujoco>
 """
-renderer = scene_of_process().renderer(scene)
-renderer.frame("agentview")
+opened = LastScene()
+opened.renderer(scene).frame("agentview")
 '''
 
 
