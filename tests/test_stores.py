@@ -26,6 +26,7 @@ from pipeline.rendering.render import STREAMS_OF_A_JOB, portions, render, render
 from pipeline.run import outcome, plan
 from pipeline.run.compute import loop
 from pipeline.run.frame_store import FrameStore, shown_of
+from pipeline.run.sealed_file import sealed
 from pipeline.run.store import TABLE
 from pipeline.run.streams import Stream, streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
@@ -367,3 +368,13 @@ def test_reserves_are_replayed_where_frames_may_be_rejected_after_all_physics(ro
     rejected = plan.select(both, kept, {both[0].episode_id: "too_dark"})
     assert [verdict.reason for verdict in rejected.values()] == ["too_dark", "kept"]
     assert plan.pending([row for row in both if row.wanted], verdicts_of({})) == ["a"]
+
+
+def test_a_file_has_the_same_bytes_whoever_still_holds_one_of_its_arrays(tmp_path: Path) -> None:
+    held = []
+    for name, holds in (("alone.h5", False), ("held.h5", True)):
+        with sealed(tmp_path / name, {"reason": "none"}) as file:
+            array = file.create_dataset("site_alpha", data=np.zeros((100, 31), np.float32), compression="gzip")
+            held += [array] * holds
+            del array
+    assert (tmp_path / "alone.h5").read_bytes() == (tmp_path / "held.h5").read_bytes()

@@ -86,7 +86,7 @@ class SealedFile:
 
 @contextmanager
 def sealed(path: Path, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
-    """A new file to fill with arrays; it gets its checksums when the block ends.
+    """A new file to fill with arrays; it gets its checksums when the block ends. The same arrays make the same bytes.
 
     Args:
         path: where it will lie.
@@ -94,6 +94,8 @@ def sealed(path: Path, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
     """
     with h5py.File(path, "w", libver=FORMAT) as file:
         yield file
+        # Or a compressed array finds its place when its last reference goes, and a profiler may hold one for a moment.
+        file.flush()
         file[ATTRIBUTES] = np.frombuffer(json.dumps(dict(attributes), sort_keys=True).encode(), np.uint8)
         arrays = _arrays(file)
         for array in arrays.values():
