@@ -21,6 +21,7 @@ import pytest
 import yaml
 from filelock import FileLock
 
+from pipeline import M_MMAP_THRESHOLD
 from pipeline.config import ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
@@ -44,7 +45,6 @@ IN_SCRIPTS = {**os.environ, "PATH": f"{SCRIPTS}{os.pathsep}{os.environ['PATH']}"
 """For DVC, whose stages call `python`."""
 
 LIBC = ctypes.CDLL("libc.so.6")
-M_MMAP_THRESHOLD = -3
 # glibc gives blocks of this size back when they are freed; without a fixed size it soon keeps those of a whole scene.
 LIBC.mallopt(M_MMAP_THRESHOLD, 2**20)
 

@@ -163,8 +163,12 @@ class Culling:
     def _lamps(self, data: mujoco.MjData, corners_m: Floats) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
         """For each lamp with shadows, in MuJoCo's order, (N,) which boxes may be in its map of what casts them, and
         which its light may reach: all but those out of its cone."""
-        model = self._model
-        for lamp in np.flatnonzero(model.light_castshadow & model.light_active):
+        model, lamps = self._model, np.flatnonzero(self._model.light_castshadow & self._model.light_active)
+        if not len(lamps):
+            return
+        middles_m = corners_m.mean(axis=1)
+        radii_m = np.linalg.norm(corners_m[:, 0] - middles_m, axis=1)
+        for lamp in lamps:
             if model.light_directional[lamp]:
                 yield np.ones(len(corners_m), np.bool_), np.ones(len(corners_m), np.bool_)
                 continue
@@ -172,15 +176,15 @@ class Culling:
             map_deg = min(model.light_cutoff[lamp] * model.vis.map.shadowscale, WIDEST_MAP_DEG)
             corner = np.arctan(np.sqrt(2) * np.tan(np.radians(map_deg)))
             axis, origin_m = data.light_xdir[lamp] / np.linalg.norm(data.light_xdir[lamp]), data.light_xpos[lamp]
-            casts = self._in_cone(corners_m, origin_m, axis, corner)
-            yield casts, self._in_cone(corners_m, origin_m, axis, np.radians(model.light_cutoff[lamp]))
+            casts = self._in_cone(middles_m, radii_m, origin_m, axis, corner)
+            yield casts, self._in_cone(middles_m, radii_m, origin_m, axis, np.radians(model.light_cutoff[lamp]))
 
-    def _in_cone(self, corners_m: Floats, tip_m: Floats, axis: Floats, angle: float) -> NDArray[np.bool_]:
-        """(N,) which boxes may reach into a cone, by half its opening angle in radians."""
+    def _in_cone(
+        self, middles_m: Floats, radii_m: Floats, tip_m: Floats, axis: Floats, angle: float
+    ) -> NDArray[np.bool_]:
+        """(N,) which boxes, by the balls around them, may reach into a cone, by half its opening angle in radians."""
         if angle > WIDEST_CONE:
-            return np.ones(len(corners_m), np.bool_)
-        middles_m = corners_m.mean(axis=1)
-        radii_m = np.linalg.norm(corners_m[:, 0] - middles_m, axis=1)
+            return np.ones(len(radii_m), np.bool_)
         ways_m = middles_m - tip_m
         along_m = ways_m @ axis
         across_m = np.linalg.norm(ways_m - along_m[:, None] * axis, axis=1)
