@@ -1,9 +1,10 @@
-"""One OpenGL context serves all scenes of the same meshes and textures, with the frames that each would have alone."""
+"""One OpenGL context serves one scene after the other, with the frames that each would have alone."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import closing
 
 import arenas
 import mujoco
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 from arenas import TASKS, frames
 
+from pipeline import gl
 from pipeline.axes.light import LightPerturbation
 from pipeline.physics.environment import Environment
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.renderer import Renderer
-from pipeline.types import Frame
+from pipeline.types import Floats, Frame
 
 SHADOWS = LightPerturbation(component="shadows", level=5, shadows=True)
 
@@ -27,34 +29,75 @@ def all_frames(renderer: Renderer) -> dict[str, Frame]:
         return plain | {f"{view} with shadows": frame for view, frame in frames(renderer).items()}
 
 
-@pytest.mark.slow
-def test_a_scene_with_its_fixtures_elsewhere_takes_over_the_context() -> None:
-    model_xml, state = arenas.scene("tabletop")
-    environment = Environment(TASKS["tabletop"])
-    elsewhere = environment.place_fixtures(5)
-    environment.close()
-    alone = Renderer(elsewhere)
-    alone.restore(state, alone.model.site_rgba[:, 3].astype(np.float32))
-    expected = all_frames(alone)
-    alone.close()
+def shown(renderer: Renderer, state: Floats) -> dict[str, Frame]:
+    """``all_frames`` of a state."""
+    renderer.restore(state, renderer.model.site_rgba[:, 3].astype(np.float32))
+    return all_frames(renderer)
 
-    opened = LastScene()
-    first = opened.renderer(model_xml)
-    first.restore(state, first.model.site_rgba[:, 3].astype(np.float32))
-    before = all_frames(first)
-    second = opened.renderer(mujoco.MjModel.from_xml_string(elsewhere))
-    assert second is first
-    second.restore(state, second.model.site_rgba[:, 3].astype(np.float32))
-    after = all_frames(second)
-    for name, frame in expected.items():
-        assert np.array_equal(after[name], frame), name
-    assert any((after[name] != frame).any() for name, frame in before.items()), "the fixtures are elsewhere"
-    hidden = mujoco.MjModel.from_xml_string(elsewhere)
-    hidden.geom_group[0] = 3
-    assert not second.adopted(hidden)
-    assert np.array_equal(frames(second)["agentview"], after["agentview"]), "what is refused changes nothing"
-    assert opened.renderer(model_xml) is first
-    opened.close()
+
+def elsewhere() -> tuple[str, Floats]:
+    """The tabletop's scene with its fixtures in other places."""
+    environment = Environment(TASKS["tabletop"])
+    try:
+        return environment.place_fixtures(5), arenas.scene("tabletop")[1]
+    finally:
+        environment.close()
+
+
+@pytest.mark.slow
+def test_one_context_shows_one_scene_after_the_other_as_contexts_of_their_own() -> None:
+    scenes = {arena: arenas.scene(arena) for arena in TASKS} | {"elsewhere": elsewhere()}
+    expected = {}
+    for name, (model_xml, state) in scenes.items():
+        with closing(Renderer(model_xml)) as alone:
+            expected[name] = shown(alone, state)
+    assert any((expected["elsewhere"][view] != frame).any() for view, frame in expected["tabletop"].items())
+
+    with closing(LastScene()) as opened:
+        first = opened.renderer(scenes["tabletop"][0])
+        for name in ("tabletop", "elsewhere", "kitchen", "tabletop", "living_room", "floor", "study", "elsewhere"):
+            model_xml, state = scenes[name]
+            renderer = opened.renderer(mujoco.MjModel.from_xml_string(model_xml))
+            assert renderer is first
+            for view, frame in shown(renderer, state).items():
+                assert np.array_equal(frame, expected[name][view]), (name, view)
+
+
+@pytest.mark.slow
+def test_a_scene_drawn_with_other_buffers_gets_a_context_of_its_own() -> None:
+    model_xml, state = arenas.scene("floor")
+    with closing(LastScene()) as opened:
+        first = opened.renderer(model_xml)
+        before = shown(first, state)
+        coarse = mujoco.MjModel.from_xml_string(model_xml)
+        coarse.vis.quality.offsamples = 0
+        assert not first.adopted(coarse)
+        assert all(np.array_equal(frame, before[view]) for view, frame in shown(first, state).items())
+        second = opened.renderer(coarse)
+        assert second is not first
+        assert any((frame != before[view]).any() for view, frame in shown(second, state).items())
+
+
+@pytest.mark.slow
+def test_scenes_that_come_and_go_leave_nothing_in_the_context() -> None:
+    with closing(LastScene()) as opened:
+
+        def held() -> tuple[int, int]:
+            """How many display lists and textures there are."""
+            opengl = gl.calls()
+            last = opengl.glGenLists(1), int(opengl.glGenTextures(1))
+            opengl.glDeleteLists(last[0], 1)
+            opengl.glDeleteTextures([last[1]])
+            lists = sum(bool(opengl.glIsList(number)) for number in range(last[0]))
+            return lists, sum(bool(opengl.glIsTexture(number)) for number in range(last[1]))
+
+        turns = []
+        for _ in range(3):
+            for arena in ("tabletop", "floor"):
+                shown(opened.renderer(arenas.scene(arena)[0]), arenas.scene(arena)[1])
+            turns.append(held())
+        assert turns[1] == turns[2]
+        assert min(turns[2]) > 10
 
 
 LEFT_OPEN = '''

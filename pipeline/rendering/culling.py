@@ -8,7 +8,6 @@ little is to be seen; of the lamps, one lights no object.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Collection, Iterator
 from typing import NamedTuple
 
@@ -75,12 +74,6 @@ class Culling:
         self._screens = np.flatnonzero(self._shown & fixed & wide)
         flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
         self._flat = np.flatnonzero(flat & (model.geom_matid >= 0))
-
-    def of(self, model: mujoco.MjModel) -> Culling:
-        """The same for a model that has the same geoms in other places."""
-        other = copy.copy(self)
-        other._model = model
-        return other
 
     def picture(self, data: mujoco.MjData, camera: str) -> Picture:
         """What has to be drawn of the data's state; positions must be up to date."""

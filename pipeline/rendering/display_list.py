@@ -17,6 +17,11 @@ def new(count: int = 1) -> int:
     return number
 
 
+def free(number: int, count: int = 1) -> None:
+    """Have OpenGL forget so many lists."""
+    gl.calls().glDeleteLists(number, count)
+
+
 @contextmanager
 def recorded(number: int) -> Iterator[None]:
     """Have a list do, whenever it is called, what OpenGL is asked to do meanwhile."""

@@ -7,6 +7,7 @@ MuJoCo's order.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Collection, Hashable, Sequence
 from itertools import product
 from typing import NamedTuple
@@ -28,6 +29,15 @@ MOST_PARTS = 0.75
 
 MARGIN_M = 1e-3
 """Added around every box, for what the rasteriser rounds."""
+
+
+PARTS = {
+    "vert": ("vert",),
+    "normal": ("normal",),
+    "texcoord": ("texcoord",),
+    "face": ("face", "facenormal", "facetexcoord"),
+}
+"""Arrays of a model that a mesh is drawn from, by what says which part of them is the mesh's."""
 
 
 class Boxes(NamedTuple):
@@ -84,23 +94,31 @@ class MeshPieces:
     one of ours (:meth:`show`): it puts layers, and sets the list base for the next pass.
 
     Args:
+        context: made from the model, or from another one.
         boxes: of the model.
+        former: those of the model that the context was for before, where it is another one. What both have stays as it
+            is; the rest is given up, and so is ``former``.
     """
 
-    def __init__(self, model: mujoco.MjModel, context: mujoco.MjrContext, boxes: Boxes):
+    def __init__(
+        self, model: mujoco.MjModel, context: mujoco.MjrContext, boxes: Boxes, former: MeshPieces | None = None
+    ):
         self._context = context
         meshes = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)[boxes.geom]
         self._boxes = np.flatnonzero(meshes >= 0)
         drawn, self._mesh = np.unique(meshes[self._boxes], return_inverse=True)
         self._piece = boxes.piece[self._boxes]
         counts = [int(self._piece[self._mesh == number].max()) + 1 for number in range(len(drawn))]
-        self._whole = [_upload(model, context, mesh, 0, model.mesh_facenum[mesh]) for mesh in drawn.tolist()]
-        self._pieces = [
-            [_upload(model, context, mesh, piece * PIECE_FACES, PIECE_FACES) for piece in range(count)]
-            if count > 1
-            else [whole]
-            for mesh, count, whole in zip(drawn.tolist(), counts, self._whole, strict=True)
-        ]
+        former_shapes = {} if former is None else former._free(model.nmesh)
+        self._shapes: dict[bytes, _Shape] = {}
+        self._meshes: list[_Shape] = []
+        for mesh, count in zip(drawn.tolist(), counts, strict=True):
+            content = _content(model, mesh)
+            shape = self._shapes.get(content) or former_shapes.pop(content, None) or _shape(model, context, mesh, count)
+            self._shapes[content] = shape
+            self._meshes.append(shape)
+        for shape in former_shapes.values():
+            shape.free()
         for number, mesh in enumerate(drawn.tolist()):
             with display_list.recorded(context.baseMesh + 2 * mesh):
                 _call_from_base(number)
@@ -108,6 +126,17 @@ class MeshPieces:
         with display_list.recorded(self._turn):
             _call_from_base(len(drawn))
         self._passes: dict[Hashable, list[_Lists]] = {}
+
+    def _free(self, meshes: int) -> dict[bytes, _Shape]:
+        """Have the context's lists of meshes do nothing, for as many meshes, and give up all but the shapes."""
+        display_list.free(self._context.baseMesh, self._context.rangeMesh)
+        display_list.free(self._turn)
+        for lists in (lists for made in self._passes.values() for lists in made):
+            display_list.free(lists.base, len(self._meshes) + 1)
+        # Of each mesh one for its faces and one for its convex hull.
+        self._context.rangeMesh = 2 * meshes
+        self._context.baseMesh = display_list.new(self._context.rangeMesh)
+        return self._shapes
 
     def show(
         self, name: Hashable, passes: Sequence[NDArray[np.bool_]], scene: mujoco.MjvScene, layers: Sequence[Layer] = ()
@@ -122,14 +151,14 @@ class MeshPieces:
         """
         made = self._passes.setdefault(name, [])
         while len(made) < len(passes):
-            made.append(_Lists(len(self._whole)))
+            made.append(_Lists(len(self._meshes)))
         for number, (lists, wanted) in enumerate(zip(made, passes, strict=False)):
             self._write(lists, wanted)
             last = number + 1 == len(passes)
             then = lists if last else made[number + 1]
             end = then.base, *(layer.number for layer in layers if last)
             if lists.end != end:
-                with display_list.recorded(lists.base + len(self._whole)):
+                with display_list.recorded(lists.base + len(self._meshes)):
                     for layer in end[1:]:
                         gl.calls().glCallList(layer)
                     gl.calls().glListBase(then.base)
@@ -141,11 +170,46 @@ class MeshPieces:
         shown = seen[self._boxes]
         for mesh in np.unique(self._mesh[shown != lists.shown]).tolist():
             pieces = np.unique(self._piece[shown & (self._mesh == mesh)]).tolist()
-            most = len(pieces) > MOST_PARTS * len(self._pieces[mesh])
+            whole, parts = self._meshes[mesh]
+            most = len(pieces) > MOST_PARTS * len(parts)
             with display_list.recorded(lists.base + mesh):
-                for number in [self._whole[mesh]] if most else [self._pieces[mesh][piece] for piece in pieces]:
+                for number in [whole] if most else [parts[piece] for piece in pieces]:
                     gl.calls().glCallList(number)
         lists.shown = shown
+
+
+class _Shape(NamedTuple):
+    """A mesh's display lists, of which every second one is there because MuJoCo writes two.
+
+    Attributes:
+        whole: of all its faces.
+        pieces: of each piece; that of a small mesh is all of it.
+    """
+
+    whole: int
+    pieces: tuple[int, ...]
+
+    def free(self) -> None:
+        for number in {self.whole, *self.pieces}:
+            display_list.free(number, 2)
+
+
+def _shape(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, count: int) -> _Shape:
+    whole = _upload(model, context, mesh, 0, model.mesh_facenum[mesh])
+    if count == 1:
+        return _Shape(whole, (whole,))
+    firsts = range(0, count * PIECE_FACES, PIECE_FACES)
+    return _Shape(whole, tuple(_upload(model, context, mesh, first, PIECE_FACES) for first in firsts))
+
+
+def _content(model: mujoco.MjModel, mesh: int) -> bytes:
+    """Tells what a mesh's faces look like from those of any other mesh."""
+    digest = hashlib.sha256()
+    for part, names in PARTS.items():
+        first, count = getattr(model, f"mesh_{part}adr")[mesh], getattr(model, f"mesh_{part}num")[mesh]
+        for name in names:
+            digest.update(getattr(model, f"mesh_{name}")[first : first + count].tobytes())
+    return digest.digest()
 
 
 class _Lists:

@@ -21,17 +21,11 @@ from pipeline.rendering.still import Still
 from pipeline.rendering.textures import Textures
 from pipeline.types import Frame
 
-_UPLOADED = (
-    *(name for name in dir(mujoco.MjModel) if name.startswith(("tex_", "mat_tex", "mesh_", "hfield_", "skin_"))),
-    *("geom_type", "geom_dataid", "geom_matid", "geom_group", "geom_aabb"),
-)
-"""What a model's GL context was made from, textures and shapes, and what tells which geom has which."""
-
 _LOOK = (
     *(name for name in dir(mujoco.MjModel) if name.startswith(("cam_", "light_", "mat_"))),
     *("geom_matid", "geom_rgba"),
 )
-"""What else a picture depends on in a model, beside where its geoms and sites are."""
+"""What a picture depends on in a model, beside meshes and textures, and where its geoms and sites are."""
 
 _CULLED = mujoco.mjNGROUP - 1
 """A group of geoms that nothing in LIBERO is in, and that is not drawn."""
@@ -48,6 +42,14 @@ class Surfaces(NamedTuple):
     depth_m: NDArray[np.float32]
     number: NDArray[np.int32]
     kind: NDArray[np.int32]
+
+
+def _fixed(model: mujoco.MjModel) -> tuple[object, ...]:
+    """What a GL context is made for once and for all: its buffers, the fineness of round bodies, lines and fog."""
+    window, quality = model.vis.global_, model.vis.quality
+    buffers = window.offwidth, window.offheight, quality.offsamples, quality.shadowsize
+    fineness = quality.numslices, quality.numstacks, quality.numquads
+    return *buffers, *fineness, window.linewidth, tuple(model.vis.rgba.fog)
 
 
 class Renderer:
@@ -73,7 +75,9 @@ class Renderer:
         hidden = np.flatnonzero(np.logical_not(self._option.geomgroup))
         self._renderer._gl_context.make_current()
         # On a GPU the geoms are no effort, and what would spare them is.
-        self._culling = Culling(self.model, height, width, hidden.tolist(), software and Layer.possible())
+        layers = software and Layer.possible()
+        self._culling_of = partial(Culling, height=height, width=width, hidden_groups=hidden.tolist(), layers=layers)
+        self._culling = self._culling_of(self.model)
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
         self._still: dict[str, Still] = {}
         self._layers: dict[tuple[str, str], Layer] = {}
@@ -82,18 +86,21 @@ class Renderer:
         self._paint = b""
 
     def adopted(self, model: mujoco.MjModel) -> bool:
-        """Go on with another model, where its meshes and textures are those in the GL context already.
+        """Go on with another model in the same GL context, where the meshes and textures that both have stay.
 
         Returns:
-            Whether it is so, and the model belongs to the renderer now; else nothing is changed.
+            Whether that can be, and the model belongs to the renderer now; else nothing is changed.
         """
-        if not all(np.array_equal(getattr(self.model, name), getattr(model, name)) for name in _UPLOADED):
+        if _fixed(model) != _fixed(self.model) or model.nhfield or model.nskin:
             return False
-        self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
-        self._culling = self._culling.of(model)
-        self._forget_layers()
-        self._textures = Textures(model, self._renderer._mjr_context)
+        self._renderer._gl_context.make_current()
         context = self._renderer._mjr_context
+        self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
+        self._culling = self._culling_of(model)
+        self._pieces = MeshPieces(model, context, self._culling.boxes, self._pieces)
+        self._textures = Textures(model, context, self._textures)
+        self._painted = np.zeros(model.ngeom, np.bool_)
+        self._forget_layers()
         # What a context keeps of a model's size, as mjr_makeContext works it out.
         context.shadowClip = model.stat.extent * model.vis.map.shadowclip
         context.shadowScale = model.vis.map.shadowscale

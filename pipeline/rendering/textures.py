@@ -14,16 +14,51 @@ from pipeline.axes import RenderPerturbation
 
 
 class Textures:
-    """By their numbers in the model; MuJoCo's OpenGL context must be the current one."""
+    """By their numbers in the model; MuJoCo's OpenGL context must be the current one.
 
-    def __init__(self, model: mujoco.MjModel, context: mujoco.MjrContext):
+    Args:
+        context: made from the model, or from another one.
+        former: those of the model whose textures the context has, where it is another one. What both have stays there
+            and is not copied again: a scene has 140 MB of textures, which take a second.
+    """
+
+    def __init__(self, model: mujoco.MjModel, context: mujoco.MjrContext, former: Textures | None = None):
         self._model, self._context = model, context
-        self._own = context.texture.copy()
         sizes = model.tex_height * model.tex_width * model.tex_nchannel
         # Where each texture's bytes lie in the model's ``tex_data``.
         self._texels = [
             slice(start, start + size) for start, size in zip(model.tex_adr.tolist(), sizes.tolist(), strict=True)
         ]
+        self._own = context.texture.copy()
+        if former is not None:
+            self._replace(former)
+
+    def _replace(self, former: Textures) -> None:
+        names, model, context = self._own[: len(former._texels)].tolist(), self._model, self._context
+        self._own[:], copied = 0, []
+        for texture in range(model.ntex):
+            same = (number for number in range(len(names)) if names[number] and self._same(texture, former, number))
+            if (number := next(same, None)) is None:
+                self._own[texture] = gl.calls().glGenTextures(1)
+                copied.append(texture)
+            else:
+                self._own[texture], names[number] = names[number], 0
+        # OpenGL passes over the zeros.
+        gl.calls().glDeleteTextures(names)
+        context.ntexture, context.textureType[: model.ntex] = model.ntex, model.tex_type
+        context.mat_texid[: model.mat_texid.size] = model.mat_texid.ravel()
+        context.mat_texrepeat[: model.mat_texrepeat.size] = model.mat_texrepeat.ravel()
+        context.mat_texuniform[: model.nmat] = model.mat_texuniform
+        self.show({})
+        self.upload(copied)
+
+    def _same(self, texture: int, other: Textures, number: int) -> bool:
+        """Whether a texture is the one that another model has under a number."""
+        fields = [(m.tex_type, m.tex_height, m.tex_width, m.tex_nchannel) for m in (self._model, other._model)]
+        if any(own[texture] != theirs[number] for own, theirs in zip(*fields, strict=True)):
+            return False
+        own, theirs = self._model.tex_data[self._texels[texture]], other._model.tex_data[other._texels[number]]
+        return np.array_equal(own, theirs)
 
     def former(self, pixels: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
         """The former bytes of the textures that differ from ``pixels``, an earlier copy of the model's ``tex_data``."""
