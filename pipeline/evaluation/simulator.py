@@ -91,9 +91,10 @@ class Simulator(Environment):
 
     def __init__(self, task: Task, files: SceneFiles | None = None):
         if files is None:
-            super().__init__(task)
+            super().__init__(task, images=True)
         else:
-            super().__init__(task, _styles({"floor": files.floor, "wall": files.wall}), files.scene_xml)
+            styles = _styles({"floor": files.floor, "wall": files.wall})
+            super().__init__(task, styles, files.scene_xml, images=True)
         self._rewind: _Rewind | None = None
 
     @property

@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -22,7 +22,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.stepping import ControlStep
-from pipeline.scenes.compiled import fixed_pose, physics_of
+from pipeline.scenes.compiled import fixed_pose, physics_of, put_images, take_images
 from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Task
 
@@ -102,17 +102,25 @@ def _until_placed(reset: Callable[[], Any], task: Task) -> Any:
 class Environment:
     """One task's environment; every ``restore`` forgets what happened before it.
 
-    Building one parses the BDDL file and loads every mesh (1 to 4 s), so keep an environment for all demonstrations
+    Building one parses the BDDL file and loads every mesh (1 to 3 s), so keep an environment for all demonstrations
     of its task.
 
     Args:
         task: the task to build.
         scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
         scene_xml: absolute path of another file for the arena.
+        images: whether the models that LIBERO's resets compile have their images, which take more time than all else.
     """
 
-    def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
+    def __init__(
+        self,
+        task: Task,
+        scene_properties: Mapping[str, str] | None = None,
+        scene_xml: str | None = None,
+        images: bool = False,
+    ):
         self.task = task
+        self._images: dict[str, dict[str, str]] | None = None if images else {}
         build = partial(
             control_env(),
             bddl_file_name=str(task.bddl_file),
@@ -123,7 +131,7 @@ class Environment:
             scene_properties=scene_properties,
             scene_xml=scene_xml,
         )
-        with seeded(0):
+        with seeded(0), self._compiling():
             self._env = _until_placed(build, task)
         self._control_step = ControlStep(self._env.env)
         self._openings = len(self._env.env.object_property_initializers)
@@ -141,13 +149,33 @@ class Environment:
             # every one of them: without this, the second placement under a seed differs from the first.
             del self._env.env.object_property_initializers[self._openings :]
             self._scene = None
-            with seeded(seed):
+            with seeded(seed), self._compiling():
                 self._reset_until_placed()
             self._control_step = ControlStep(self._env.env)
             scene = ET.fromstring(self._env.sim.model.get_xml())
+            put_images(scene, self._images or {})
             as_evaluated(scene)
             self._placed[seed] = ET.tostring(scene, encoding="unicode")
         return self._placed[seed]
+
+    @contextmanager
+    def _compiling(self) -> Iterator[None]:
+        """Have robosuite leave out the images of the scenes that it compiles, unless they were asked for."""
+        from robosuite.utils.binding_utils import MjSim
+
+        compiled = vars(MjSim)["from_xml_string"]
+
+        def without_images(model_xml: str) -> MjSim:
+            scene = ET.fromstring(model_xml)
+            self._images = take_images(scene)
+            return MjSim(mujoco.MjModel.from_xml_string(ET.tostring(scene, encoding="unicode")))
+
+        if self._images is not None:
+            MjSim.from_xml_string = without_images
+        try:
+            yield
+        finally:
+            MjSim.from_xml_string = compiled
 
     def _reset_until_placed(self) -> None:
         _until_placed(self._env.env.reset, self.task)
