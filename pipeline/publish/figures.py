@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 Values = NDArray[Any]
@@ -74,12 +75,13 @@ def colour(group: str) -> str:
 def panel(title: str, draw: Callable[[Axes], None], height_in: float = HEIGHT_IN) -> Panel:
     """One pair of axes, drawn on by ``draw``."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+        figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained", dpi=DOTS_DPI)
         draw(figure.add_subplot())
         written = io.StringIO()
         # Without a date the same data give the same bytes.
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(written, format="svg", metadata=nothing, dpi=DOTS_DPI)
+        # As savefig does, which draws everything once more before.
+        FigureCanvasSVG(figure).print_svg(written, metadata=nothing)  # type: ignore[no-untyped-call]
     drawn = written.getvalue()
     drawn = drawn[drawn.index("<svg") :].replace(INK, "currentColor")
     # HTML knows the namespaces, and numbered names would clash between the figures of a page.
@@ -104,6 +106,8 @@ def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = 
         axes.set(xlabel=label, ylabel="share", xlim=(bins[0] - margin, bins[-1] + margin))
         if log:
             axes.set(yscale="log", ylim=(SMALLEST_SHARE, 1.2))
+            # Left to itself, Matplotlib sets powers of ten as formulas, which takes longer than all else.
+            axes.yaxis.set(major_formatter="{x:g}", minor_formatter=NullFormatter())
 
     return panel(title, draw)
 
