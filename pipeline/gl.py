@@ -49,15 +49,22 @@ class GlChoice:
         return f"rendering with {self.backend} on {self.device}: {self.reason}"
 
 
+_ENVIRONMENT = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID")
+_of_the_run: GlChoice | None = None
+
+
 @functools.cache
 def choose() -> GlChoice:
     """Try what is there in short subprocesses (0.7 s each), set the environment, return the choice for printing.
 
-    ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set.
+    ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set. A worker of this machine takes over
+    what the run's own process chose (``Shared``).
 
     Raises:
         PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does.
     """
+    if _of_the_run is not None:
+        return _of_the_run
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     device_asked = "MUJOCO_EGL_DEVICE_ID" in os.environ
     faults = {}
@@ -111,6 +118,27 @@ def gpus() -> tuple[str, ...]:
         if device == choice.device:
             found.append(index)
     return tuple(found)
+
+
+class Shared:
+    """What renders here, for worker processes of this machine: they need not try it again.
+
+    Raises:
+        PipelineError: when nothing renders here, as in ``choose``.
+    """
+
+    def __init__(self) -> None:
+        self._choice, self._gpus = choose(), gpus()
+        self._environment = {name: os.environ[name] for name in _ENVIRONMENT if name in os.environ}
+
+    def __call__(self, worker: int) -> None:
+        """Have this process, the worker of that number, render with it, on one of several GPUs in turn."""
+        global _of_the_run
+        _of_the_run = self._choice
+        os.environ.update(self._environment)
+        if self._gpus:
+            # MuJoCo looks when it opens its first context.
+            os.environ["MUJOCO_EGL_DEVICE_ID"] = self._gpus[worker % len(self._gpus)]
 
 
 def prepare() -> GlChoice:

@@ -15,7 +15,7 @@ def run(config: Config) -> None:
     same_machine(config.data, {"OpenGL device": gl.choose().device})
     rows = plan.read(config.data / "plan.parquet")
     folder = config.data / "frames"
-    with runner(config.compute, config.data, gl.gpus) as workers:
+    with runner(config.compute, config.data, gl.Shared) as workers:
         rendered = render_plan(rows, config, config.data / "trajectories", folder, workers)
     FrameStore(folder, config.render).keep(rendered)
     print(f"{len(rendered)} files of frames are in {folder}")

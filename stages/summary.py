@@ -15,7 +15,7 @@ def run(config: Config) -> None:
     rows = manifest.read(config.data / "manifest.parquet")
     load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
     drawn = sheets.draw(rows, load, config.data / "sheets")
-    with runner(config.compute, config.data, gl.gpus) as workers:
+    with runner(config.compute, config.data, gl.Shared) as workers:
         previews = preview.for_run(config, config.data / "previews", workers)
     console = Console()
     console.print(manifest.counts_table(rows))

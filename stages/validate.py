@@ -11,7 +11,7 @@ from pipeline.validation.validate import validate
 
 
 def run(config: Config) -> None:
-    with runner(config.compute, config.data, gl.gpus) as workers:
+    with runner(config.compute, config.data, gl.Shared) as workers:
         report = validate(config, workers)
     file = config.data / "validation.json"
     file.write_text(json.dumps(report, indent=1) + "\n")

@@ -16,6 +16,7 @@ import psutil
 import pytest
 from conftest import REPOSITORY
 
+from pipeline import gl
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.run.compute import TRIES, Expendable, loop, runner
@@ -75,18 +76,24 @@ def test_a_worker_keeps_the_memory_that_it_frees(tmp_path: Path) -> None:
     assert pages < 10 * BLOCK_BYTES // resource.getpagesize(), "not anew each time"
 
 
-def gpu(_: int) -> tuple[int, str | None]:
+def gpu(_: int) -> tuple[int, str, str | None]:
     time.sleep(0.1)
-    return os.getpid(), os.environ.get("MUJOCO_EGL_DEVICE_ID")
+    return os.getpid(), gl.choose().device, os.environ.get("MUJOCO_EGL_DEVICE_ID")
 
 
 @pytest.mark.slow
-def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(tmp_path: Path) -> None:
-    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, lambda: ("0", "2")) as run:
-        assert sorted(index or "" for _, index in set(run(gpu, range(30), "GPUs"))) == ["0", "0", "2"]
+def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # None that is there: a worker that tried what renders would find another.
+    monkeypatch.setattr(gl, "choose", lambda: gl.GlChoice("egl", "two GPUs", "a test"))
+    monkeypatch.setattr(gl, "gpus", lambda: ("0", "2"))
+    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, gl.Shared) as run:
+        found = sorted((device, index or "") for _, device, index in set(run(gpu, range(30), "GPUs")))
+        assert found == [("two GPUs", "0"), ("two GPUs", "0"), ("two GPUs", "2")]
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
             run(die, [1], "deaths")
-        assert {index for _, index in run(gpu, range(30), "GPUs")} <= {"0", "2"}
+        assert {(device, index) for _, device, index in run(gpu, range(30), "GPUs")} <= set(found)
 
 
 def die(_: int) -> int:

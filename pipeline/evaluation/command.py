@@ -141,7 +141,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     )
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
-    with runner(compute, arguments.out, gl.gpus) as run:
+    with runner(compute, arguments.out, gl.Shared) as run:
         found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
     return 0

@@ -89,14 +89,15 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 
 
 @contextmanager
-def runner(config: ComputeConfig, folder: Path, gpus: Callable[[], Sequence[str]] = tuple) -> Iterator[Run]:
+def runner(
+    config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None = None
+) -> Iterator[Run]:
     """Open what ``config.cluster`` names and yield the function that runs work on it.
 
     Args:
         config: where to run.
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
-        gpus: gives EGL's indices of those that worker processes of this machine render with, in turn; asked for local
-            workers only.
+        opengl: for work that renders, ``gl.Shared``: gives what each local worker calls with its number.
 
     Raises:
         PipelineError: when no scheduler answers, or a worker cannot work for this run.
@@ -128,8 +129,8 @@ def runner(config: ComputeConfig, folder: Path, gpus: Callable[[], Sequence[str]
         os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
         with _local_cluster(workers) as cluster, Client(cluster) as client:
             client.run(_leave_interrupts_to_the_run)
-            if found := gpus():
-                _share(found, client)
+            if opengl is not None:
+                _have_called(opengl(), client)
             # A worker that dies while it starts is not replaced by Dask alone.
             yield _on(client, refill=partial(cluster.scale, workers))
     elif config.cluster == "slurm":
@@ -177,16 +178,15 @@ def _local_cluster(workers: int) -> Any:
     ) from failure
 
 
-def _share(gpus: Sequence[str], client: Any) -> None:
-    """Give each worker of this machine one of the GPUs, also those that come later."""
+def _have_called(prepare: Callable[[int], None], client: Any) -> None:
+    """Have each worker of this machine call a function with its number, also those that come later."""
     from distributed import Worker, WorkerPlugin
 
-    class Share(WorkerPlugin):  # type: ignore[misc]
+    class Prepared(WorkerPlugin):  # type: ignore[misc]
         def setup(self, worker: Worker) -> None:
-            # Workers of this machine are numbered. MuJoCo looks when it opens its first context.
-            os.environ["MUJOCO_EGL_DEVICE_ID"] = gpus[int(worker.name) % len(gpus)]
+            prepare(int(worker.name))
 
-    client.register_plugin(Share())
+    client.register_plugin(Prepared())
 
 
 def _leave_interrupts_to_the_run() -> None:
