@@ -83,7 +83,8 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     finished = work / "record.json"
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, run)
-        places = target.assemble(work, pieces)
+        # In a worker, which has the format's packages loaded already.
+        (places,) = run(_Assembly(target, work), [pieces], f"{target.title} assembly")
         dataset = work / "dataset"
         sync(dataset)
         paths = sorted(file for file in dataset.rglob("*") if file.is_file())
@@ -118,6 +119,17 @@ class _PieceJob:
         path, episode_ids = piece
         with replaced(path) as temporary:
             self.target.write_piece(temporary, episode_ids, self.load)
+
+
+@dataclass(frozen=True)
+class _Assembly:
+    target: AnyFormat
+    work: Path
+
+    def __call__(self, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
+        # Without what a worker made that was lost in the middle of it.
+        keep_below(self.work, {self.work / name for name in pieces})
+        return self.target.assemble(self.work, pieces)
 
 
 def _clear_work(target: AnyFormat) -> None:

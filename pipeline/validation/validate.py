@@ -76,7 +76,8 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
                 # What damaged files seem to hold is of no interest, and may be anything.
                 continue
             try:
-                found = list(one.check(kept, cache))
+                # In a worker, which reads the episodes with the same packages later.
+                (found,) = run(partial(_as_a_whole, kept, cache), [one], f"{one.title} as a whole")
             except PipelineError as error:
                 total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
                 continue
@@ -101,6 +102,10 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
         check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
         for check, checked in total.checked.items()
     }
+
+
+def _as_a_whole(kept: Mapping[str, Row], cache: Path, one: Format[Any]) -> list[tuple[str, Fault]]:
+    return list(one.check(kept, cache))
 
 
 def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[Format[Any]]) -> list[list[Row]]:
