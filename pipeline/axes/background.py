@@ -8,6 +8,7 @@ changes the pattern; level 5 shows the new surface in colours of its own.
 from __future__ import annotations
 
 from functools import cache
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -194,11 +195,22 @@ def _cover(model: mujoco.MjModel, skin: Skin, image: Frame, colour_scale: float)
     start = int(model.tex_adr[skin.texture])
     there = model.tex_data[start : start + height * width * channels].reshape(height, width, channels)
     size = (width // skin.repeats, height // skin.repeats)
-    piece = cv2.resize(image, size, interpolation=cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR)
-    own, former = piece.mean((0, 1)).clip(1), there[..., :3].mean((0, 1))
+    interpolation = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
+    piece = np.asarray(cv2.resize(image, size, interpolation=interpolation), np.uint8)
+    own, former = _mean(piece).clip(1), _mean(there)
     wanted = former + colour_scale * (own - former)
     wanted *= np.clip(wanted.mean(), _DARKEST, _BRIGHTEST) / wanted.mean()
     # Darker by a factor and lighter by a shift: neither cuts the pattern off at black or white.
-    piece = np.where(wanted < own, piece * (wanted / own), piece + (wanted - own))
-    rows, columns = np.arange(height) % size[1], np.arange(width) % size[0]
-    there[..., :3] = np.rint(piece).clip(0, 255).astype(np.uint8)[rows[:, None], columns]
+    levels = np.arange(256.0)[:, None]
+    changed = np.where(wanted < own, levels * (wanted / own), levels + (wanted - own))
+    piece = np.asarray(cv2.LUT(piece, np.rint(changed).clip(0, 255).astype(np.uint8)[None]), np.uint8)
+    for top, left in product(range(0, height, size[1]), range(0, width, size[0])):
+        there[top : top + size[1], left : left + size[0], :3] = piece[: height - top, : width - left]
+
+
+def _mean(image: Frame) -> Floats:
+    """(3,) over the pixels of an image (H, W, 3 or more)."""
+    import cv2
+
+    sums: Floats = np.asarray(cv2.sumElems(image), float)[:3]
+    return sums / (image.shape[0] * image.shape[1])

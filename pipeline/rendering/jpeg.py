@@ -13,7 +13,7 @@ from pipeline.types import Frame
 if TYPE_CHECKING:
     from pipeline.config import RenderConfig
 
-Pixels = TypeVar("Pixels", bound=np.generic)
+Pixels = TypeVar("Pixels", bound=np.integer)
 
 
 def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
@@ -21,7 +21,7 @@ def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
 
     This is the only place where frames are turned. LIBERO's raw frames have their first row at the bottom.
     """
-    return np.ascontiguousarray(frame[::-1, ::-1])
+    return np.asarray(cv2.flip(frame, -1), frame.dtype)
 
 
 def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
@@ -33,7 +33,8 @@ def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
 
 def encode(frame: Frame, config: RenderConfig) -> bytes:
     """JPEG file of an RGB frame; every dataset carries these bytes or pixels decoded from them."""
-    done, packed = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
+    bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
+    done, packed = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
     if not done:
         raise RuntimeError("OpenCV could not encode a frame as JPEG")
     return packed.tobytes()

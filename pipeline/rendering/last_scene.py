@@ -9,6 +9,7 @@ import functools
 import mujoco
 
 from pipeline.rendering.renderer import Renderer
+from pipeline.scenes.compiled import compiled
 
 
 class LastScene:
@@ -29,7 +30,7 @@ class LastScene:
             PipelineError: when nothing renders on this machine.
         """
         if self._renderer is None or not self._is_last(scene):
-            model = mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else copy.copy(scene)
+            model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
             if self._renderer is None or not self._renderer.adopted(model):
                 self.close()
                 self._renderer = Renderer(model)

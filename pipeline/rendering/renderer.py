@@ -19,6 +19,7 @@ from pipeline.rendering.layer import Layer
 from pipeline.rendering.mesh_pieces import MeshPieces
 from pipeline.rendering.still import Still
 from pipeline.rendering.textures import Textures
+from pipeline.scenes.compiled import compiled
 from pipeline.types import Frame
 
 _LOOK = (
@@ -65,7 +66,7 @@ class Renderer:
     def __init__(self, scene: str | mujoco.MjModel):
         software = gl.prepare().software
         height, width, _ = SCHEMA.frame.shape
-        self.model = mujoco.MjModel.from_xml_string(scene) if isinstance(scene, str) else scene
+        self.model = compiled(scene) if isinstance(scene, str) else scene
         self.data = mujoco.MjData(self.model)
         self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()
@@ -250,24 +251,23 @@ class Renderer:
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
         """Apply render-layer perturbations to the model for a moment."""
         written = {name for perturbation in perturbations for name in perturbation.fields}
-        saved = {name: getattr(self.model, name).copy() for name in written}
-        # Textures are a hundred megabytes and more, and copied to the GL context: keep only those that change.
-        pixels = saved.pop("tex_data", None)
+        saved = {name: getattr(self.model, name).copy() for name in written - {"tex_data"}}
+        painted = "tex_data" in written
+        if painted:
+            self._textures.keep()
         former: dict[int, NDArray[np.uint8]] = {}
         try:
             try:
                 for perturbation in perturbations:
                     perturbation.apply(self.model)
             finally:
-                if pixels is not None:
-                    former = self._textures.former(pixels)
-                    del pixels
+                former = self._textures.former() if painted else {}
             self._upload(former)
             yield
         finally:
             for name, value in saved.items():
                 getattr(self.model, name)[:] = value
-            self._textures.write(former)
+            self._textures.put_back(former)
             self._upload(former)
 
     def _upload(self, textures: Collection[int]) -> None:

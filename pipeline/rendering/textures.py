@@ -29,6 +29,7 @@ class Textures:
         self._texels = [
             slice(start, start + size) for start, size in zip(model.tex_adr.tolist(), sizes.tolist(), strict=True)
         ]
+        self._kept: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._own = context.texture.copy()
         if former is not None:
             self._replace(former)
@@ -60,18 +61,26 @@ class Textures:
         own, theirs = self._model.tex_data[self._texels[texture]], other._model.tex_data[other._texels[number]]
         return np.array_equal(own, theirs)
 
-    def former(self, pixels: NDArray[np.uint8]) -> dict[int, NDArray[np.uint8]]:
-        """The former bytes of the textures that differ from ``pixels``, an earlier copy of the model's ``tex_data``."""
-        return {
-            texture: pixels[texels].copy()
-            for texture, texels in enumerate(self._texels)
-            if not np.array_equal(pixels[texels], self._model.tex_data[texels])
-        }
+    def keep(self) -> None:
+        """Have a copy of the model's textures, before they are written."""
+        # A hundred megabytes and more: made once, for those to whom it matters.
+        if len(self._kept) != len(self._model.tex_data):
+            self._kept = self._model.tex_data.copy()
 
-    def write(self, textures: Mapping[int, NDArray[np.uint8]]) -> None:
-        """Write bytes of textures into the model."""
-        for texture, value in textures.items():
+    def former(self) -> dict[int, NDArray[np.uint8]]:
+        """The former bytes of the textures that were written since ``keep`` was called first, or this was."""
+        there, former = self._model.tex_data, {}
+        for texture, texels in enumerate(self._texels):
+            if not np.array_equal(self._kept[texels], there[texels]):
+                former[texture] = self._kept[texels].copy()
+                self._kept[texels] = there[texels]
+        return former
+
+    def put_back(self, former: Mapping[int, NDArray[np.uint8]]) -> None:
+        """Write former bytes of textures into the model."""
+        for texture, value in former.items():
             self._model.tex_data[self._texels[texture]] = value
+            self._kept[self._texels[texture]] = value
 
     def upload(self, textures: Iterable[int]) -> None:
         """Copy textures of the model to the context."""
@@ -98,17 +107,21 @@ class Textures:
         if not perturbations:
             return {}
         names: dict[int, int] = {}
-        pixels = self._model.tex_data.copy()
+        former: dict[int, NDArray[np.uint8]] = {}
+        self.keep()
         try:
-            for perturbation in perturbations:
-                perturbation.apply(self._model)
+            try:
+                for perturbation in perturbations:
+                    perturbation.apply(self._model)
+            finally:
+                former = self.former()
             opengl = gl.calls()
-            for texture in self.former(pixels):
+            for texture in former:
                 names[texture] = int(opengl.glGenTextures(1))
             self.show(names)
             self.upload(names)
         finally:
-            self._model.tex_data[:] = pixels
+            self.put_back(former)
             self.show({})
         return names
 
