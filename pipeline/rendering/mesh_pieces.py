@@ -70,13 +70,10 @@ def boxes_of(model: mujoco.MjModel, hidden_groups: Collection[int]) -> Boxes:
 def _piece_bounds(model: mujoco.MjModel, mesh: int) -> Floats:
     """(P, 2, 3) centre and half size of the box around each piece of a mesh, in its geom's frame."""
     start, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    vertices_m = model.mesh_vert[model.mesh_vertadr[mesh] :][model.mesh_face[start : start + faces]]
-    bounds = []
-    for first in range(0, faces, PIECE_FACES):
-        piece_m = vertices_m[first : first + PIECE_FACES].reshape(-1, 3).astype(float)
-        low_m, high_m = piece_m.min(axis=0), piece_m.max(axis=0)
-        bounds.append([(low_m + high_m) / 2, (high_m - low_m) / 2])
-    return np.array(bounds)
+    vertices_m = model.mesh_vert[model.mesh_vertadr[mesh] :][model.mesh_face[start : start + faces].ravel()]
+    firsts = np.arange(0, 3 * faces, 3 * PIECE_FACES)
+    low_m, high_m = (least.reduceat(vertices_m, firsts).astype(float) for least in (np.minimum, np.maximum))
+    return np.stack([(low_m + high_m) / 2, (high_m - low_m) / 2], axis=1)
 
 
 def _corners(bounds: Floats) -> Floats:
