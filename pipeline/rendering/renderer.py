@@ -19,7 +19,7 @@ from pipeline.rendering.layer import Layer
 from pipeline.rendering.mesh_pieces import MeshPieces
 from pipeline.rendering.still import Still
 from pipeline.rendering.textures import Textures
-from pipeline.scenes.compiled import compiled
+from pipeline.scenes.compiled import Images, compiled
 from pipeline.types import Frame
 
 _LOOK = (
@@ -58,12 +58,13 @@ class Renderer:
 
     Args:
         scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
+        images: of a model that was compiled without them.
 
     Raises:
         PipelineError: when nothing renders on this machine.
     """
 
-    def __init__(self, scene: str | mujoco.MjModel):
+    def __init__(self, scene: str | mujoco.MjModel, images: Images | None = None):
         software = gl.prepare().software
         height, width, _ = SCHEMA.frame.shape
         self.model = compiled(scene) if isinstance(scene, str) else scene
@@ -82,11 +83,11 @@ class Renderer:
         self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
         self._still: dict[str, Still] = {}
         self._layers: dict[tuple[str, str], Layer] = {}
-        self._textures = Textures(self.model, self._renderer._mjr_context)
+        self._textures = Textures(self.model, self._renderer._mjr_context, images=images)
         self._painted: NDArray[np.bool_] = np.zeros(self.model.ngeom, np.bool_)
         self._paint = b""
 
-    def adopted(self, model: mujoco.MjModel) -> bool:
+    def adopted(self, model: mujoco.MjModel, images: Images | None = None) -> bool:
         """Go on with another model in the same GL context, where the meshes and textures that both have stay.
 
         Returns:
@@ -99,7 +100,7 @@ class Renderer:
         self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
         self._culling = self._culling_of(model)
         self._pieces = MeshPieces(model, context, self._culling.boxes, self._pieces)
-        self._textures = Textures(model, context, self._textures)
+        self._textures = Textures(model, context, self._textures, images)
         self._painted = np.zeros(model.ngeom, np.bool_)
         self._forget_layers()
         # What a context keeps of a model's size, as mjr_makeContext works it out.
@@ -259,7 +260,7 @@ class Renderer:
         try:
             try:
                 for perturbation in perturbations:
-                    perturbation.apply(self.model)
+                    self._apply(perturbation)
             finally:
                 former = self._textures.former() if painted else {}
             self._upload(former)
@@ -269,6 +270,18 @@ class Renderer:
                 getattr(self.model, name)[:] = value
             self._textures.put_back(former)
             self._upload(former)
+
+    def _apply(self, perturbation: RenderPerturbation) -> None:
+        """Apply a perturbation; what paints writes into the model with its images, which may be another one."""
+        if "tex_data" not in perturbation.fields:
+            perturbation.apply(self.model)
+            return
+        painted, others = self._textures.model, [name for name in perturbation.fields if name != "tex_data"]
+        for name in others:
+            getattr(painted, name)[:] = getattr(self.model, name)
+        perturbation.apply(painted)
+        for name in others:
+            getattr(self.model, name)[:] = getattr(painted, name)
 
     def _upload(self, textures: Collection[int]) -> None:
         if textures:

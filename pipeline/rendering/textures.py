@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 
 import mujoco
 import numpy as np
@@ -11,66 +12,96 @@ from numpy.typing import NDArray
 
 from pipeline import gl
 from pipeline.axes import RenderPerturbation
+from pipeline.scenes.compiled import Images
 
 
 class Textures:
     """By their numbers in the model; MuJoCo's OpenGL context must be the current one.
 
     Args:
+        model: whose textures they are.
         context: made from the model, or from another one.
         former: those of the model whose textures the context has, where it is another one. What both have stays there
             and is not copied again: a scene has 140 MB of textures, which take a second.
+        images: of a model that was compiled without them; else it has its own.
     """
 
-    def __init__(self, model: mujoco.MjModel, context: mujoco.MjrContext, former: Textures | None = None):
-        self._model, self._context = model, context
-        sizes = model.tex_height * model.tex_width * model.tex_nchannel
-        # Where each texture's bytes lie in the model's ``tex_data``.
-        self._texels = [
-            slice(start, start + size) for start, size in zip(model.tex_adr.tolist(), sizes.tolist(), strict=True)
-        ]
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        context: mujoco.MjrContext,
+        former: Textures | None = None,
+        images: Images | None = None,
+    ):
+        self._model, self._context, self._images = model, context, images
+        self._names = [model.tex(texture).name for texture in range(model.ntex)]
+        self._contents = [images.content(name) if images else None for name in self._names]
         self._kept: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._own = context.texture.copy()
-        if former is not None:
+        if former is None:
+            self._load([texture for texture, content in enumerate(self._contents) if content])
+        else:
             self._replace(former)
 
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The model with its images: what perturbations that paint write into. Compiled where it has none itself."""
+        return self._images.scene() if self._images else self._model
+
     def _replace(self, former: Textures) -> None:
-        names, model, context = self._own[: len(former._texels)].tolist(), self._model, self._context
+        left, model, context = former._own[: former._model.ntex].tolist(), self._model, self._context
         self._own[:], copied = 0, []
         for texture in range(model.ntex):
-            same = (number for number in range(len(names)) if names[number] and self._same(texture, former, number))
+            same = (number for number in range(len(left)) if left[number] and self._same(texture, former, number))
             if (number := next(same, None)) is None:
                 self._own[texture] = gl.calls().glGenTextures(1)
                 copied.append(texture)
             else:
-                self._own[texture], names[number] = names[number], 0
+                self._own[texture], left[number] = left[number], 0
         # OpenGL passes over the zeros.
-        gl.calls().glDeleteTextures(names)
+        gl.calls().glDeleteTextures(left)
         context.ntexture, context.textureType[: model.ntex] = model.ntex, model.tex_type
         context.mat_texid[: model.mat_texid.size] = model.mat_texid.ravel()
         context.mat_texrepeat[: model.mat_texrepeat.size] = model.mat_texrepeat.ravel()
         context.mat_texuniform[: model.nmat] = model.mat_texuniform
         self.show({})
-        self.upload(copied)
+        for texture in copied:
+            if not self._contents[texture]:
+                mujoco.mjr_uploadTexture(model, context, texture)
+        self._load([texture for texture in copied if self._contents[texture]])
+
+    def _load(self, textures: Sequence[int]) -> None:
+        """Read images and copy them to the context."""
+        if not textures or self._images is None:
+            return
+        loaded = self._images.load([self._names[texture] for texture in textures])
+        try:
+            self._context.texture[: len(textures)] = self._own[[*textures]]
+            for number in range(len(textures)):
+                mujoco.mjr_uploadTexture(loaded, self._context, number)
+        finally:
+            self.show({})
 
     def _same(self, texture: int, other: Textures, number: int) -> bool:
         """Whether a texture is the one that another model has under a number."""
+        if self._contents[texture] or other._contents[number]:
+            return self._contents[texture] == other._contents[number]
         fields = [(m.tex_type, m.tex_height, m.tex_width, m.tex_nchannel) for m in (self._model, other._model)]
         if any(own[texture] != theirs[number] for own, theirs in zip(*fields, strict=True)):
             return False
-        own, theirs = self._model.tex_data[self._texels[texture]], other._model.tex_data[other._texels[number]]
-        return np.array_equal(own, theirs)
+        own, theirs = _texels(self._model)[texture], _texels(other._model)[number]
+        return np.array_equal(self._model.tex_data[own], other._model.tex_data[theirs])
 
     def keep(self) -> None:
         """Have a copy of the model's textures, before they are written."""
         # A hundred megabytes and more: made once, for those to whom it matters.
-        if len(self._kept) != len(self._model.tex_data):
-            self._kept = self._model.tex_data.copy()
+        if len(self._kept) != len(self.model.tex_data):
+            self._kept = self.model.tex_data.copy()
 
     def former(self) -> dict[int, NDArray[np.uint8]]:
         """The former bytes of the textures that were written since ``keep`` was called first, or this was."""
-        there, former = self._model.tex_data, {}
-        for texture, texels in enumerate(self._texels):
+        there, former = self.model.tex_data, {}
+        for texture, texels in enumerate(_texels(self.model)):
             if not np.array_equal(self._kept[texels], there[texels]):
                 former[texture] = self._kept[texels].copy()
                 self._kept[texels] = there[texels]
@@ -79,13 +110,13 @@ class Textures:
     def put_back(self, former: Mapping[int, NDArray[np.uint8]]) -> None:
         """Write former bytes of textures into the model."""
         for texture, value in former.items():
-            self._model.tex_data[self._texels[texture]] = value
-            self._kept[self._texels[texture]] = value
+            texels = _texels(self.model)[texture]
+            self.model.tex_data[texels] = self._kept[texels] = value
 
     def upload(self, textures: Iterable[int]) -> None:
-        """Copy textures of the model to the context."""
+        """Copy textures of the model with its images to the context."""
         for texture in textures:
-            mujoco.mjr_uploadTexture(self._model, self._context, texture)
+            mujoco.mjr_uploadTexture(self.model, self._context, texture)
 
     @contextmanager
     def held(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[dict[int, int]]]:
@@ -112,7 +143,7 @@ class Textures:
         try:
             try:
                 for perturbation in perturbations:
-                    perturbation.apply(self._model)
+                    perturbation.apply(self.model)
             finally:
                 former = self.former()
             opengl = gl.calls()
@@ -134,3 +165,9 @@ class Textures:
         """(ngeom,) which geoms have one of the textures."""
         of_material = np.isin(self._model.mat_texid, [*textures]).reshape(self._model.nmat, -1).any(axis=1)
         return np.asarray(np.append(of_material, False)[self._model.geom_matid])
+
+
+def _texels(model: mujoco.MjModel) -> list[slice]:
+    """Where each texture's bytes lie in a model's ``tex_data``."""
+    sizes = model.tex_height * model.tex_width * model.tex_nchannel
+    return [slice(start, start + size) for start, size in zip(model.tex_adr.tolist(), sizes.tolist(), strict=True)]

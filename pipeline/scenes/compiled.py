@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import posixpath
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import mujoco
@@ -27,7 +27,7 @@ def physics_of(model_xml: str) -> mujoco.MjModel:
     Raises:
         ValueError: when MuJoCo refuses the scene.
     """
-    return copy.copy(_compiled(model_xml))
+    return copy.copy(physics_to_read(model_xml))
 
 
 def compiled(model_xml: str) -> mujoco.MjModel:
@@ -45,7 +45,8 @@ def compiled(model_xml: str) -> mujoco.MjModel:
 
 
 @lru_cache(maxsize=2)
-def _compiled(model_xml: str) -> mujoco.MjModel:
+def physics_to_read(model_xml: str) -> mujoco.MjModel:
+    """The same model for all who ask, not to be written into: a copy takes 100 MB."""
     scene = ET.fromstring(model_xml)
     take_images(scene)
     return compiled(ET.tostring(scene, encoding="unicode"))
@@ -65,6 +66,37 @@ def take_images(scene: ET.Element) -> dict[str, dict[str, str]]:
     return taken
 
 
+class Images:
+    """The images of a scene that was compiled without them (``physics_of``).
+
+    Args:
+        model_xml: MJCF of the scene.
+    """
+
+    def __init__(self, model_xml: str):
+        self._model_xml = model_xml
+        scene = ET.fromstring(model_xml)
+        self._compiler = scene.findall("compiler")
+        self._taken = take_images(scene)
+
+    def content(self, name: str) -> tuple[tuple[str, str], ...] | None:
+        """Tells a texture that is an image from any other; None when it is none."""
+        attributes = self._taken.get(name, {})
+        return tuple(sorted(item for item in attributes.items() if item[0] != "name")) or None
+
+    def load(self, names: Sequence[str]) -> mujoco.MjModel:
+        """A model of nothing but these textures, in their order."""
+        scene = ET.Element("mujoco")
+        scene.extend(self._compiler)
+        asset = ET.SubElement(scene, "asset")
+        asset.extend(ET.Element("texture", self._taken[name]) for name in names)
+        return compiled(ET.tostring(scene, encoding="unicode"))
+
+    def scene(self) -> mujoco.MjModel:
+        """The scene compiled with its images."""
+        return compiled(self._model_xml)
+
+
 def put_images(scene: ET.Element, taken: Mapping[str, Mapping[str, str]]) -> None:
     """Undo ``take_images``, in a scene that MuJoCo compiled without its images and wrote as MJCF since."""
     for texture in scene.iterfind("asset/texture[@name]"):
@@ -76,14 +108,14 @@ def put_images(scene: ET.Element, taken: Mapping[str, Mapping[str, str]]) -> Non
 
 
 class CompiledScene:
-    """A scene's model and data at its state.
+    """A scene's model, not to be written into, and data at its state.
 
     Args:
-        scene: what to compile, as ``physics_of`` does.
+        scene: what to compile, as ``physics_to_read`` does.
     """
 
     def __init__(self, scene: Scene):
-        self.model = physics_of(scene.model_xml)
+        self.model = physics_to_read(scene.model_xml)
         self.data = mujoco.MjData(self.model)
         self.restore(scene.state)
 

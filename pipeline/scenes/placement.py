@@ -16,7 +16,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
-from pipeline.scenes.compiled import physics_of
+from pipeline.scenes.compiled import physics_to_read
 from pipeline.scenes.swept_path import SweptPath
 from pipeline.types import Demo, Floats, RollOut, Scene
 
@@ -122,7 +122,7 @@ class _Placement:
         names: Sequence[str],
         targets: Sequence[str],
     ):
-        self._model = physics_of(model_xml)
+        self._model = physics_to_read(model_xml)
         self._data = mujoco.MjData(self._model)
         self.old_nq = self._model.nq - 7 * len(names)
         self._old_nv = self._model.nv - 6 * len(names)
