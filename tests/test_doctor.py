@@ -76,7 +76,7 @@ def test_memory_is_counted_for_the_workers_that_are_asked_for(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     link_testset(tmp_path)
-    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 9e9)
+    monkeypatch.setattr("distributed.system.MEMORY_LIMIT", 15e9)
     for workers, warned in ((4, False), (5, True)):
         run_doctor("starter", monkeypatch, free_gb=1, compute=ComputeConfig(workers=workers))
         assert ("warn  machine" in capsys.readouterr().err) == warned
