@@ -105,13 +105,12 @@ class MeshPieces:
         self._boxes = np.flatnonzero(meshes >= 0)
         drawn, self._mesh = np.unique(meshes[self._boxes], return_inverse=True)
         self._piece = boxes.piece[self._boxes]
-        counts = [int(self._piece[self._mesh == number].max()) + 1 for number in range(len(drawn))]
         former_shapes = {} if former is None else former._free(model.nmesh)
         self._shapes: dict[bytes, _Shape] = {}
         self._meshes: list[_Shape] = []
-        for mesh, count in zip(drawn.tolist(), counts, strict=True):
+        for mesh in drawn.tolist():
             content = _content(model, mesh)
-            shape = self._shapes.get(content) or former_shapes.pop(content, None) or _shape(model, context, mesh, count)
+            shape = self._shapes.get(content) or former_shapes.pop(content, None) or _shape(model, context, mesh)
             self._shapes[content] = shape
             self._meshes.append(shape)
         for shape in former_shapes.values():
@@ -191,11 +190,12 @@ class _Shape(NamedTuple):
             display_list.free(number, 2)
 
 
-def _shape(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, count: int) -> _Shape:
-    whole = _upload(model, context, mesh, 0, model.mesh_facenum[mesh])
-    if count == 1:
+def _shape(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int) -> _Shape:
+    faces = int(model.mesh_facenum[mesh])
+    whole = _upload(model, context, mesh, 0, faces)
+    if faces <= PIECE_FACES:
         return _Shape(whole, (whole,))
-    firsts = range(0, count * PIECE_FACES, PIECE_FACES)
+    firsts = range(0, faces, PIECE_FACES)
     return _Shape(whole, tuple(_upload(model, context, mesh, first, PIECE_FACES) for first in firsts))
 
 
