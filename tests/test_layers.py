@@ -28,8 +28,12 @@ SITES = "".join(
 )
 
 
-def scene() -> str:
-    """Bodies above a floor, a mirror on a table, a pane of glass before some of them, and sites, seen or not."""
+def scene(shadows: bool) -> str:
+    """Bodies above a floor, a mirror on a table, a pane of glass before some of them, and sites, seen or not.
+
+    Args:
+        shadows: whether the second lamp casts them.
+    """
     rng = seeding.rng("test_layers")
     bodies = "".join(
         f'<body mocap="true" pos="{" ".join(f"{x:.3f}" for x in rng.uniform(-0.5, 0.5, 3))}">'
@@ -41,6 +45,7 @@ def scene() -> str:
       <asset><material name="mirror" reflectance="0.5"/><material name="paint" specular="0.8"/></asset>
       <worldbody>
         <light pos="0.5 0 3" dir="0 0 -1" castshadow="false"/>
+        <light pos="-1 1 3" dir="0.3 -0.3 -1" diffuse="0.3 0.3 0.4" castshadow="{str(shadows).lower()}"/>
         <geom type="plane" size="3 3 0.1" pos="0 0 -0.7" group="1" rgba="0.5 0.5 0.5 1"/>
         <geom type="box" size="0.3 0.3 0.01" pos="0.2 0.5 -0.5" group="1" material="mirror"/>
         <geom type="box" size="0.4 0.4 0.01" pos="0.2 0.5 -0.53" group="1" rgba="0.9 0.8 0.7 1"/>
@@ -54,8 +59,8 @@ def scene() -> str:
 
 
 @pytest.fixture
-def renderer() -> Iterator[Renderer]:
-    opened = Renderer(scene())
+def renderer(request: pytest.FixtureRequest) -> Iterator[Renderer]:
+    opened = Renderer(scene(shadows=getattr(request, "param", False)))
     yield opened
     opened.close()
 
@@ -80,6 +85,7 @@ def assert_as_plain(renderer: Renderer, *cameras: str) -> None:
         assert np.array_equal(renderer.frame(camera), plain(renderer, camera)), camera
 
 
+@pytest.mark.parametrize("renderer", [False, True], ids=["lights", "shadows"], indirect=True)
 def test_the_same_pixels_whatever_moves(renderer: Renderer) -> None:
     rng = seeding.rng("test_layers", "moves")
     for step in range(80):
@@ -93,6 +99,7 @@ def test_the_same_pixels_whatever_moves(renderer: Renderer) -> None:
         assert_as_plain(renderer, *CAMERAS)
 
 
+@pytest.mark.parametrize("renderer", [False, True], ids=["lights", "shadows"], indirect=True)
 def test_what_stands_still_is_drawn_once(renderer: Renderer, drawn: list[int]) -> None:
     for step in range(30):
         renderer.data.mocap_pos[0, 2] = 0.01 * step

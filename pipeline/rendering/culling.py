@@ -27,6 +27,9 @@ WIDEST_CONE = np.radians(80)
 WIDEST_MAP_DEG = 80.0
 """Half the widest angle of MuJoCo's maps of what casts shadows (``mjr_render``)."""
 
+SHADOW_MARGIN_M = 0.05
+"""How far out of a picture a shadow is let be: more than two pixels of a lamp's map of it."""
+
 SQUARE = np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])
 """Corners of a box's upper z face, which is what reflects (``mjr_render``), in units of its half sizes."""
 
@@ -40,6 +43,7 @@ class Picture(NamedTuple):
         seen: (N,) which boxes are before the camera.
         images: (N,) which show in the mirror.
         shadows: (N,) for each lamp with shadows, which boxes cast them, and which are seen and lit.
+        sites: (nsite,) which sites.
         layers: whether it can be put together of layers, of what is opaque and does not reflect.
     """
 
@@ -49,6 +53,7 @@ class Picture(NamedTuple):
     seen: NDArray[np.bool_]
     images: NDArray[np.bool_]
     shadows: tuple[NDArray[np.bool_], ...]
+    sites: NDArray[np.bool_]
     layers: bool
 
 
@@ -65,8 +70,9 @@ class Culling:
         self._model, self._height, self._width, self._layers = model, height, width, layers
         self._shown = ~np.isin(model.geom_group, list(hidden_groups))
         self.boxes = boxes_of(model, hidden_groups)
-        # A plane has no bound: it is drawn wherever it is.
         self._planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        # A plane without bounds is drawn wherever it is.
+        self._endless = self._planes & (model.geom_size[:, :2].min(axis=1) <= 0)
         self._of_mesh = (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)[self.boxes.geom]
         # What moves is left out, as layers are kept while what they show stands still.
         fixed = ((model.body_weldid == 0) & (model.body_mocapid[model.body_rootid] < 0))[model.geom_bodyid]
@@ -85,15 +91,14 @@ class Culling:
         of = self.boxes.geom
         turns = data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
         corners_m = data.geom_xpos[of, None] + self.boxes.corners_m @ turns[of]
-        seen = self._planes[of] | view.shows(corners_m)
+        seen = self._endless[of] | view.shows(corners_m)
         near = np.flatnonzero(seen & self._of_mesh)
         seen[near] = ~self._hidden(data, view, corners_m[near], clear)
         casting = np.zeros_like(seen)
         shadows: list[NDArray[np.bool_]] = []
-        for casts, reached in self._lamps(data, corners_m):
+        for casts, reached in self._lamps(data, view, corners_m):
             # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
             lit = reached & seen | clear[of]
-            # A shadow may come from outside of the picture.
             shadows += [casts & lit.any(), lit]
             casting |= casts
         images = np.zeros_like(seen)
@@ -106,7 +111,8 @@ class Culling:
             seen=seen,
             images=images,
             shadows=tuple(shadows),
-            layers=self._layers and not shadows and not self._sites_see_through(),
+            sites=self._sites(bool(shadows)),
+            layers=self._layers and not self._sites_see_through(),
         )
 
     def _geoms(self, boxes: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -120,12 +126,13 @@ class Culling:
         heights_m = self._heights(data, mirror, corners_m)
         image_m = corners_m - 2 * heights_m[..., None] * self._normal(data, mirror)
         images: NDArray[np.bool_] = (heights_m > 0).any(axis=1) & view.shows(image_m)
-        if not self._planes[mirror]:
-            corners = SQUARE * self._model.geom_size[mirror]
+        if not self._endless[mirror]:
+            half_x_m, half_y_m, _ = self._model.geom_size[mirror]
+            corners = SQUARE * [half_x_m, half_y_m, self._face_m(mirror)]
             images &= view.shows_through(
                 image_m, data.geom_xpos[mirror] + corners @ data.geom_xmat[mirror].reshape(3, 3).T
             )
-        return np.asarray(images | self._planes[self.boxes.geom])
+        return np.asarray(images | self._endless[self.boxes.geom])
 
     def _hidden(
         self, data: mujoco.MjData, view: _View, corners_m: Floats, clear: NDArray[np.bool_]
@@ -153,9 +160,11 @@ class Culling:
             hidden[behind] |= ((enters < leaves) & (enters < 1) & drawn).all(axis=1)
         return hidden
 
-    def _lamps(self, data: mujoco.MjData, corners_m: Floats) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-        """For each lamp with shadows, in MuJoCo's order, (N,) which boxes may be in its map of what casts them, and
-        which its light may reach: all but those out of its cone."""
+    def _lamps(
+        self, data: mujoco.MjData, view: _View, corners_m: Floats
+    ) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
+        """For each lamp with shadows, in MuJoCo's order, (N,) which boxes may cast them into the picture, and which its
+        light may reach: those in its map, and those in its cone."""
         model, lamps = self._model, np.flatnonzero(self._model.light_castshadow & self._model.light_active)
         if not len(lamps):
             return
@@ -170,6 +179,8 @@ class Culling:
             corner = np.arctan(np.sqrt(2) * np.tan(np.radians(map_deg)))
             axis, origin_m = data.light_xdir[lamp] / np.linalg.norm(data.light_xdir[lamp]), data.light_xpos[lamp]
             casts = self._in_cone(middles_m, radii_m, origin_m, axis, corner)
+            # Out of the picture, it may still stand between the lamp and what is in it.
+            casts &= self._endless[self.boxes.geom] | view.shows(corners_m, origin_m)
             yield casts, self._in_cone(middles_m, radii_m, origin_m, axis, np.radians(model.light_cutoff[lamp]))
 
     def _in_cone(
@@ -182,7 +193,7 @@ class Culling:
         along_m = ways_m @ axis
         across_m = np.linalg.norm(ways_m - along_m[:, None] * axis, axis=1)
         near = across_m * np.cos(angle) - along_m * np.sin(angle) < radii_m
-        return np.asarray(near | self._planes[self.boxes.geom])
+        return np.asarray(near | self._endless[self.boxes.geom])
 
     def _mirror(self, data: mujoco.MjData, view: _View, clear: NDArray[np.bool_]) -> tuple[int | None, bool]:
         """The geom whose mirror images MuJoCo draws: the first that reflects, if the camera is before it.
@@ -208,15 +219,25 @@ class Culling:
 
     def _heights(self, data: mujoco.MjData, mirror: int, places_m: Floats) -> Floats:
         """(...) of ``places_m`` (..., 3) above the reflecting side: that of a plane, or a box's face."""
-        face_m = 0 if self._planes[mirror] else self._model.geom_size[mirror, 2]
-        heights_m: Floats = (places_m - data.geom_xpos[mirror]) @ self._normal(data, mirror) - face_m
+        heights_m: Floats = (places_m - data.geom_xpos[mirror]) @ self._normal(data, mirror) - self._face_m(mirror)
         return heights_m
+
+    def _face_m(self, mirror: int) -> float:
+        """How far a geom's reflecting face is from its middle."""
+        return 0.0 if self._planes[mirror] else float(self._model.geom_size[mirror, 2])
 
     def _see_through(self) -> NDArray[np.bool_]:
         """(ngeom,) which geoms may show what is behind them: by their own colour, or by their material's."""
         model, materials = self._model, self._model.geom_matid
         opacity = np.minimum(model.geom_rgba[:, 3], np.append(model.mat_rgba[:, 3], 1)[materials])
         return np.asarray(self._shown & (opacity < 1))
+
+    def _sites(self, shadows: bool) -> NDArray[np.bool_]:
+        """(nsite,) which sites may show.
+
+        robosuite hides some by a negative opacity: MuJoCo draws them, and only where lamps cast shadows they show.
+        """
+        return np.asarray((self._model.site_rgba[:, 3] > 0) | shadows)
 
     def _sites_see_through(self) -> bool:
         opacity = self._model.site_rgba[:, 3]
@@ -227,7 +248,7 @@ class Culling:
         every, clear = np.ones(len(self.boxes.geom), np.bool_), self._see_through()
         reflecting = self._shown & False
         reflecting[self._flat] = True
-        return Picture(self._shown & ~clear, clear, reflecting, every, every, (), False)
+        return Picture(self._shown & ~clear, clear, reflecting, every, every, (), self._sites(shadows=True), False)
 
 
 class _View:
@@ -247,14 +268,19 @@ class _View:
         depths_m: Floats = -(corners_m - self.position_m) @ self._axes[:, 2]
         return depths_m
 
-    def shows(self, corners_m: Floats) -> NDArray[np.bool_]:
-        """(N,) whether boxes with ``corners_m`` (N, 8, 3) may be in the picture."""
+    def shows(self, corners_m: Floats, lamp_m: Floats | None = None) -> NDArray[np.bool_]:
+        """(N,) whether boxes with ``corners_m`` (N, 8, 3) may be in the picture, or with a lamp (3,), their shadows."""
+        margin_m = 0.0
+        if lamp_m is not None:
+            # By a metre's distance from the lamp, a shadow reaches a hundred metres.
+            corners_m = np.concatenate([corners_m, corners_m + 100 * (corners_m - lamp_m)], axis=1)
+            margin_m = SHADOW_MARGIN_M
         right, up, back = np.moveaxis((corners_m - self.position_m) @ self._axes, -1, 0)
         inside = np.ones(len(corners_m), np.bool_)
         for off_axis, tangent in ((right, self._tangents[0]), (up, self._tangents[1])):
             # A box is outside when all of it is beyond one side; the sides pass through the camera.
-            inside &= ~(off_axis + tangent * back > 0).all(axis=1)
-            inside &= ~(off_axis - tangent * back < 0).all(axis=1)
+            inside &= ~(off_axis + tangent * back > margin_m).all(axis=1)
+            inside &= ~(off_axis - tangent * back < -margin_m).all(axis=1)
         return inside
 
     def shows_through(self, corners_m: Floats, opening_m: Floats) -> NDArray[np.bool_]:

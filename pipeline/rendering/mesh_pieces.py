@@ -59,8 +59,12 @@ def boxes_of(model: mujoco.MjModel, hidden_groups: Collection[int]) -> Boxes:
     corners: list[Floats] = []
     numbers: list[tuple[int, int]] = []
     for geom in np.flatnonzero(~np.isin(model.geom_group, list(hidden_groups))).tolist():
-        mesh = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH
-        bounds = _piece_bounds(model, model.geom_dataid[geom]) if mesh else model.geom_aabb[geom].reshape(1, 2, 3)
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+            bounds = _piece_bounds(model, model.geom_dataid[geom])
+        elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+            bounds = np.array([[np.zeros(3), [*model.geom_size[geom, :2], 0]]])
+        else:
+            bounds = model.geom_aabb[geom].reshape(1, 2, 3)
         corners.append(_corners(bounds))
         numbers += [(geom, piece) for piece in range(len(bounds))]
     geoms, pieces = np.array(numbers, np.intp).reshape(-1, 2).T
@@ -135,7 +139,12 @@ class MeshPieces:
         return self._shapes
 
     def show(
-        self, name: Hashable, passes: Sequence[NDArray[np.bool_]], scene: mujoco.MjvScene, layers: Sequence[Layer] = ()
+        self,
+        name: Hashable,
+        passes: Sequence[NDArray[np.bool_]],
+        scene: mujoco.MjvScene,
+        main: int = 0,
+        layers: Sequence[Layer] = (),
     ) -> None:
         """Have the pieces drawn of which a box is wanted, of the geoms that are in a scene.
 
@@ -143,16 +152,16 @@ class MeshPieces:
             name: of what is drawn, for which most lists stay as they were the last time.
             passes: (N,) which of the boxes each pass of ``mjr_render`` draws; those after the last draw the same.
             scene: of all that is drawn; it gets one more mesh, the last.
-            layers: put in the last of ``passes``.
+            main: which of ``passes`` gets the layers.
+            layers: put after all other meshes.
         """
         made = self._passes.setdefault(name, [])
         while len(made) < len(passes):
             made.append(_Lists(len(self._meshes)))
         for number, (lists, wanted) in enumerate(zip(made, passes, strict=False)):
             self._write(lists, wanted)
-            last = number + 1 == len(passes)
-            then = lists if last else made[number + 1]
-            end = then.base, *(layer.number for layer in layers if last)
+            then = made[min(number + 1, len(passes) - 1)]
+            end = then.base, *(layer.number for layer in layers if number == main)
             if lists.end != end:
                 with display_list.recorded(lists.base + len(self._meshes)):
                     for layer in end[1:]:

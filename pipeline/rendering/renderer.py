@@ -29,7 +29,7 @@ _LOOK = (
 """What a picture depends on in a model, beside meshes and textures, and where its geoms and sites are."""
 
 _CULLED = mujoco.mjNGROUP - 1
-"""A group of geoms that nothing in LIBERO is in, and that is not drawn."""
+"""A group of geoms and sites that nothing in LIBERO is in, and that is not drawn."""
 
 
 class Surfaces(NamedTuple):
@@ -73,7 +73,7 @@ class Renderer:
         self._option = mujoco.MjvOption()
         # As robosuite's off-screen context: visual meshes without the collision geometry.
         self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
-        self._option.geomgroup[_CULLED] = 0
+        self._option.geomgroup[_CULLED] = self._option.sitegroup[_CULLED] = 0
         hidden = np.flatnonzero(np.logical_not(self._option.geomgroup))
         self._renderer._gl_context.make_current()
         # On a GPU the geoms are no effort, and what would spare them is.
@@ -136,7 +136,8 @@ class Renderer:
         view, places = self._view(camera), self._places()
         opaque = picture.opaque & ~picture.mirror
         painted = opaque & self._painted
-        if painted.any():
+        # What lamps with shadows light is drawn once more for each of them, so that little is gained.
+        if painted.any() and not picture.shadows:
             rest = opaque & ~painted
             content = view + rest.tobytes() + places[rest].tobytes()
             draw = partial(self._draw_beside_still, picture, rest, camera, view, places, last=False)
@@ -154,7 +155,9 @@ class Renderer:
         last: bool = True,
     ) -> None:
         """Draw opaque geoms of a picture; those that stand still are a layer."""
-        still = self._still.setdefault(camera, Still(self.model)).geoms(view, places, opaque) & opaque
+        if camera not in self._still:
+            self._still[camera] = Still(self.model)
+        still = self._still[camera].geoms(view, places, opaque) & opaque
         layers = []
         if still.any():
             content = view + still.tobytes() + places[still].tobytes()
@@ -170,10 +173,14 @@ class Renderer:
         if layer.content != content:
             # The sky is behind all layers.
             sky, flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = flags[mujoco.mjtRndFlag.mjRND_SKYBOX], False
+            # The light of lamps with shadows is added to a picture afterwards.
+            active = self.model.light_active.copy()
+            self.model.light_active[self.model.light_castshadow != 0] = 0
             try:
                 draw()
             finally:
                 flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = sky
+                self.model.light_active[:] = active
             layer.keep(content)
         return layer
 
@@ -188,28 +195,34 @@ class Renderer:
         """Draw opaque geoms (ngeom,) of a picture, over layers, into the emptied off-screen buffer.
 
         Args:
-            last: with what no layer has: the mirror and what shows in it, what can be seen through, and the sites.
+            last: with what no layer has: the mirror and what shows in it, what can be seen through, the sites, and
+                the light of lamps with shadows.
         """
-        of, passes, drawn = self._culling.boxes.geom, [picture.seen], opaque
+        of, main, drawn = self._culling.boxes.geom, picture.seen & opaque[self._culling.boxes.geom], opaque
+        before, after = [], []
         reflections = last and bool(picture.mirror.any())
         if last:
-            drawn = opaque | picture.mirror | picture.clear
-            passes = [picture.seen & drawn[of] | picture.clear[of], *picture.shadows]
+            beside = picture.mirror | picture.clear
+            main = main | picture.seen & beside[of] | picture.clear[of]
+            drawn, after = opaque | beside, [*picture.shadows]
+        if after:
+            # Lamps light what is in the layers, too.
+            drawn = drawn | picture.opaque
         if reflections:
             # A geom that is there for its image alone has no piece before the camera to draw.
             drawn[of[picture.images]] = True
-            passes.insert(0, picture.images | picture.clear[of])
-        groups, site_groups, scene = self.model.geom_group.copy(), self._option.sitegroup.copy(), self._renderer.scene
+            before = [picture.images | picture.clear[of]]
+        groups, site_groups, scene = self.model.geom_group.copy(), self.model.site_group.copy(), self._renderer.scene
         try:
             self.model.geom_group[:] = np.where(drawn, groups, _CULLED)
-            self._option.sitegroup *= last
+            self.model.site_group[:] = np.where(last & picture.sites, site_groups, _CULLED)
             scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
             self._renderer.update_scene(self.data, camera, self._option)
-            self._pieces.show((camera, last), passes, scene, layers)
+            self._pieces.show((camera, last), [*before, main, *after], scene, len(before), layers)
             mujoco.mjr_render(self._renderer._rect, scene, self._renderer._mjr_context)
         finally:
             self.model.geom_group[:] = groups
-            self._option.sitegroup[:] = site_groups
+            self.model.site_group[:] = site_groups
 
     def _view(self, camera: str) -> bytes:
         """All that a picture depends on beside textures, geoms and sites."""
