@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 Values = NDArray[Any]
@@ -106,8 +106,9 @@ def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = 
         axes.set(xlabel=label, ylabel="share", xlim=(bins[0] - margin, bins[-1] + margin))
         if log:
             axes.set(yscale="log", ylim=(SMALLEST_SHARE, 1.2))
-            # Left to itself, Matplotlib sets powers of ten as formulas, which takes longer than all else.
-            axes.yaxis.set(major_formatter="{x:g}", minor_formatter=NullFormatter())
+            # Left to itself, Matplotlib sets powers of ten as formulas, and eight ticks between two, which takes longer
+            # than all else.
+            axes.yaxis.set(major_formatter="{x:g}", minor_locator=NullLocator())
 
     return panel(title, draw)
 

@@ -29,7 +29,7 @@ def mp4(frames: Sequence[Frame], steps: Sequence[int]) -> bytes:
     shown_s = (steps[-1] - steps[0] + 1) / SCHEMA.fps_hz
     bits_per_s = int(0.95 * VIDEO_BYTES * 8 / (shown_s + 1))
     rate = {"maxrate": str(bits_per_s), "bufsize": str(bits_per_s)}
-    limits = {"crf": _CRF, "preset": "medium", "threads": "1", **rate}
+    limits = {"crf": _CRF, "preset": "veryfast", "threads": "1", **rate}
     packed = io.BytesIO()
     with av.open(packed, "w", format="mp4") as file:
         stream = file.add_stream(_ENCODER, SCHEMA.fps_hz, options=limits)
