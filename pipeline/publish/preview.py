@@ -43,8 +43,8 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task
 
-VARIANTS, PHYSICS_VARIANTS = 11, 5
-"""With the original, three rows of four; a row and a half where each variant is a scene of its own to compile."""
+VARIANTS, PHYSICS_VARIANTS = 11, 3
+"""With the original, three rows of four; one where each variant is a scene of its own to compile."""
 CANDIDATES = 200
 """The plan's first draws, from which the variants are chosen; most draws take well under a millisecond."""
 
