@@ -168,6 +168,7 @@ def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyP
 
 def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(1, 5)))
+    monkeypatch.setattr(preview, "PHYSICS_VARIANTS", 4)
     captions: list[str] = []
 
     def tile(picture: Image.Image, caption: str) -> sheets.Tile:
