@@ -28,7 +28,7 @@ WIDEST_MAP_DEG = 80.0
 """Half the widest angle of MuJoCo's maps of what casts shadows (``mjr_render``)."""
 
 SHADOW_MARGIN_M = 0.05
-"""How far out of a picture a shadow is let be: more than two pixels of a lamp's map of it."""
+"""So near to a picture, a shadow counts as in it: more than two pixels of a lamp's map."""
 
 SQUARE = np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])
 """Corners of a box's upper z face, which is what reflects (``mjr_render``), in units of its half sizes."""
@@ -180,7 +180,10 @@ class Culling:
             axis, origin_m = data.light_xdir[lamp] / np.linalg.norm(data.light_xdir[lamp]), data.light_xpos[lamp]
             casts = self._in_cone(middles_m, radii_m, origin_m, axis, corner)
             # Out of the picture, it may still stand between the lamp and what is in it.
-            casts &= self._endless[self.boxes.geom] | view.shows(corners_m, origin_m)
+            # By a metre's distance from the lamp, its shadow reaches a hundred metres.
+            far_m = corners_m + 100 * (corners_m - origin_m)
+            shadows_m = np.concatenate([corners_m, far_m], axis=1)
+            casts &= self._endless[self.boxes.geom] | view.shows(shadows_m, SHADOW_MARGIN_M)
             yield casts, self._in_cone(middles_m, radii_m, origin_m, axis, np.radians(model.light_cutoff[lamp]))
 
     def _in_cone(
@@ -268,13 +271,8 @@ class _View:
         depths_m: Floats = -(corners_m - self.position_m) @ self._axes[:, 2]
         return depths_m
 
-    def shows(self, corners_m: Floats, lamp_m: Floats | None = None) -> NDArray[np.bool_]:
-        """(N,) whether boxes with ``corners_m`` (N, 8, 3) may be in the picture, or with a lamp (3,), their shadows."""
-        margin_m = 0.0
-        if lamp_m is not None:
-            # By a metre's distance from the lamp, a shadow reaches a hundred metres.
-            corners_m = np.concatenate([corners_m, corners_m + 100 * (corners_m - lamp_m)], axis=1)
-            margin_m = SHADOW_MARGIN_M
+    def shows(self, corners_m: Floats, margin_m: float = 0.0) -> NDArray[np.bool_]:
+        """(N,) whether what has ``corners_m`` (N, K, 3) may be in the picture, or within a margin around it."""
         right, up, back = np.moveaxis((corners_m - self.position_m) @ self._axes, -1, 0)
         inside = np.ones(len(corners_m), np.bool_)
         for off_axis, tangent in ((right, self._tangents[0]), (up, self._tangents[1])):
