@@ -34,6 +34,13 @@ def outputs(stage: str) -> list[str]:
     return [next(iter(entry)).replace("${run}", "tiny") for entry in listed]
 
 
+ALONE = """
+import sys
+
+sys.meta_path[:] = [finder for finder in sys.meta_path if "__editable__" not in str(finder)]
+"""
+"""Keeps Python from taking what is missing from where the package is installed."""
+
 MADE_BUT_FOR_ONE = {"replay": "data/tiny/trajectories", "render": "data/tiny/frames"}
 """Stores that a stage finds as after a kill: it opens as much for one file as for all, in less time."""
 
@@ -56,6 +63,7 @@ def test_a_stage_opens_all_that_it_declares_and_needs_nothing_else(stage: str, f
         config["demos"]["tasks"] = config["demos"]["tasks"][:1]
     file.write_text(yaml.safe_dump(config))
     link_testset(tmp_path)
+    (tmp_path / "sitecustomize.py").write_text(ALONE)
     environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
     with opened_files(tmp_path) as opened:
         done = subprocess.run(

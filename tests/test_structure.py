@@ -30,6 +30,7 @@ FLOORS = (
     "export_config",
     "gl",
     "seeding",
+    "jit",
     "tables",
     "files",
     "types",

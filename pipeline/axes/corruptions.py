@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, PositiveInt
 
 from pipeline.axes.base import Frozen
-from pipeline.axes.jit import compiled
+from pipeline.jit import compiled
 from pipeline.types import Floats, Frame
 
 Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]

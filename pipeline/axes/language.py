@@ -24,9 +24,9 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
 from pipeline.axes.base import Axis, Level, TextPerturbation, on_task
-from pipeline.axes.jit import compiled
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
+from pipeline.jit import compiled
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
