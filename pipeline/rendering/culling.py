@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rendering.mesh_pieces import MARGIN_M, boxes_of
+from pipeline.rendering.samples import Projection
 from pipeline.types import Floats
 
 LEAST_SCREEN_M = 0.1
@@ -45,6 +46,7 @@ class Picture(NamedTuple):
         shadows: (N,) for each lamp with shadows, which boxes cast them, and which are seen and lit.
         sites: (nsite,) which sites.
         layers: whether it can be put together of layers, of what is opaque and does not reflect.
+        projection: by which to choose single faces, or None.
     """
 
     opaque: NDArray[np.bool_]
@@ -55,6 +57,7 @@ class Picture(NamedTuple):
     shadows: tuple[NDArray[np.bool_], ...]
     sites: NDArray[np.bool_]
     layers: bool
+    projection: Projection | None = None
 
 
 class Culling:
@@ -113,6 +116,7 @@ class Culling:
             shadows=tuple(shadows),
             sites=self._sites(bool(shadows)),
             layers=self._layers and not self._sites_see_through(),
+            projection=view.projection() if self._layers else None,
         )
 
     def _geoms(self, boxes: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -265,6 +269,14 @@ class _View:
         tangent = np.tan(np.radians(model.cam_fovy[number]) / 2)
         # Of half the angles of view, to the side and up.
         self._tangents = tangent * width / height, tangent
+        self._size_px = width, height
+
+    def projection(self) -> Projection:
+        half_px = np.array(self._size_px) / 2
+        focal_px = half_px[1] / self._tangents[1]
+        onto = np.array([[focal_px, 0, -half_px[0]], [0, focal_px, -half_px[1]], [0, 0, -1]])
+        matrix = onto @ np.column_stack([self._axes.T, -self._axes.T @ self.position_m])
+        return Projection(matrix, self.near_m, self._size_px)
 
     def depths(self, corners_m: Floats) -> Floats:
         """(...) of ``corners_m`` (..., 3), along the axis that the camera looks along."""

@@ -56,7 +56,7 @@ class Boxes(NamedTuple):
 
 def boxes_of(model: mujoco.MjModel, hidden_groups: Collection[int]) -> Boxes:
     """The boxes of a model's geoms; those of ``hidden_groups``, which are not drawn, have none."""
-    corners: list[Floats] = []
+    corners: list[Floats] = [np.empty((0, 8, 3))]
     numbers: list[tuple[int, int]] = []
     for geom in np.flatnonzero(~np.isin(model.geom_group, list(hidden_groups))).tolist():
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
@@ -94,6 +94,10 @@ class MeshPieces:
     list base. So one call of ``mjr_render`` can draw other pieces in each of its passes. The last mesh of every pass is
     one of ours (:meth:`show`): it puts layers, and sets the list base for the next pass.
 
+    Attributes:
+        contents: mesh to what tells it from any other, for those that are drawn.
+        closing: (nmesh,) of each of them, the list to be called after its skin.
+
     Args:
         context: made from the model, or from another one.
         boxes: of the model.
@@ -112,8 +116,8 @@ class MeshPieces:
         former_shapes = {} if former is None else former._free(model.nmesh)
         self._shapes: dict[bytes, _Shape] = {}
         self._meshes: list[_Shape] = []
-        for mesh in drawn.tolist():
-            content = _content(model, mesh)
+        self.contents = {mesh: _content(model, mesh) for mesh in drawn.tolist()}
+        for mesh, content in self.contents.items():
             shape = self._shapes.get(content) or former_shapes.pop(content, None) or _shape(model, context, mesh)
             self._shapes[content] = shape
             self._meshes.append(shape)
@@ -125,14 +129,23 @@ class MeshPieces:
         self._turn = display_list.new()
         with display_list.recorded(self._turn):
             _call_from_base(len(drawn))
+        self._close = display_list.new(len(drawn))
+        for number in range(len(drawn)):
+            with display_list.recorded(self._close + number):
+                _call_from_base(len(drawn) + 1 + number)
+        self.closing: NDArray[np.intp] = np.zeros(model.nmesh, np.intp)
+        self.closing[drawn] = self._close + np.arange(len(drawn))
+        self._nothing = _query_of_nothing()
         self._passes: dict[Hashable, list[_Lists]] = {}
 
     def _free(self, meshes: int) -> dict[bytes, _Shape]:
         """Have the context's lists of meshes do nothing, for as many meshes, and give up all but the shapes."""
         display_list.free(self._context.baseMesh, self._context.rangeMesh)
         display_list.free(self._turn)
+        display_list.free(self._close, len(self._meshes))
         for lists in (lists for made in self._passes.values() for lists in made):
-            display_list.free(lists.base, len(self._meshes) + 1)
+            display_list.free(lists.base, 2 * len(self._meshes) + 1)
+        gl.calls().glDeleteQueries(1, [self._nothing])
         # Of each mesh one for its faces and one for its convex hull.
         self._context.rangeMesh = 2 * meshes
         self._context.baseMesh = display_list.new(self._context.rangeMesh)
@@ -145,8 +158,13 @@ class MeshPieces:
         scene: mujoco.MjvScene,
         main: int = 0,
         layers: Sequence[Layer] = (),
+        skinned: NDArray[np.bool_] | None = None,
     ) -> None:
         """Have the pieces drawn of which a box is wanted, of the geoms that are in a scene.
+
+        What the camera sees of a mesh that has a skin is drawn by the skin, for which the mesh leaves its place on the
+        stack of matrices. In passes that are not to have the skin, OpenGL is told to draw it if something is there
+        that is not.
 
         Args:
             name: of what is drawn, for which most lists stay as they were the last time.
@@ -154,12 +172,16 @@ class MeshPieces:
             scene: of all that is drawn; it gets one more mesh, the last.
             main: which of ``passes`` gets the layers.
             layers: put after all other meshes.
+            skinned: (nmesh,) which meshes have a skin in the scene, which is drawn in ``main``, and, like the camera's
+                picture, in every second pass after it.
         """
         made = self._passes.setdefault(name, [])
         while len(made) < len(passes):
             made.append(_Lists(len(self._meshes)))
+        by_skin = np.zeros(len(self._meshes), np.bool_) if skinned is None else skinned[[*self.contents]]
         for number, (lists, wanted) in enumerate(zip(made, passes, strict=False)):
-            self._write(lists, wanted)
+            by_camera = number >= main and (number - main) % 2 == 0
+            self._write(lists, wanted, by_skin, before=number < main, by_camera=by_camera)
             then = made[min(number + 1, len(passes) - 1)]
             end = then.base, *(layer.number for layer in layers if number == main)
             if lists.end != end:
@@ -171,16 +193,34 @@ class MeshPieces:
         gl.calls().glListBase(made[0].base)
         display_list.add(self._turn, scene, self._context)
 
-    def _write(self, lists: _Lists, seen: NDArray[np.bool_]) -> None:
-        shown = seen[self._boxes]
-        for mesh in np.unique(self._mesh[shown != lists.shown]).tolist():
+    def _write(
+        self, lists: _Lists, seen: NDArray[np.bool_], by_skin: NDArray[np.bool_], before: bool, by_camera: bool
+    ) -> None:
+        wanted, drawn = seen[self._boxes], np.zeros(len(self._meshes), np.bool_)
+        drawn[self._mesh[wanted]] = True
+        # Lamps' maps have no skins, mirror images must not show them.
+        opened = by_skin & (before or by_camera)
+        shut = opened & (before | ~drawn)
+        shown = wanted & ~(by_skin & by_camera)[self._mesh]
+        changed = (opened != lists.opened) | (shut != lists.shut)
+        changed[self._mesh[shown != lists.shown]] = True
+        for mesh in np.flatnonzero(changed).tolist():
             pieces = np.unique(self._piece[shown & (self._mesh == mesh)]).tolist()
             whole, parts = self._meshes[mesh]
             most = len(pieces) > MOST_PARTS * len(parts)
             with display_list.recorded(lists.base + mesh):
                 for number in [whole] if most else [parts[piece] for piece in pieces]:
                     gl.calls().glCallList(number)
-        lists.shown = shown
+                if opened[mesh]:
+                    gl.calls().glPushMatrix()
+                if shut[mesh]:
+                    gl.calls().glBeginConditionalRender(self._nothing, gl.calls().GL_QUERY_WAIT)
+            with display_list.recorded(lists.closing + mesh):
+                if shut[mesh]:
+                    gl.calls().glEndConditionalRender()
+                if opened[mesh]:
+                    gl.calls().glPopMatrix()
+        lists.shown, lists.opened, lists.shut = shown, opened, shut
 
 
 class _Shape(NamedTuple):
@@ -219,18 +259,33 @@ def _content(model: mujoco.MjModel, mesh: int) -> bytes:
 
 
 class _Lists:
-    """A display list for each mesh and one more, which follow each other.
+    """A display list for each mesh, one more, and for each mesh what follows its skin, one after the other.
 
     Attributes:
         base: number of the first.
-        end: what the last one does: the base that it sets, and the lists that it calls before.
+        closing: number of the first that follows a skin.
+        end: what the one more does: the base that it sets, and the lists that it calls before.
         shown: of the boxes of meshes, those whose pieces the lists draw.
+        opened: of the meshes, those that are followed by a skin.
+        shut: those whose skin is not drawn.
     """
 
     def __init__(self, meshes: int):
-        self.base = display_list.new(meshes + 1)
+        self.base = display_list.new(2 * meshes + 1)
+        self.closing = self.base + meshes + 1
         self.end: tuple[int, ...] = ()
         self.shown: NDArray[np.bool_] = np.zeros(1, np.bool_)
+        self.opened: NDArray[np.bool_] = np.zeros(meshes, np.bool_)
+        self.shut: NDArray[np.bool_] = np.zeros(meshes, np.bool_)
+
+
+def _query_of_nothing() -> int:
+    """A query whether something was drawn, answered with no."""
+    opengl = gl.calls()
+    number = int(opengl.glGenQueries(1)[0])
+    opengl.glBeginQuery(opengl.GL_ANY_SAMPLES_PASSED, number)
+    opengl.glEndQuery(opengl.GL_ANY_SAMPLES_PASSED)
+    return number
 
 
 def _call_from_base(number: int) -> None:

@@ -17,6 +17,8 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.culling import Culling, Picture
 from pipeline.rendering.layer import Layer
 from pipeline.rendering.mesh_pieces import MeshPieces
+from pipeline.rendering.samples import SAMPLES
+from pipeline.rendering.skins import SKINS, Skins, bare
 from pipeline.rendering.still import Still
 from pipeline.rendering.textures import Textures
 from pipeline.scenes.compiled import Images, compiled
@@ -46,11 +48,18 @@ class Surfaces(NamedTuple):
 
 
 def _fixed(model: mujoco.MjModel) -> tuple[object, ...]:
-    """What a GL context is made for once and for all: its buffers, the fineness of round bodies, lines and fog."""
+    """What a GL context is made for once and for all: buffers, the fineness of round bodies, lines, fog and planes."""
     window, quality = model.vis.global_, model.vis.quality
     buffers = window.offwidth, window.offheight, quality.offsamples, quality.shadowsize
     fineness = quality.numslices, quality.numstacks, quality.numquads
-    return *buffers, *fineness, window.linewidth, tuple(model.vis.rgba.fog)
+    planes = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
+    return *buffers, *fineness, window.linewidth, tuple(model.vis.rgba.fog), planes.tobytes()
+
+
+def _shares(model: mujoco.MjModel) -> bool:
+    """Whether a model can be shown by a GL context that was made for another one: not with what only that one's has."""
+    planes = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
+    return not model.nhfield and not model.nskin and bool((planes[:, :2] > 0).all())
 
 
 class Renderer:
@@ -67,9 +76,10 @@ class Renderer:
     def __init__(self, scene: str | mujoco.MjModel, images: Images | None = None):
         software = gl.prepare().software
         height, width, _ = SCHEMA.frame.shape
-        self.model = compiled(scene) if isinstance(scene, str) else scene
-        self.data = mujoco.MjData(self.model)
-        self._renderer = mujoco.Renderer(self.model, height, width, max_geom=1000)
+        model = compiled(scene) if isinstance(scene, str) else scene
+        # A context is made for what all scenes have alike, and then goes on with this one.
+        first = bare(model, SKINS if software else 0) if _shares(model) else model
+        self._renderer = mujoco.Renderer(first, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()
         # As robosuite's off-screen context: visual meshes without the collision geometry.
         self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
@@ -79,13 +89,11 @@ class Renderer:
         # On a GPU the geoms are no effort, and what would spare them is.
         layers = software and Layer.possible()
         self._culling_of = partial(Culling, height=height, width=width, hidden_groups=hidden.tolist(), layers=layers)
-        self._culling = self._culling_of(self.model)
-        self._pieces = MeshPieces(self.model, self._renderer._mjr_context, self._culling.boxes)
         self._still: dict[str, Still] = {}
         self._layers: dict[tuple[str, str], Layer] = {}
-        self._textures = Textures(self.model, self._renderer._mjr_context, images=images)
-        self._painted: NDArray[np.bool_] = np.zeros(self.model.ngeom, np.bool_)
-        self._paint = b""
+        self._show(first, images if first is model else None)
+        if first is not model:
+            self._show(model, images, self)
 
     def adopted(self, model: mujoco.MjModel, images: Images | None = None) -> bool:
         """Go on with another model in the same GL context, where the meshes and textures that both have stay.
@@ -93,22 +101,31 @@ class Renderer:
         Returns:
             Whether that can be, and the model belongs to the renderer now; else nothing is changed.
         """
-        if _fixed(model) != _fixed(self.model) or model.nhfield or model.nskin:
+        if not _shares(model) or not _shares(self.model) or _fixed(model) != _fixed(self.model):
             return False
         self._renderer._gl_context.make_current()
-        context = self._renderer._mjr_context
+        self._show(model, images, self)
+        return True
+
+    def _show(self, model: mujoco.MjModel, images: Images | None, former: Renderer | None = None) -> None:
+        """Have the context show a model: the one that it was made for, or another one after a former."""
+        context, scene = self._renderer._mjr_context, self._renderer.scene
         self.model, self.data, self._renderer._model = model, mujoco.MjData(model), model
         self._culling = self._culling_of(model)
-        self._pieces = MeshPieces(model, context, self._culling.boxes, self._pieces)
-        self._textures = Textures(model, context, self._textures, images)
-        self._painted = np.zeros(model.ngeom, np.bool_)
+        boxes = self._culling.boxes
+        self._pieces: MeshPieces = MeshPieces(model, context, boxes, former._pieces if former else None)
+        self._skins: Skins | None = None
+        if context.nskin == 2 * SKINS and context.offSamples == SAMPLES:
+            self._skins = Skins(model, context, scene, boxes, self._pieces, former._skins if former else None)
+        self._textures: Textures = Textures(model, context, former._textures if former else None, images)
+        self._painted: NDArray[np.bool_] = np.zeros(model.ngeom, np.bool_)
+        self._paint = b""
         self._forget_layers()
         # What a context keeps of a model's size, as mjr_makeContext works it out.
         context.shadowClip = model.stat.extent * model.vis.map.shadowclip
         context.shadowScale = model.vis.map.shadowscale
         context.fogStart = model.stat.extent * model.vis.map.fogstart
         context.fogEnd = model.stat.extent * model.vis.map.fogend
-        return True
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
         """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
@@ -218,7 +235,12 @@ class Renderer:
             self.model.site_group[:] = np.where(last & picture.sites, site_groups, _CULLED)
             scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = reflections
             self._renderer.update_scene(self.data, camera, self._option)
-            self._pieces.show((camera, last), [*before, main, *after], scene, len(before), layers)
+            skinned = None
+            if self._skins is not None and picture.projection is not None:
+                # Of the passes for a lamp every second is drawn as the camera sees it.
+                wanted = np.logical_or.reduce([main, *after[1::2]])
+                skinned = self._skins.put(self.data, picture.projection, wanted)
+            self._pieces.show((camera, last), [*before, main, *after], scene, len(before), layers, skinned)
             mujoco.mjr_render(self._renderer._rect, scene, self._renderer._mjr_context)
         finally:
             self.model.geom_group[:] = groups

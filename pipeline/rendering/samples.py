@@ -1,0 +1,159 @@
+"""Which faces of a mesh a picture can show: those that cover one of its samples.
+
+A picture has four samples a pixel, and most faces of LIBERO's meshes lie between them: of 90,000 faces of the arm that
+an agent view looks at, 17,000 cover a sample and do not face away. MuJoCo hands all of them to OpenGL, which finds
+that out one by one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.jit import compiled
+from pipeline.rendering.faces import Faces
+from pipeline.rendering.mesh_pieces import PIECE_FACES
+from pipeline.types import Floats
+
+MARGIN_PX = 1 / 128
+"""How far beside a face a sample counts as covered. OpenGL rounds corners to 1/256 of a pixel, so by half of that."""
+
+SAMPLES = 4
+"""Of a pixel, as LIBERO's scenes ask for."""
+
+
+class Projection(NamedTuple):
+    """How a picture shows places.
+
+    Attributes:
+        matrix: (3, 4) of a place in the world, in m, to its column, its row from below, and 1, all times its depth.
+        near_m: depth up to which something may be cut off.
+        size_px: width and height.
+    """
+
+    matrix: Floats
+    near_m: float
+    size_px: tuple[int, int]
+
+
+def faces_that_show(
+    projection: Projection,
+    position_m: Floats,
+    rotation: Floats,
+    faces: Faces,
+    pieces: NDArray[np.bool_],
+    samples: NDArray[np.float32],
+    found: NDArray[np.uint32],
+) -> int:
+    """Write the corners of all faces that may cover a sample, in their order.
+
+    Args:
+        projection: of the picture.
+        position_m, rotation: (3,) and (9,) of the mesh in the world.
+        faces: of the mesh; their corners come counter-clockwise as seen from the front.
+        pieces: (P,) which pieces of the mesh are looked at.
+        samples: (``SAMPLES``, 2) place of each sample in its pixel, 0 to 1 to the right and up.
+        found: (3 F,) to write into.
+
+    Returns:
+        How many numbers were written.
+    """
+    matrix = np.empty((3, 4))
+    matrix[:, :3] = projection.matrix[:, :3] @ rotation.reshape(3, 3)
+    matrix[:, 3] = projection.matrix[:, :3] @ position_m + projection.matrix[:, 3]
+    return _covering(
+        matrix,
+        projection.near_m,
+        faces.places_m,
+        faces.place_of_corner,
+        faces.corners,
+        pieces,
+        PIECE_FACES,
+        samples,
+        *projection.size_px,
+        found,
+    )
+
+
+@compiled
+def _covering(
+    matrix: Floats,
+    near_m: float,
+    places_m: NDArray[np.float32],
+    place_of_corner: NDArray[np.uint32],
+    corners: NDArray[np.uint32],
+    pieces: NDArray[np.bool_],
+    piece_faces: int,
+    samples: NDArray[np.float32],
+    width_px: int,
+    height_px: int,
+    found: NDArray[np.uint32],
+) -> int:
+    """In three loops without branches, each over what the one before has left: most of the time would go into branches
+    that the processor guesses wrongly."""
+    at_px = np.empty((len(places_m), 2), np.float32)
+    for place in range(len(places_m)):
+        x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
+        depth_m = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+        if depth_m < near_m:
+            # Whatever is compared with it later, the face stays.
+            depth_m = np.nan
+        at_px[place, 0] = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / depth_m
+        at_px[place, 1] = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth_m
+    margin = np.float32(MARGIN_PX)
+    left_over, doubtful = np.empty(len(corners), np.int32), np.empty(len(corners), np.bool_)
+    count = 0
+    for piece in range(len(pieces)):
+        if not pieces[piece]:
+            continue
+        for face in range(piece_faces * piece, min(piece_faces * (piece + 1), len(corners))):
+            a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
+            abx, aby = at_px[b, 0] - at_px[a, 0], at_px[b, 1] - at_px[a, 1]
+            acx, acy = at_px[c, 0] - at_px[a, 0], at_px[c, 1] - at_px[a, 1]
+            twice_area = abx * acy - aby * acx
+            # So near to 0 the face may turn around when its corners are rounded.
+            unsure = margin * (abs(abx) + abs(aby) + abs(acx) + abs(acy) + margin)
+            left_over[count], doubtful[count] = face, not twice_area > unsure
+            count += not twice_area < -unsure
+    faces, count = count, 0
+    for number in range(faces):
+        face = left_over[number]
+        a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
+        ax, ay, bx, by, cx, cy = at_px[a, 0], at_px[a, 1], at_px[b, 0], at_px[b, 1], at_px[c, 0], at_px[c, 1]
+        left, right, low, high = ax, ax, ay, ay
+        left, right = (bx if bx < left else left), (bx if bx > right else right)
+        left, right = (cx if cx < left else left) - margin, (cx if cx > right else right) + margin
+        low, high = (by if by < low else low), (by if by > high else high)
+        low, high = (cy if cy < low else low) - margin, (cy if cy > high else high) + margin
+        inside = False
+        for sample in range(SAMPLES):
+            x, y = samples[sample, 0], samples[sample, 1]
+            inside |= (np.ceil(left - x) + x <= right) & (np.ceil(low - y) + y <= high)
+        inside &= (right >= 0) & (left <= width_px) & (high >= 0) & (low <= height_px)
+        cut = ax + bx + cx
+        left_over[count], doubtful[count] = face, doubtful[number]
+        count += inside | (cut != cut)
+    faces, count = count, 0
+    for number in range(faces):
+        face = left_over[number]
+        a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
+        ax, ay, bx, by, cx, cy = at_px[a, 0], at_px[a, 1], at_px[b, 0], at_px[b, 1], at_px[c, 0], at_px[c, 1]
+        left, low = min(ax, bx, cx) - margin, min(ay, by, cy) - margin
+        wide = (max(ax, bx, cx) + margin - left > 1) | (max(ay, by, cy) + margin - low > 1)
+        abx, aby, bcx, bcy, cax, cay = bx - ax, by - ay, cx - bx, cy - by, ax - cx, ay - cy
+        # Of each side, how far a place is to its left, times the side's length.
+        ab = margin * (abs(abx) + abs(aby)) - abx * ay + aby * ax
+        bc = margin * (abs(bcx) + abs(bcy)) - bcx * by + bcy * bx
+        ca = margin * (abs(cax) + abs(cay)) - cax * cy + cay * cx
+        covers = False
+        for sample in range(SAMPLES):
+            x = np.ceil(left - samples[sample, 0]) + samples[sample, 0]
+            y = np.ceil(low - samples[sample, 1]) + samples[sample, 1]
+            covers |= (abx * y - aby * x + ab >= 0) & (bcx * y - bcy * x + bc >= 0) & (cax * y - cay * x + ca >= 0)
+        cut = ax + bx + cx
+        for corner in range(3):
+            found[3 * count + corner] = corners[face, corner]
+        count += covers | wide | doubtful[number] | (cut != cut)
+    return 3 * count

@@ -1,0 +1,172 @@
+"""Of a mesh only the faces are drawn that a picture can show, and every picture is the one that MuJoCo draws of all."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from test_culling import plain
+
+from pipeline import gl, seeding
+from pipeline.rendering.faces import Faces
+from pipeline.rendering.mesh_pieces import PIECE_FACES
+from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.samples import Projection, faces_that_show
+from pipeline.rendering.skins import GEOM, SKINS
+from pipeline.types import Floats
+
+SIZE_PX = 64, 48
+SAMPLES = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
+
+
+def covers(corners_px: Floats, sample_px: Floats) -> NDArray[np.bool_]:
+    """(F,) whether a sample is in faces (F, 3, 2), or on their edge; front faces only."""
+    sides = np.roll(corners_px, -1, axis=1) - corners_px
+    to_sample = sample_px - corners_px
+    left = sides[..., 0] * to_sample[..., 1] - sides[..., 1] * to_sample[..., 0]
+    return np.asarray((left >= 0).all(axis=1) & (left > 0).any(axis=1))
+
+
+@pytest.mark.parametrize("size_px", [0.05, 0.3, 0.9, 3.0, 30.0])
+def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
+    rng = seeding.rng("test_skins", str(size_px))
+    count = 3 * PIECE_FACES - 100
+    # Before the camera at a depth of 1 m, where a pixel is a hundredth of a metre wide.
+    focal_px = 100.0
+    middles_px = rng.uniform(-3, np.array(SIZE_PX) + 3, (count, 1, 2))
+    corners_px = middles_px + rng.normal(0, size_px, (count, 3, 2))
+    # Some have hardly any area, and may turn to the front when their corners are rounded.
+    corners_px[::10, 2] = corners_px[::10].mean(axis=1) + rng.normal(0, 1e-3, (len(corners_px[::10]), 2))
+    places_m = np.ones((3 * count, 3), np.float32)
+    places_m[:, :2] = corners_px.reshape(-1, 2) / focal_px
+    numbers = np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)
+    faces = Faces(places_m, places_m, None, numbers, places_m, numbers)
+    pieces = np.array([True, False, True])
+    projection = Projection(np.diag([focal_px, focal_px, 1.0]) @ np.eye(3, 4), 0.1, SIZE_PX)
+    found = np.empty(3 * count, np.uint32)
+    written = faces_that_show(projection, np.zeros(3), np.eye(3).ravel(), faces, pieces, SAMPLES, found)
+    shown = found[:written].reshape(-1, 3)
+    assert np.array_equal(shown, numbers[np.sort(shown[:, 0] // 3)]), "whole faces, in their order"
+
+    looked_at = pieces[np.arange(count) // PIECE_FACES]
+    rounded = np.rint(corners_px * 256) / 256
+    needed = np.zeros(count, np.bool_)
+    for column, row in np.ndindex(SIZE_PX):
+        for sample in SAMPLES.astype(float):
+            needed |= covers(rounded, np.array([column, row]) + sample)
+    left_out = np.ones(count, np.bool_)
+    left_out[shown[:, 0] // 3] = False
+    assert not (needed & looked_at & left_out).any()
+    assert left_out[~looked_at].all()
+    assert 0.4 < left_out[looked_at].mean() < 1, "those that face away, and those between samples"
+
+
+def test_a_face_that_reaches_the_camera_stays() -> None:
+    places_m = np.array([[0, 0, 1], [0.001, 0, 1], [0, 0.001, -1]], np.float32)
+    numbers = np.array([[0, 1, 2]], np.uint32)
+    faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(3, np.uint32)
+    projection = Projection(np.eye(3, 4), 0.1, SIZE_PX)
+    straight = np.zeros(3), np.eye(3).ravel()
+    assert faces_that_show(projection, *straight, faces, np.array([True]), SAMPLES, found) == 3
+
+
+def test_a_geom_lies_in_memory_as_mujoco_has_it() -> None:
+    scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string("<mujoco/>"), 2)
+    first, second = scene.geoms
+    addresses = {name: getattr(first, name).ctypes.data for name in ("size", "pos", "mat", "rgba")}
+    offsets = {name: GEOM.fields[name][1] for name in addresses}  # type: ignore[index]
+    begin = addresses["size"] - offsets["size"]
+    assert {name: address - begin for name, address in addresses.items()} == offsets
+    assert second.size.ctypes.data - first.size.ctypes.data == GEOM.itemsize
+    geoms = np.frombuffer(memoryview((ctypes.c_byte * GEOM.itemsize).from_address(begin)), GEOM)
+    for name in ("type", "dataid", "objtype", "objid", "category", "matid", "texcoord", "segid", "transparent"):
+        setattr(first, name, 1)
+        assert geoms[name][0] == getattr(first, name) == 1
+        setattr(first, name, 0)
+        assert geoms[name][0] == 0
+    first.emission, first.reflectance, first.camdist, first.modelrbound = 0.125, 0.25, 0.5, 0.75
+    assert geoms[["emission", "reflectance", "camdist", "modelrbound"]][0].tolist() == (0.125, 0.25, 0.5, 0.75)
+
+
+def stone(name: str, subdivisions: int, texture: bool) -> str:
+    """A round mesh of many faces."""
+    shape = trimesh.creation.icosphere(subdivisions)
+    written = {"vertex": shape.vertices * 0.3, "face": shape.faces}
+    if texture:
+        written["texcoord"] = shape.vertices[:, :2]
+    attributes = " ".join(f'{key}="{" ".join(map(str, values.ravel()))}"' for key, values in written.items())
+    return f'<mesh name="{name}" {attributes}/>'
+
+
+def scene(shadows: bool) -> str:
+    """Stones around a mirror, with and without places in a texture, some far away, and two of one mesh, one clear."""
+    rng = seeding.rng("test_skins", "scene")
+    stones = [("plain", 'rgba="0.4 0.6 0.2 1"'), ("painted", 'material="paint"'), ("both", 'rgba="0.7 0.3 0.3 1"')]
+    bodies = "".join(
+        f'<body mocap="true" pos="{" ".join(f"{x:.3f}" for x in rng.uniform((-0.5, -0.5, 0.1), (0.5, 0.5, 0.8)))}">'
+        f'<geom type="mesh" mesh="{mesh}" {look} group="1"/></body>'
+        for mesh, look in [*stones, ("both", 'rgba="0.2 0.3 0.9 0.4"'), ("plain", 'rgba="0.9 0.6 0.2 1"')]
+    )
+    return f"""
+    <mujoco>
+      <asset>
+        {stone("plain", 3, False)}{stone("painted", 4, True)}{stone("both", 3, False)}
+        <texture name="chequers" type="2d" builtin="checker" rgb1="0.9 0.8 0.2" rgb2="0 0 0.4" width="64" height="64"/>
+        <material name="paint" texture="chequers" specular="0.7"/><material name="mirror" reflectance="0.4"/>
+      </asset>
+      <worldbody>
+        <light pos="0.5 0 3" dir="0 0 -1" castshadow="false"/>
+        <light pos="-1 1 3" dir="0.3 -0.3 -1" diffuse="0.3 0.3 0.4" castshadow="{str(shadows).lower()}"/>
+        <geom type="box" size="0.9 0.9 0.01" group="1" material="mirror"/>
+        <geom type="plane" size="3 3 0.1" pos="0 0 -0.5" group="1" rgba="0.5 0.5 0.5 1"/>
+        {bodies}
+        <camera name="fixed" pos="3 0 1.5" xyaxes="0 1 0 -0.4 0 1"/>
+        <body mocap="true" pos="0 1.5 0.7"><camera name="moving" xyaxes="-1 0 0 0 -0.4 1"/></body>
+      </worldbody>
+    </mujoco>"""
+
+
+@pytest.fixture(params=[False, True], ids=["lights", "shadows"])
+def renderer(request: pytest.FixtureRequest) -> Iterator[Renderer]:
+    opened = Renderer(scene(request.param))
+    yield opened
+    opened.close()
+
+
+def test_the_same_pixels_with_fewer_faces(renderer: Renderer) -> None:
+    assert gl.choose().software
+    skins = renderer._skins
+    assert skins is not None
+    rng, drawn = seeding.rng("test_skins", "moves"), []
+    for _ in range(30):
+        for body in rng.choice(5, 2, replace=False):
+            renderer.data.mocap_pos[body] += rng.normal(0, 0.1, 3)
+            renderer.data.mocap_quat[body] = rng.normal(size=4)
+        renderer.data.mocap_pos[-1] += rng.normal(0, 0.05, 3)
+        mujoco.mj_forward(renderer.model, renderer.data)
+        for camera in ("fixed", "moving"):
+            skins._kept.drawn[:] = 0
+            frame = renderer.frame(camera)
+            drawn.append(skins._kept.drawn.copy())
+            assert np.array_equal(frame, plain(renderer, camera)), camera
+    faces = np.sum(drawn, axis=0)
+    assert faces[:SKINS].any(), "with places in a texture"
+    assert faces[SKINS:].any(), "without them"
+    assert np.max(drawn) < 0.6 * renderer.model.mesh("painted").facenum[0], "half of the faces are on the other side"
+
+
+def test_faces_of_an_endless_floor_scene_are_drawn_by_mujoco_alone() -> None:
+    endless = scene(False).replace('type="plane" size="3 3 0.1"', 'type="plane" size="0 0 0.1"')
+    opened = Renderer(endless)
+    try:
+        mujoco.mj_forward(opened.model, opened.data)
+        assert opened._skins is None
+        assert not opened.adopted(mujoco.MjModel.from_xml_string(scene(False)))
+        assert np.array_equal(opened.frame("fixed"), plain(opened, "fixed"))
+    finally:
+        opened.close()
