@@ -114,9 +114,9 @@ class Renderer:
         self._culling = self._culling_of(model)
         boxes = self._culling.boxes
         self._pieces: MeshPieces = MeshPieces(model, context, boxes, former._pieces if former else None)
-        self._skins: Skins | None = None
-        if context.nskin == 2 * SKINS and context.offSamples == SAMPLES:
-            self._skins = Skins(model, context, scene, boxes, self._pieces, former._skins if former else None)
+        before = former._skins if former else None
+        having = context.nskin == 2 * SKINS and context.offSamples == SAMPLES
+        self._skins: Skins | None = Skins(model, context, scene, boxes, self._pieces, before) if having else None
         self._textures: Textures = Textures(model, context, former._textures if former else None, images)
         self._painted: NDArray[np.bool_] = np.zeros(model.ngeom, np.bool_)
         self._paint = b""
