@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Iterator
+from contextlib import closing
 
 import mujoco
 import numpy as np
@@ -14,11 +15,11 @@ from test_culling import plain
 
 from pipeline import gl, seeding
 from pipeline.rendering.faces import Faces
-from pipeline.rendering.mesh_pieces import PIECE_FACES
+from pipeline.rendering.mesh_pieces import BATCH_FACES, PIECE_FACES
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.samples import Projection, faces_that_show
 from pipeline.rendering.skins import GEOM, SKINS
-from pipeline.types import Floats
+from pipeline.types import Floats, Frame
 
 SIZE_PX = 64, 48
 SAMPLES = np.array([[0.375, 0.125], [0.875, 0.375], [0.125, 0.625], [0.625, 0.875]], np.float32)
@@ -47,8 +48,8 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
     numbers = np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)
     faces = Faces(places_m, places_m, None, numbers, places_m, numbers)
     pieces = np.array([True, False, True])
-    projection = Projection(np.diag([focal_px, focal_px, 1.0]) @ np.eye(3, 4), 0.1, SIZE_PX)
-    found = np.empty(3 * count, np.uint32)
+    projection = Projection(np.diag([focal_px, focal_px, 1.0]) @ np.eye(3, 4), 0.1, 10.0, SIZE_PX)
+    found = np.empty(6 * count, np.uint32)
     written = faces_that_show(projection, np.zeros(3), np.eye(3).ravel(), faces, pieces, SAMPLES, found)
     shown = found[:written].reshape(-1, 3)
     assert np.array_equal(shown, numbers[np.sort(shown[:, 0] // 3)]), "whole faces, in their order"
@@ -69,8 +70,8 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
 def test_a_face_that_reaches_the_camera_stays() -> None:
     places_m = np.array([[0, 0, 1], [0.001, 0, 1], [0, 0.001, -1]], np.float32)
     numbers = np.array([[0, 1, 2]], np.uint32)
-    faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(3, np.uint32)
-    projection = Projection(np.eye(3, 4), 0.1, SIZE_PX)
+    faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(6, np.uint32)
+    projection = Projection(np.eye(3, 4), 0.1, 10.0, SIZE_PX)
     straight = np.zeros(3), np.eye(3).ravel()
     assert faces_that_show(projection, *straight, faces, np.array([True]), SAMPLES, found) == 3
 
@@ -91,6 +92,123 @@ def test_a_geom_lies_in_memory_as_mujoco_has_it() -> None:
         assert geoms[name][0] == 0
     first.emission, first.reflectance, first.camdist, first.modelrbound = 0.125, 0.25, 0.5, 0.75
     assert geoms[["emission", "reflectance", "camdist", "modelrbound"]][0].tolist() == (0.125, 0.25, 0.5, 0.75)
+
+
+SLIVERS = 2_000_000
+
+
+def turning_faces() -> Floats:
+    """(N, 3, 2) thin faces that face away before their corners are rounded, and cover a sample when they are."""
+    rng = seeding.rng("test_skins", "slivers")
+    middle = 20.5 + rng.uniform(-5, 5, (SLIVERS, 1, 2))
+    along = np.stack([rng.uniform(low, high, SLIVERS) for low, high in ((-1, -0.3), (-0.3, 0.3), (0.3, 1))], axis=1)
+    corners_px = middle + along[..., None] * rng.normal(size=(SLIVERS, 1, 2)) + rng.normal(0, 0.002, (SLIVERS, 3, 2))
+    rounded = np.rint(corners_px * 256) / 256
+    turned = (twice_area(corners_px) < -1e-4) & (twice_area(rounded) > 0)
+    corners_px, rounded = corners_px[turned], rounded[turned]
+    covering = np.zeros(len(rounded), np.bool_)
+    for column, row in np.ndindex(4, 4):
+        for sample in SAMPLES.astype(float):
+            # The samples of the pixels from where the face begins on.
+            places_px = np.floor(rounded.min(axis=1)) + (np.array([column, row]) + sample)
+            covering |= covers(rounded, places_px[:, None])
+    return corners_px[covering]
+
+
+def twice_area(corners_px: Floats) -> Floats:
+    """(N,) of faces (N, 3, 2); negative for those that face away."""
+    (abx, aby), (acx, acy) = (np.moveaxis(corners_px[:, n] - corners_px[:, 0], -1, 0) for n in (1, 2))
+    areas: Floats = abx * acy - aby * acx
+    return areas
+
+
+class Drawing:
+    """Faces drawn by OpenGL alone into MuJoCo's buffer, from a display list or by the order of a buffer."""
+
+    def __init__(self) -> None:
+        gl.prepare()
+        model = mujoco.MjModel.from_xml_string(
+            '<mujoco><visual><global offwidth="64" offheight="48"/></visual></mujoco>'
+        )
+        self._renderer = mujoco.Renderer(model, SIZE_PX[1], SIZE_PX[0])
+        self._renderer._gl_context.make_current()
+
+    def picture(self, places: NDArray[np.float32], listed: NDArray[np.uint32], by_list: bool) -> Frame:
+        """Of white faces that face the camera.
+
+        Args:
+            places: (V, 4) in OpenGL's clip coordinates.
+            listed: numbers of the corners.
+            by_list: whether from a display list, as MuJoCo draws meshes, or from buffers, as it draws skins.
+        """
+        opengl, context = gl.calls(), self._renderer._mjr_context
+        opengl.glViewport(0, 0, *SIZE_PX)
+        opengl.glClipControl(opengl.GL_LOWER_LEFT, opengl.GL_ZERO_TO_ONE)
+        for setting in (opengl.GL_LIGHTING, opengl.GL_DEPTH_TEST):
+            opengl.glDisable(setting)
+        opengl.glEnable(opengl.GL_CULL_FACE)
+        for matrices in (opengl.GL_PROJECTION, opengl.GL_MODELVIEW):
+            opengl.glMatrixMode(matrices)
+            opengl.glLoadIdentity()
+        opengl.glClear(opengl.GL_COLOR_BUFFER_BIT | opengl.GL_DEPTH_BUFFER_BIT)
+        opengl.glColor3f(1, 1, 1)
+        if by_list:
+            number = opengl.glGenLists(1)
+            opengl.glNewList(number, opengl.GL_COMPILE)
+            opengl.glBegin(opengl.GL_TRIANGLES)
+            for corner in places[listed].tolist():
+                opengl.glVertex4f(*corner)
+            opengl.glEnd()
+            opengl.glEndList()
+            opengl.glCallList(number)
+            opengl.glDeleteLists(number, 1)
+        else:
+            buffers = opengl.glGenBuffers(2)
+            opengl.glBindBuffer(opengl.GL_ARRAY_BUFFER, buffers[0])
+            opengl.glBufferData(opengl.GL_ARRAY_BUFFER, places.nbytes, places, opengl.GL_STATIC_DRAW)
+            opengl.glEnableClientState(opengl.GL_VERTEX_ARRAY)
+            opengl.glVertexPointer(4, opengl.GL_FLOAT, 0, None)
+            opengl.glBindBuffer(opengl.GL_ELEMENT_ARRAY_BUFFER, buffers[1])
+            opengl.glBufferData(opengl.GL_ELEMENT_ARRAY_BUFFER, listed.nbytes, listed, opengl.GL_STREAM_DRAW)
+            opengl.glDrawElements(opengl.GL_TRIANGLES, len(listed), opengl.GL_UNSIGNED_INT, None)
+            opengl.glDisableClientState(opengl.GL_VERTEX_ARRAY)
+            for kind in (opengl.GL_ARRAY_BUFFER, opengl.GL_ELEMENT_ARRAY_BUFFER):
+                opengl.glBindBuffer(kind, 0)
+            opengl.glDeleteBuffers(2, buffers)
+        frame: Frame = np.empty((SIZE_PX[1], SIZE_PX[0], 3), np.uint8)
+        mujoco.mjr_readPixels(frame, None, mujoco.MjrRect(0, 0, *SIZE_PX), context)
+        return frame
+
+    def close(self) -> None:
+        self._renderer.close()
+
+
+def test_faces_that_turn_around_are_drawn_where_opengl_draws_them_of_the_whole_mesh() -> None:
+    """In a batch with a corner outside of the view, OpenGL sorts out what faces away before it rounds corners."""
+    rng, turning = seeding.rng("test_skins", "batches"), turning_faces()
+    assert len(turning) > 50
+    projection = Projection(np.eye(3, 4), 0.1, 10.0, SIZE_PX)
+    straight, count, shown = (np.zeros(3), np.eye(3).ravel()), 6 * BATCH_FACES - 50, []
+    with closing(Drawing()) as drawing:
+        for outside in (0.0, 0.001, 0.002, 0.01):
+            # Far from those that may turn, some face away, some are seen.
+            corners_px = rng.uniform((30, 2), (60, 46), (count, 1, 2)) + rng.normal(0, 0.4, (count, 3, 2))
+            places = rng.random(count) < 0.02
+            corners_px[places] = rng.choice(turning, places.sum())
+            corners_px[rng.random(count) < outside] += [40, 0]
+            places_m = np.ones((3 * count, 3), np.float32)
+            places_m[:, :2] = corners_px.reshape(-1, 2)
+            numbers = np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)
+            faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(6 * count, np.uint32)
+            pieces = np.ones(-(-count // PIECE_FACES), np.bool_)
+            written = faces_that_show(projection, *straight, faces, pieces, SAMPLES, found)
+            assert written < 0.8 * 3 * count
+            clip = np.column_stack([2 * places_m[:, :2] / SIZE_PX - 1, np.full((3 * count, 2), (0.5, 1.0))])
+            clip = clip.astype(np.float32)
+            plain = drawing.picture(clip, numbers.ravel(), by_list=True)
+            assert np.array_equal(drawing.picture(clip, found[:written], by_list=False), plain)
+            shown.append(int((plain[:, :30] > 0).sum()))
+    assert shown[0] > shown[-1], "where corners are outside, fewer of those that turn are drawn"
 
 
 def stone(name: str, subdivisions: int, texture: bool) -> str:

@@ -270,13 +270,14 @@ class _View:
         # Of half the angles of view, to the side and up.
         self._tangents = tangent * width / height, tangent
         self._size_px = width, height
+        self._depths_m = model.vis.map.znear * model.stat.extent, model.vis.map.zfar * model.stat.extent
 
     def projection(self) -> Projection:
         half_px = np.array(self._size_px) / 2
         focal_px = half_px[1] / self._tangents[1]
         onto = np.array([[focal_px, 0, -half_px[0]], [0, focal_px, -half_px[1]], [0, 0, -1]])
         matrix = onto @ np.column_stack([self._axes.T, -self._axes.T @ self.position_m])
-        return Projection(matrix, self.near_m, self._size_px)
+        return Projection(matrix, *self._depths_m, self._size_px)
 
     def depths(self, corners_m: Floats) -> Floats:
         """(...) of ``corners_m`` (..., 3), along the axis that the camera looks along."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.jit import compiled
 from pipeline.rendering.faces import Faces
-from pipeline.rendering.mesh_pieces import PIECE_FACES
+from pipeline.rendering.mesh_pieces import BATCH_FACES, PIECE_FACES
 from pipeline.types import Floats
 
 MARGIN_PX = 1 / 128
@@ -29,12 +29,13 @@ class Projection(NamedTuple):
 
     Attributes:
         matrix: (3, 4) of a place in the world, in m, to its column, its row from below, and 1, all times its depth.
-        near_m: depth up to which something may be cut off.
+        near_m, far_m: depths before and beyond which nothing is drawn.
         size_px: width and height.
     """
 
     matrix: Floats
     near_m: float
+    far_m: float
     size_px: tuple[int, int]
 
 
@@ -47,7 +48,7 @@ def faces_that_show(
     samples: NDArray[np.float32],
     found: NDArray[np.uint32],
 ) -> int:
-    """Write the corners of all faces that may cover a sample, in their order.
+    """Write the corners of all faces that may cover a sample, in their order, and between them some without an area.
 
     Args:
         projection: of the picture.
@@ -55,7 +56,7 @@ def faces_that_show(
         faces: of the mesh; their corners come counter-clockwise as seen from the front.
         pieces: (P,) which pieces of the mesh are looked at.
         samples: (``SAMPLES``, 2) place of each sample in its pixel, 0 to 1 to the right and up.
-        found: (3 F,) to write into.
+        found: (6 F,) to write into.
 
     Returns:
         How many numbers were written.
@@ -66,11 +67,13 @@ def faces_that_show(
     return _covering(
         matrix,
         projection.near_m,
+        projection.far_m,
         faces.places_m,
         faces.place_of_corner,
         faces.corners,
         pieces,
         PIECE_FACES,
+        BATCH_FACES,
         samples,
         *projection.size_px,
         found,
@@ -81,11 +84,13 @@ def faces_that_show(
 def _covering(
     matrix: Floats,
     near_m: float,
+    far_m: float,
     places_m: NDArray[np.float32],
     place_of_corner: NDArray[np.uint32],
     corners: NDArray[np.uint32],
     pieces: NDArray[np.bool_],
     piece_faces: int,
+    batch_faces: int,
     samples: NDArray[np.float32],
     width_px: int,
     height_px: int,
@@ -93,30 +98,37 @@ def _covering(
 ) -> int:
     """In three loops without branches, each over what the one before has left: most of the time would go into branches
     that the processor guesses wrongly."""
-    at_px = np.empty((len(places_m), 2), np.float32)
+    at_px, outside = np.empty((len(places_m), 2), np.float32), np.empty(len(places_m), np.bool_)
     for place in range(len(places_m)):
         x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
         depth_m = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
-        if depth_m < near_m:
-            # Whatever is compared with it later, the face stays.
-            depth_m = np.nan
-        at_px[place, 0] = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / depth_m
-        at_px[place, 1] = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth_m
+        column = (matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]) / depth_m
+        row = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth_m
+        out = (column < 0) | (column > width_px) | (row < 0) | (row > height_px)
+        outside[place] = out | (depth_m < near_m) | (depth_m > far_m)
+        # Cut off by the near plane, a face has other corners. Whatever NaN is compared with, the face stays.
+        at_px[place, 0] = column if depth_m > 1.01 * near_m else np.nan
+        at_px[place, 1] = row if depth_m > 1.01 * near_m else np.nan
     margin = np.float32(MARGIN_PX)
     left_over, doubtful = np.empty(len(corners), np.int32), np.empty(len(corners), np.bool_)
     count = 0
-    for piece in range(len(pieces)):
-        if not pieces[piece]:
+    for batch in range((len(corners) + batch_faces - 1) // batch_faces):
+        first, last = batch_faces * batch, min(batch_faces * (batch + 1), len(corners))
+        if not pieces[first // piece_faces]:
             continue
-        for face in range(piece_faces * piece, min(piece_faces * (piece + 1), len(corners))):
+        sorted_before = False
+        for face in range(first, last):
             a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
-            abx, aby = at_px[b, 0] - at_px[a, 0], at_px[b, 1] - at_px[a, 1]
-            acx, acy = at_px[c, 0] - at_px[a, 0], at_px[c, 1] - at_px[a, 1]
-            twice_area = abx * acy - aby * acx
+            sorted_before |= outside[a] | outside[b] | outside[c]
+        for face in range(first, last):
+            a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
+            cax, cay = at_px[a, 0] - at_px[c, 0], at_px[a, 1] - at_px[c, 1]
+            cbx, cby = at_px[b, 0] - at_px[c, 0], at_px[b, 1] - at_px[c, 1]
+            twice_area = cax * cby - cay * cbx
             # So near to 0 the face may turn around when its corners are rounded.
-            unsure = margin * (abs(abx) + abs(aby) + abs(acx) + abs(acy) + margin)
+            unsure = margin * (abs(cax) + abs(cay) + abs(cbx) + abs(cby) + margin)
             left_over[count], doubtful[count] = face, not twice_area > unsure
-            count += not twice_area < -unsure
+            count += not twice_area < (0 if sorted_before else -unsure)
     faces, count = count, 0
     for number in range(faces):
         face = left_over[number]
@@ -153,7 +165,22 @@ def _covering(
             y = np.ceil(low - samples[sample, 1]) + samples[sample, 1]
             covers |= (abx * y - aby * x + ab >= 0) & (bcx * y - bcy * x + bc >= 0) & (cax * y - cay * x + ca >= 0)
         cut = ax + bx + cx
-        for corner in range(3):
-            found[3 * count + corner] = corners[face, corner]
+        left_over[count], doubtful[count] = face, cax * -bcy + cay * bcx < 0
         count += covers | wide | doubtful[number] | (cut != cut)
-    return 3 * count
+    # In the batches that OpenGL makes of what is left, a face that may turn around must not meet a corner outside.
+    written, met_outside, met_back = 0, False, False
+    for number in range(count):
+        face = left_over[number]
+        out = outside[place_of_corner[face, 0]] | outside[place_of_corner[face, 1]] | outside[place_of_corner[face, 2]]
+        if written % batch_faces == 0:
+            met_outside, met_back = False, False
+        if (met_outside and doubtful[number]) or (met_back and out):
+            while written % batch_faces:
+                found[3 * written : 3 * written + 3] = found[3 * written - 1]
+                written += 1
+            met_outside, met_back = False, False
+        met_outside, met_back = met_outside or out, met_back or doubtful[number]
+        for corner in range(3):
+            found[3 * written + corner] = corners[face, corner]
+        written += 1
+    return 3 * written

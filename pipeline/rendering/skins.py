@@ -138,7 +138,7 @@ class Skins:
                 self._fill(int(self._skin[geom]), faces, content)
         # All geoms of a mesh are drawn in one way.
         self._skin[np.isin(self._mesh, self._mesh[drawn[self._skin[drawn] < 0]])] = -1
-        most = max((faces.corners.size for faces in self._faces.values()), default=0)
+        most = max((2 * faces.corners.size for faces in self._faces.values()), default=0)
         self._found: NDArray[np.uint32] = np.empty(most, np.uint32)
 
     def _fill(self, skin: int, faces: Faces, content: bytes) -> None:
