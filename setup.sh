@@ -69,6 +69,8 @@ install_venv() {
     .venv/bin/uv pip sync --compile-bytecode --require-hashes requirements.lock
     # The lock holds the build back end, so the package itself needs no network.
     .venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable .
+    # So that not every worker of the first run compiles them. Where nothing renders, `doctor` says so later.
+    .venv/bin/python -m pipeline.validation.loops || true
 }
 
 [[ $VERB =~ ^(run|quick|test|)$ ]] || fail "unknown verb '$VERB', expected run, quick, test or none"

@@ -59,7 +59,8 @@ def _preview(arguments: argparse.Namespace) -> int:
 
     config = load(arguments.config)
     tasks = select_tasks([arguments.task])
-    with preview.staged(tasks, config) as stage, replaced(arguments.out) as temporary:
+    stage = preview.staged(tasks, config)
+    with replaced(arguments.out) as temporary:
         preview.draw(stage, arguments.axis, config, benchmark.load()).save(temporary, format="PNG")
         of = f", the first of {len(tasks)} tasks" if len(tasks) > 1 else ""
         print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")

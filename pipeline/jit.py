@@ -1,10 +1,17 @@
-"""Loops over pixels and characters, compiled by Numba when they are first called."""
+"""Loops over pixels, faces and characters, compiled by Numba when they are first called.
+
+Numba keeps what it compiled beside the source, for all processes that come later; ``setup.sh`` has it compile all loops
+once (``pipeline/validation/loops.py``).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
+
+DISPATCHERS: dict[str, Callable[[], Any]] = {}
+"""Name of each compiled function to what gives Numba's dispatcher for it."""
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
@@ -21,6 +28,8 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
         from numba import njit
 
         return njit(cache=True)(function)
+
+    DISPATCHERS[f"{function.__module__}.{function.__qualname__}"] = dispatcher
 
     @wraps(function)
     def call(*arguments: Parameters.args, **named: Parameters.kwargs) -> Result:

@@ -24,6 +24,7 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.environment import Environment
 from pipeline.publish import preview, sheets
 from pipeline.rendering.jpeg import decode
+from pipeline.rendering.last_scene import scene_of_process
 from pipeline.rendering.render import render
 from pipeline.run import plan
 from pipeline.run.compute import loop
@@ -43,8 +44,8 @@ NO_TESTS = TestSet(())
 @pytest.fixture(scope="module")
 def stage() -> Iterator[preview.Stage]:
     # Its task has something to move, so that every axis applies.
-    with preview.staged([BOWL], STARTER) as stage:
-        yield stage
+    yield preview.staged([BOWL], STARTER)
+    scene_of_process().close()
 
 
 class Dimming(RenderPerturbation):

@@ -6,8 +6,7 @@ demonstration.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -36,7 +35,7 @@ from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import roll_out
 from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
 from pipeline.rendering.jpeg import to_policy
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.last_scene import LastScene, scene_of_process
 from pipeline.run.compute import Run
 from pipeline.run.plan import draws_of
 from pipeline.testset import benchmark
@@ -91,9 +90,10 @@ class Stage:
         return shown
 
 
-@contextmanager
-def staged(tasks: Iterable[Task], config: Config) -> Iterator[Stage]:
+def staged(tasks: Iterable[Task], config: Config) -> Stage:
     """Set up the first demonstration that the configured source has of any of the tasks.
+
+    Its scenes are rendered where this process renders; whoever is done closes it (``scene_of_process``).
 
     Raises:
         PipelineError: when the source has no usable one.
@@ -115,11 +115,7 @@ def staged(tasks: Iterable[Task], config: Config) -> Iterator[Stage]:
     model_xml = demo.model_xml
     if model_xml is None:
         model_xml = shared(demo.task).place_fixtures(config.replay.fixture_seed)
-    opened = LastScene()
-    try:
-        yield Stage(demo, Scene(model_xml, demo.init_state), opened, config.replay.noops)
-    finally:
-        opened.close()
+    return Stage(demo, Scene(model_xml, demo.init_state), scene_of_process(), config.replay.noops)
 
 
 def configured(name: str, config: Config) -> AnyAxis:
@@ -197,16 +193,19 @@ def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
     test = benchmark.load()
     with replaced(folder) as temporary:
         jobs = [(tasks, config, temporary / suite, test) for suite, tasks in by_suite.items()]
-        run(_draw_all, jobs, "previews")
+        try:
+            run(_draw_all, jobs, "previews")
+        finally:
+            scene_of_process().close()
     return {suite: folder / suite for suite in by_suite}
 
 
 def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     tasks, config, folder, test = job
     folder.mkdir(parents=True)
-    with staged(tasks, config) as stage:
-        # Layout last: each of its draws opens a scene of its own, after which the demonstration's would be opened anew.
-        for name in sorted(Axes.model_fields, key="layout".__eq__):
-            axis: AnyAxis | None = getattr(config.plan.axes, name)
-            if axis is not None and axis.applies(stage.demo.task):
-                draw(stage, name, config, test).save(folder / f"{name}.png")
+    stage = staged(tasks, config)
+    # Layout last: each of its draws opens a scene of its own, after which the demonstration's would be opened anew.
+    for name in sorted(Axes.model_fields, key="layout".__eq__):
+        axis: AnyAxis | None = getattr(config.plan.axes, name)
+        if axis is not None and axis.applies(stage.demo.task):
+            draw(stage, name, config, test).save(folder / f"{name}.png")

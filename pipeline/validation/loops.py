@@ -1,0 +1,32 @@
+"""Have Numba compile all loops that a run uses, robosuite's and ours: python -m pipeline.validation.loops
+
+``setup.sh`` does so once. Without it, each process that is the first to need a loop compiles it, several at a time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline import seeding
+from pipeline.axes.language import distance
+from pipeline.axes.noise import NoiseAxis
+from pipeline.episode_schema import SCHEMA
+from pipeline.validation.doctor import trial
+
+
+def compile_all() -> None:
+    """Call everything that is compiled; what was compiled before takes no time.
+
+    Raises:
+        PipelineError: when nothing renders on this machine.
+    """
+    trial()
+    frame = np.zeros(SCHEMA.frame.shape, np.uint8)
+    axis = NoiseAxis()
+    for levels in (axis.motion, axis.gaussian, axis.zoom, axis.fog, axis.glass):
+        levels[0].apply(frame, seeding.rng("loops"))
+    distance("one wording", "another")
+
+
+if __name__ == "__main__":
+    compile_all()
