@@ -17,7 +17,7 @@ from pipeline import gl, seeding
 from pipeline.rendering.faces import Faces
 from pipeline.rendering.mesh_pieces import BATCH_FACES, PIECE_FACES
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.samples import Projection, faces_that_show
+from pipeline.rendering.samples import Projection, faces_that_show, room
 from pipeline.rendering.skins import GEOM, SKINS
 from pipeline.types import Floats, Frame
 
@@ -49,9 +49,10 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
     faces = Faces(places_m, places_m, None, numbers, places_m, numbers)
     pieces = np.array([True, False, True])
     projection = Projection(np.diag([focal_px, focal_px, 1.0]) @ np.eye(3, 4), 0.1, 10.0, SIZE_PX)
-    found = np.empty(6 * count, np.uint32)
+    found = np.empty(room(count), np.uint32)
     written = faces_that_show(projection, np.zeros(3), np.eye(3).ravel(), faces, pieces, SAMPLES, found)
-    shown = found[:written].reshape(-1, 3)
+    listed = found[:written].reshape(-1, 3)
+    shown = listed[listed[:, 0] != listed[:, 1]]
     assert np.array_equal(shown, numbers[np.sort(shown[:, 0] // 3)]), "whole faces, in their order"
 
     looked_at = pieces[np.arange(count) // PIECE_FACES]
@@ -60,6 +61,8 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
     for column, row in np.ndindex(SIZE_PX):
         for sample in SAMPLES.astype(float):
             needed |= covers(rounded, np.array([column, row]) + sample)
+    # The next test is about what turns around.
+    needed &= twice_area(corners_px) > 0
     left_out = np.ones(count, np.bool_)
     left_out[shown[:, 0] // 3] = False
     assert not (needed & looked_at & left_out).any()
@@ -70,7 +73,7 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
 def test_a_face_that_reaches_the_camera_stays() -> None:
     places_m = np.array([[0, 0, 1], [0.001, 0, 1], [0, 0.001, -1]], np.float32)
     numbers = np.array([[0, 1, 2]], np.uint32)
-    faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(6, np.uint32)
+    faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(room(1), np.uint32)
     projection = Projection(np.eye(3, 4), 0.1, 10.0, SIZE_PX)
     straight = np.zeros(3), np.eye(3).ravel()
     assert faces_that_show(projection, *straight, faces, np.array([True]), SAMPLES, found) == 3
@@ -98,13 +101,15 @@ SLIVERS = 2_000_000
 
 
 def turning_faces() -> Floats:
-    """(N, 3, 2) thin faces that face away before their corners are rounded, and cover a sample when they are."""
+    """(N, 3, 2) thin faces that face away, or about so, until their corners are rounded, and then cover a sample."""
     rng = seeding.rng("test_skins", "slivers")
     middle = 20.5 + rng.uniform(-5, 5, (SLIVERS, 1, 2))
     along = np.stack([rng.uniform(low, high, SLIVERS) for low, high in ((-1, -0.3), (-0.3, 0.3), (0.3, 1))], axis=1)
     corners_px = middle + along[..., None] * rng.normal(size=(SLIVERS, 1, 2)) + rng.normal(0, 0.002, (SLIVERS, 3, 2))
+    corners_px[::2, 1] = corners_px[::2, ::2].mean(axis=1) + rng.normal(0, 1e-5, (SLIVERS // 2, 2))
     rounded = np.rint(corners_px * 256) / 256
-    turned = (twice_area(corners_px) < -1e-4) & (twice_area(rounded) > 0)
+    # Of some it is a matter of single precision which way they face.
+    turned = (twice_area(corners_px) < 1e-5) & (twice_area(rounded) > 0)
     corners_px, rounded = corners_px[turned], rounded[turned]
     covering = np.zeros(len(rounded), np.bool_)
     for column, row in np.ndindex(4, 4):
@@ -183,7 +188,7 @@ class Drawing:
         self._renderer.close()
 
 
-def test_faces_that_turn_around_are_drawn_where_opengl_draws_them_of_the_whole_mesh() -> None:
+def test_faces_that_turn_around_are_drawn_where_opengl_does_so_of_the_whole_mesh() -> None:
     """In a batch with a corner outside of the view, OpenGL sorts out what faces away before it rounds corners."""
     rng, turning = seeding.rng("test_skins", "batches"), turning_faces()
     assert len(turning) > 50
@@ -199,7 +204,7 @@ def test_faces_that_turn_around_are_drawn_where_opengl_draws_them_of_the_whole_m
             places_m = np.ones((3 * count, 3), np.float32)
             places_m[:, :2] = corners_px.reshape(-1, 2)
             numbers = np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)
-            faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(6 * count, np.uint32)
+            faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(room(count), np.uint32)
             pieces = np.ones(-(-count // PIECE_FACES), np.bool_)
             written = faces_that_show(projection, *straight, faces, pieces, SAMPLES, found)
             assert written < 0.8 * 3 * count

@@ -39,6 +39,12 @@ class Projection(NamedTuple):
     size_px: tuple[int, int]
 
 
+def room(faces: int) -> int:
+    """How many numbers ``faces_that_show`` writes at most for a mesh of so many faces: of all of them, of as many that
+    fill batches before others of the mesh, and of one corner outside in each."""
+    return 3 * (2 * faces + 2 * (2 * faces // BATCH_FACES + 2) + BATCH_FACES)
+
+
 def faces_that_show(
     projection: Projection,
     position_m: Floats,
@@ -56,7 +62,7 @@ def faces_that_show(
         faces: of the mesh; their corners come counter-clockwise as seen from the front.
         pieces: (P,) which pieces of the mesh are looked at.
         samples: (``SAMPLES``, 2) place of each sample in its pixel, 0 to 1 to the right and up.
-        found: (6 F,) to write into.
+        found: (``room(F)``,) to write into.
 
     Returns:
         How many numbers were written.
@@ -64,20 +70,19 @@ def faces_that_show(
     matrix = np.empty((3, 4))
     matrix[:, :3] = projection.matrix[:, :3] @ rotation.reshape(3, 3)
     matrix[:, 3] = projection.matrix[:, :3] @ position_m + projection.matrix[:, 3]
-    return _covering(
+    outside, left, before, either_way = _covering(
         matrix,
         projection.near_m,
         projection.far_m,
         faces.places_m,
         faces.place_of_corner,
-        faces.corners,
         pieces,
         PIECE_FACES,
         BATCH_FACES,
         samples,
         *projection.size_px,
-        found,
     )
+    return _in_batches(faces.corners, faces.place_of_corner, outside, left, before, either_way, BATCH_FACES, found)
 
 
 @compiled
@@ -87,17 +92,22 @@ def _covering(
     far_m: float,
     places_m: NDArray[np.float32],
     place_of_corner: NDArray[np.uint32],
-    corners: NDArray[np.uint32],
     pieces: NDArray[np.bool_],
     piece_faces: int,
     batch_faces: int,
     samples: NDArray[np.float32],
     width_px: int,
     height_px: int,
-    found: NDArray[np.uint32],
-) -> int:
-    """In three loops without branches, each over what the one before has left: most of the time would go into branches
-    that the processor guesses wrongly."""
+) -> tuple[NDArray[np.bool_], NDArray[np.int32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which faces may cover a sample.
+
+    In three loops without branches, each over what the one before has left: most of the time would go into branches
+    that the processor guesses wrongly.
+
+    Returns:
+        (P,) which places are outside of the view; (L,) the numbers of the faces; and of each, whether OpenGL sorts its
+        batch before corners are rounded, and whether the face may face either way.
+    """
     at_px, outside = np.empty((len(places_m), 2), np.float32), np.empty(len(places_m), np.bool_)
     for place in range(len(places_m)):
         x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
@@ -110,10 +120,11 @@ def _covering(
         at_px[place, 0] = column if depth_m > 1.01 * near_m else np.nan
         at_px[place, 1] = row if depth_m > 1.01 * near_m else np.nan
     margin = np.float32(MARGIN_PX)
-    left_over, doubtful = np.empty(len(corners), np.int32), np.empty(len(corners), np.bool_)
+    left_over, doubtful = np.empty(len(place_of_corner), np.int32), np.empty(len(place_of_corner), np.bool_)
+    before, either_way = np.empty(len(place_of_corner), np.bool_), np.empty(len(place_of_corner), np.bool_)
     count = 0
-    for batch in range((len(corners) + batch_faces - 1) // batch_faces):
-        first, last = batch_faces * batch, min(batch_faces * (batch + 1), len(corners))
+    for batch in range((len(place_of_corner) + batch_faces - 1) // batch_faces):
+        first, last = batch_faces * batch, min(batch_faces * (batch + 1), len(place_of_corner))
         if not pieces[first // piece_faces]:
             continue
         sorted_before = False
@@ -128,7 +139,8 @@ def _covering(
             # So near to 0 the face may turn around when its corners are rounded.
             unsure = margin * (abs(cax) + abs(cay) + abs(cbx) + abs(cby) + margin)
             left_over[count], doubtful[count] = face, not twice_area > unsure
-            count += not twice_area < (0 if sorted_before else -unsure)
+            before[count] = sorted_before
+            count += not twice_area < (-unsure / 8 if sorted_before else -unsure)
     faces, count = count, 0
     for number in range(faces):
         face = left_over[number]
@@ -145,7 +157,7 @@ def _covering(
             inside |= (np.ceil(left - x) + x <= right) & (np.ceil(low - y) + y <= high)
         inside &= (right >= 0) & (left <= width_px) & (high >= 0) & (low <= height_px)
         cut = ax + bx + cx
-        left_over[count], doubtful[count] = face, doubtful[number]
+        left_over[count], doubtful[count], before[count] = face, doubtful[number], before[number]
         count += inside | (cut != cut)
     faces, count = count, 0
     for number in range(faces):
@@ -165,22 +177,51 @@ def _covering(
             y = np.ceil(low - samples[sample, 1]) + samples[sample, 1]
             covers |= (abx * y - aby * x + ab >= 0) & (bcx * y - bcy * x + bc >= 0) & (cax * y - cay * x + ca >= 0)
         cut = ax + bx + cx
-        left_over[count], doubtful[count] = face, cax * -bcy + cay * bcx < 0
+        unsure = margin * (abs(cax) + abs(cay) + abs(bcx) + abs(bcy) + margin)
+        left_over[count], before[count] = face, before[number]
+        # To OpenGL, whose numbers have the same precision, it may face either way.
+        either_way[count] = cay * bcx - cax * bcy <= unsure / 8
         count += covers | wide | doubtful[number] | (cut != cut)
-    # In the batches that OpenGL makes of what is left, a face that may turn around must not meet a corner outside.
-    written, met_outside, met_back = 0, False, False
-    for number in range(count):
-        face = left_over[number]
-        out = outside[place_of_corner[face, 0]] | outside[place_of_corner[face, 1]] | outside[place_of_corner[face, 2]]
+    return outside, left_over[:count], before[:count], either_way[:count]
+
+
+@compiled
+def _in_batches(
+    corners: NDArray[np.uint32],
+    place_of_corner: NDArray[np.uint32],
+    outside: NDArray[np.bool_],
+    faces: NDArray[np.int32],
+    before: NDArray[np.bool_],
+    either_way: NDArray[np.bool_],
+    batch_faces: int,
+    found: NDArray[np.uint32],
+) -> int:
+    """Write faces so that in each batch that OpenGL makes of them, all that may face either way are sorted as in the
+    mesh: faces without an area fill a batch up, or bring in a corner outside of the view."""
+    written, met_outside, met_after = 0, False, False
+    for number in range(len(faces)):
+        face = faces[number]
+        a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
+        reaches_out = outside[a] | outside[b] | outside[c]
+        after = either_way[number] and not before[number]
+        outsider = either_way[number] and before[number] and not reaches_out
+        clash = (met_outside and after) or (met_after and (reaches_out or outsider))
+        # An outsider takes a place in the same batch.
+        places_left = (batch_faces - written % batch_faces) % batch_faces
+        fill = places_left if clash or (outsider and places_left == 1) else 0
+        for _ in range(fill):
+            found[3 * written : 3 * written + 3] = found[3 * written - 1]
+            written += 1
         if written % batch_faces == 0:
-            met_outside, met_back = False, False
-        if (met_outside and doubtful[number]) or (met_back and out):
-            while written % batch_faces:
-                found[3 * written : 3 * written + 3] = found[3 * written - 1]
-                written += 1
-            met_outside, met_back = False, False
-        met_outside, met_back = met_outside or out, met_back or doubtful[number]
+            met_outside, met_after = False, False
         for corner in range(3):
             found[3 * written + corner] = corners[face, corner]
         written += 1
+        if outsider and not met_outside:
+            corner = 3 * batch_faces * (face // batch_faces)
+            while not outside[place_of_corner[corner // 3, corner % 3]]:
+                corner += 1
+            found[3 * written : 3 * written + 3] = corners[corner // 3, corner % 3]
+            written += 1
+        met_outside, met_after = met_outside or reaches_out or outsider, met_after or after
     return 3 * written

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline import gl
 from pipeline.rendering.faces import Faces, faces_of
 from pipeline.rendering.mesh_pieces import Boxes, MeshPieces
-from pipeline.rendering.samples import SAMPLES, Projection, faces_that_show
+from pipeline.rendering.samples import SAMPLES, Projection, faces_that_show, room
 
 SKINS = 64
 """As many with places in a texture, and as many without; LIBERO's scenes have up to 50 large meshes."""
@@ -138,7 +138,7 @@ class Skins:
                 self._fill(int(self._skin[geom]), faces, content)
         # All geoms of a mesh are drawn in one way.
         self._skin[np.isin(self._mesh, self._mesh[drawn[self._skin[drawn] < 0]])] = -1
-        most = max((2 * faces.corners.size for faces in self._faces.values()), default=0)
+        most = max((room(len(faces.corners)) for faces in self._faces.values()), default=0)
         self._found: NDArray[np.uint32] = np.empty(most, np.uint32)
 
     def _fill(self, skin: int, faces: Faces, content: bytes) -> None:
