@@ -293,3 +293,14 @@ def test_faces_of_an_endless_floor_scene_are_drawn_by_mujoco_alone() -> None:
         assert np.array_equal(opened.frame("fixed"), plain(opened, "fixed"))
     finally:
         opened.close()
+
+
+def test_on_a_gpu_meshes_are_drawn_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gl.GlChoice, "software", False)
+    opened = Renderer(scene(True))
+    try:
+        mujoco.mj_forward(opened.model, opened.data)
+        assert opened._skins is None
+        assert np.array_equal(opened.frame("moving"), plain(opened, "moving"))
+    finally:
+        opened.close()
