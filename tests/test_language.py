@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -35,6 +36,11 @@ from pipeline.types import Task
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 MIN_PER_CLASS = 10
 
+OF_A_KIND = re.compile(
+    r"\b(container|vessel|receptacle|appliance|equipment|device|holder|product|item|dishware|furniture|structure|unit"
+    r"|condiment|beverage|broth|liquid|dessert|cupboard|platter|organizer|volume|source)s?\b"
+)
+"""Words for the kinds of things; LIBERO-Plus describes a thing by its kind with what it is made of or used for."""
 
 TASKS = [task for suite in SUITES for task in tasks(suite)]
 BOWL_ON_PLATE = find_task("libero_goal", "put_the_bowl_on_the_plate")
@@ -62,6 +68,11 @@ def test_bank_is_complete_and_clean(task: Task) -> None:
     assert all(len(texts) >= MIN_PER_CLASS for texts in classes.values())
     linted = {text: lint(text, task, component) for component, texts in classes.items() for text in texts}
     assert {text: fault for text, fault in linted.items() if fault} == {}
+
+
+def test_things_are_also_called_by_their_kind(task: Task) -> None:
+    described = [text for text in load_bank()[task.suite][task.name]["common_sense"] if OF_A_KIND.search(text)]
+    assert len(described) > 5
 
 
 def test_no_rewrite_is_stored_twice(task: Task) -> None:
