@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
@@ -68,6 +69,33 @@ class Policy(Protocol):
     def close(self) -> None: ...
 
 
+class NextLook:
+    """When a model server has to be shown the scene anew.
+
+    A server that answers with a chunk (n, 7) computes its next answer when those actions are taken, from what it is
+    shown then. One that answers with a single action (7,) may have taken it from a chunk that it keeps, which nobody
+    but itself knows; it is shown the scene once in ``every`` control steps.
+    """
+
+    def __init__(self, every: int):
+        self._every, self._left = every, 0
+
+    def begin(self) -> None:
+        """An episode begins."""
+        self._left = 0
+
+    @property
+    def due(self) -> bool:
+        return self._left == 0
+
+    def looked(self) -> None:
+        self._left = self._every
+
+    def answered(self, actions: ArrayLike) -> None:
+        """Args: actions: (n, 7) or (7,), all of which are taken before the next question."""
+        self._left = self._left - 1 if np.ndim(actions) == 1 else 0
+
+
 class Server:
     """A model server of vla-eval. It is asked at every step, or, where it answers with a chunk, once in a chunk.
 
@@ -77,7 +105,7 @@ class Server:
     Args:
         address: such as ``ws://localhost:8000``.
         timeout_s: how long an answer may take.
-        look_every: see ``PerturbedLibero``.
+        look_every: see ``NextLook``.
 
     Raises:
         PipelineError: when no server answers there.
@@ -90,7 +118,7 @@ class Server:
             raise PipelineError(
                 "the package vla-eval is not installed", remedy="pip install 'pipeline[evaluation]', or vla-eval==0.8.0"
             ) from error
-        self.name, self._look_every = address, look_every
+        self.name, self._next_look = address, NextLook(look_every)
         self._loop = asyncio.new_event_loop()
         self._connection = Connection(address, timeout=timeout_s, max_retries=3)
         self._connect()
@@ -100,25 +128,27 @@ class Server:
             bool(wanted.get("send_state")),
             not wanted.get("quat_no_antipodal"),
         )
-        self._asked = 0
         self._seen: dict[str, Any] = {}
 
     def begin(self, task: EvaluationTask) -> None:
-        self._asked = 0
+        self._next_look.begin()
         if not self._connection.is_connected:
             self._connect()
         self._run(self._connection.start_episode({"task": task.for_harness()}), self._connection.timeout)
 
     def act(self, look: Look) -> Any:
-        if self._asked % self._look_every == 0:
+        if self._next_look.due:
             self._seen = look(self._wanted)
-        self._asked += 1
+            self._next_look.looked()
         if not self._connection.is_connected:
             raise self._fault("the connection was closed")
         answer = self._run(self._connection.act(self._seen), self._connection.timeout)
         if not isinstance(answer, dict):
             raise self._fault(f"the model server answers with {type(answer).__name__}")
-        return answer.get("actions", answer.get("action"))
+        actions = answer.get("actions", answer.get("action"))
+        checked_actions(actions, self.name)
+        self._next_look.answered(actions)
+        return actions
 
     def end(self, success: bool) -> None:
         # The episode is over, whether the server hears of it or not.

@@ -46,8 +46,8 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
         actions = self._replays[ctx.session_id].act(lambda _: obs)
-        # A chunk of one is sent as one action (7,).
-        await ctx.send_action({"actions": actions.squeeze()})
+        # A chunk of one is sent as one action (7,), but not the last action of a longer one: it keeps none.
+        await ctx.send_action({"actions": actions.squeeze() if self._tracked or self._chunk == 1 else actions})
 
     def get_observation_params(self) -> dict[str, Any]:
         return {"send_state": self._tracked}

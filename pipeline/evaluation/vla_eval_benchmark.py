@@ -22,6 +22,7 @@ from vla_eval.specs import (
 from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.policies import NextLook
 from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 
@@ -35,8 +36,9 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     Args:
         selection: fields of ``Selection``, such as ``{"source": "libero_plus", "axes": ["camera"], "subset": 100}``.
         settings: fields of ``Settings``, such as ``{"prompt": "benchmark"}``.
-        look_every: a server that answers from a chunk of actions uses one observation in so many; frames in between
-            are those of the last look and are not rendered anew. 1 renders every step.
+        look_every: a server that answers with one action from a chunk of its own is shown one observation in so many
+            control steps, the number of actions that it takes from a chunk; in between the last one is sent again, and
+            nothing is rendered. 1 renders every step. After a chunk that a server answers with it is always looked.
         send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
             names it. Its model servers set these.
         env_seed: as there, of LIBERO's reset.
@@ -71,7 +73,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         fixtures = {} if env_seed is None else {"fixture_seed": env_seed}
         self._archive = None if assets is None else Path(assets)
         self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}), self._archive)
-        self._look_every = max(1, look_every)
+        self._next_look = NextLook(look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
     def get_tasks(self) -> list[dict[str, Any]]:
@@ -82,20 +84,20 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         progress = self._environment.reset(EvaluationTask.of_harness(task))
         if progress.over:
             raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
+        self._next_look.begin()
         return self._look()
 
     def step(self, action: dict[str, Any]) -> StepResult:
         """Take one action (7,), or all of a chunk (n, 7) until the episode is over."""
         given = action.get("actions", action.get("action"))
-        chunk = np.atleast_2d(np.asarray(given))
-        for one in chunk:
+        for one in np.atleast_2d(np.asarray(given)):
             progress = self._environment.step(one)
             if progress.over:
                 break
-        seen = self._last
-        if not progress.over and (len(chunk) > 1 or progress.steps % self._look_every == 0):
-            seen = self._look()
-        return StepResult(seen, float(progress.success), progress.over, {"success": progress.success})
+        self._next_look.answered(given)
+        if self._next_look.due and not progress.over:
+            self._look()
+        return StepResult(self._last, float(progress.success), progress.over, {"success": progress.success})
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
         observation: dict[str, Any] = raw_obs
@@ -130,4 +132,5 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def _look(self) -> dict[str, Any]:
         self._last = self._environment.observation(self._wanted)
+        self._next_look.looked()
         return self._last

@@ -1,0 +1,107 @@
+"""A model server that is shown few observations is shown the right ones: those that it computes new actions from."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import REPOSITORY, STOVE
+
+from pipeline import gl
+
+# The harness's classes import robosuite, which renders with what MUJOCO_GL says then.
+gl.choose()
+
+from vla_eval.connection import Connection  # noqa: E402
+from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
+
+from pipeline.evaluation import episode  # noqa: E402
+from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
+from pipeline.evaluation.policies import Server  # noqa: E402
+from pipeline.evaluation.replay_server import running  # noqa: E402
+from pipeline.evaluation.rollout import roll_out_policy  # noqa: E402
+from pipeline.evaluation.tasks import Selection, select  # noqa: E402
+from pipeline.evaluation.vla_eval_benchmark import PerturbedLibero  # noqa: E402
+
+STEPS, LOOK_EVERY = 17, 8
+CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
+(TASK,) = select(CHOSEN)
+
+Run = Callable[[str, int], int]
+"""Runs the episode with the server at an address, which looks once in so many steps; how many looks were rendered."""
+
+
+def ours(address: str, look_every: int) -> int:
+    with closing(EpisodeEnvironment()) as environment, closing(Server(address, look_every=look_every)) as server:
+        row = roll_out_policy(environment, server, TASK)
+    assert row["steps"] == STEPS
+    return int(row["looks"])
+
+
+def harness(address: str, look_every: int) -> int:
+    """By the runner of vla-eval itself."""
+
+    async def run() -> dict[str, Any]:
+        async with Connection(address) as connection:
+            ran = await SyncEpisodeRunner().run_episode(benchmark, TASK.for_harness(), connection, max_steps=STEPS)
+            return dict(ran)
+
+    selection = {"suites": CHOSEN.suites, "tasks": CHOSEN.tasks}
+    benchmark = PerturbedLibero(selection, look_every=look_every, send_wrist_image=True, send_state=True)
+    looks = 0
+    observation = benchmark._environment.observation
+
+    def counted(wanted: Any) -> dict[str, Any]:
+        nonlocal looks
+        looks += 1
+        return observation(wanted)
+
+    benchmark._environment.observation = counted  # type: ignore[method-assign]
+    asyncio.run(run())
+    assert benchmark._environment.progress.steps == STEPS
+    benchmark.cleanup()
+    return looks
+
+
+def shown(run: Run, out: Path, chunk: int, keeps: bool, look_every: int) -> tuple[dict[int, str], int]:
+    """Control step to the observation from which the server computed new actions, and the number of looks."""
+    options = ["--args.out", str(out), "--args.chunk", str(chunk), "--args.keeps", str(keeps).lower()]
+    with running(str(REPOSITORY / "tests" / "recording_server.py"), *options) as address:
+        looks = run(address, look_every)
+    lines = [json.loads(line) for line in out.read_text().splitlines()]
+    assert len(dict(lines)) == len(lines)
+    return dict(lines), looks
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(episode.STEP_LIMITS, STOVE.suite, STEPS)
+        yield
+
+
+@pytest.fixture(scope="module")
+def at_every_step(tmp_path_factory: pytest.TempPathFactory) -> dict[int, str]:
+    """What a run shows that looks at every step, whose server computes at every step."""
+    observations, looks = shown(ours, tmp_path_factory.mktemp("every") / "shown.jsonl", 1, False, 1)
+    assert list(observations) == list(range(STEPS))
+    assert len({*observations.values()}) == looks == STEPS
+    return observations
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("run", [ours, harness])
+@pytest.mark.parametrize(("chunk", "keeps"), [(5, False), (LOOK_EVERY, True)])
+def test_new_actions_are_computed_from_the_state_as_it_is(
+    at_every_step: dict[int, str], tmp_path: Path, run: Run, chunk: int, keeps: bool
+) -> None:
+    """A server answers with its chunk, of any length, or keeps it and answers with one action at a time."""
+    observations, looks = shown(run, tmp_path / "shown.jsonl", chunk, keeps, LOOK_EVERY)
+    starts = range(0, STEPS, chunk)
+    assert observations == {step: at_every_step[step] for step in starts}
+    assert looks == len(starts)
