@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 import pickle
 import zipfile
 from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -134,3 +137,47 @@ def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
     (clean,) = select(Selection(suites=("libero_goal",), tasks=("turn_on_the_stove",)))
     own_class = {"name": "turn on the stove", "suite": "libero_goal", "task_id": 7, "episode_idx": 0}
     assert EvaluationTask.of_harness(own_class) == clean
+
+
+@pytest.mark.parametrize(
+    ("chosen", "told"),
+    [
+        ({"episodes": 60}, "at most 50"),
+        ({"source": "pairs", "episodes": 51}, "at most 50"),
+        ({"source": "own", "levels": (9,)}, "1 or 2 or 3 or 4 or 5"),
+        ({"source": "libero_plus", "levels": (9,)}, "0 or 1 or 2 or 3 or 4 or 5"),
+        ({"levels": (3,)}, "expected: 0"),
+        ({"source": "libero_plus", "components": ("dist",)}, "distance or fog or gaussian"),
+        ({"source": "own", "axes": ("camera",), "components": ("dist",)}, "distance or orientation or spherical"),
+        ({"components": ("distance",)}, "expected: clean"),
+        ({"suites": ("libero_gaol",)}, "libero_10 or libero_goal"),
+        ({"axes": ("camera",)}, "expected: clean"),
+        ({"tasks": ("turn_on*", "turn_of_the_stove")}, "turn_on_the_stove"),
+        ({"source": "libero_plus", "axes": ("camera",), "components": ("fog",)}, "axes noise; or components distance"),
+    ],
+)
+def test_a_name_that_nothing_has_is_refused_with_those_that_there_are(chosen: dict[str, object], told: str) -> None:
+    with pytest.raises(PipelineError) as caught:
+        select(Selection.model_validate(chosen))
+    assert told in str(caught.value)
+
+
+def test_held_out_draws_can_be_more_than_initial_states() -> None:
+    chosen = {"source": "own", "axes": ("robot",), "levels": (3,), "suites": (STOVE.suite,), "tasks": (STOVE.name,)}
+    fifty, more = (select(Selection.model_validate(chosen | {"episodes": count})) for count in (50, 53))
+    assert more[:50] == fifty
+    assert [task.number for task in more[50:]] == [50, 51, 52]
+    assert len({draw(task, 0).model_dump_json() for task in more}) == 53
+
+
+def test_a_list_of_tasks_is_checked(tmp_path: Path) -> None:
+    (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+    file = tmp_path / "tasks.json"
+    for wrong in ({"level": "high"}, {"source": "libero_pro"}, {"number": None}):
+        file.write_text(json.dumps({"seed": 0, "tasks": [asdict(task) | wrong]}))
+        with pytest.raises(PipelineError, match="not a list of tasks"):
+            select(Selection(file=file))
+    file.write_text(json.dumps({"seed": 0, "tasks": [asdict(task)]}))
+    assert select(Selection(file=file)) == [task]
+    with pytest.raises(PipelineError, match="expected: clean"):
+        select(Selection(file=file, axes=("camera",)))

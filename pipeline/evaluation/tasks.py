@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import difflib
 import fnmatch
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import combinations, product, zip_longest
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import Field
+from pydantic import TypeAdapter
 
 from pipeline import seeding
 from pipeline.axes import AnyPerturbation, axes_of
-from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation import goals, held_out, libero_plus
 from pipeline.evaluation.held_out import LEVELS, OWN_AXES
+from pipeline.evaluation.selection import Selection as Selection
+from pipeline.evaluation.selection import Source, check, check_names
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import SUITES
 from pipeline.types import Task
 
-Source = Literal["libero", "libero_plus", "own", "goals"]
+COLUMNS = {"suites": "suite", "axes": "axis", "components": "component", "levels": "level"}
+"""Fields of a selection to what they restrict."""
+
 PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
 """The six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
 
@@ -69,33 +73,6 @@ class EvaluationTask:
         return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
 
 
-class Selection(Frozen):
-    """Which tasks to evaluate on; what is left out does not restrict.
-
-    Attributes:
-        source: where they come from. ``pairs`` are, for every two axes, LIBERO's task, the held-out draw of either
-            axis, and both draws together, on the same initial states.
-        file: a list of tasks that ``analyse construct`` wrote, in place of a source.
-        suites, axes, components, levels: those of the tasks wanted.
-        tasks: shell-style patterns, one of which must match the task's name or its LIBERO task's.
-        episodes: how many of LIBERO's 50 initial states of each task (``libero``, ``goals``, ``pairs``), or draws of
-            each task, axis and level (``own``).
-        subset: at most so many, spread evenly over suites, axes, components and levels.
-        seed: of the subset and of all draws.
-    """
-
-    source: Source | Literal["pairs"] = "libero"
-    file: Path | None = None
-    suites: tuple[str, ...] = SUITES
-    axes: tuple[str, ...] = ()
-    components: tuple[str, ...] = ()
-    levels: tuple[int, ...] = ()
-    tasks: tuple[str, ...] = ()
-    episodes: int = Field(default=1, ge=1, le=50)
-    subset: int | None = Field(default=None, ge=1)
-    seed: int = 0
-
-
 def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
     """The tasks that a selection names, in a fixed order.
 
@@ -105,12 +82,14 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
     Raises:
         PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.
     """
-    _check_names(selection)
-    wanted = [task for task in _listed(selection) if _matches(task, selection)]
+    check_names(selection)
+    listed = list(_listed(selection))
+    _check_listed(selection, listed)
+    wanted = [task for task in listed if _matches(task, selection)]
     if selection.source == "libero_plus" and selection.file is None:
         wanted = _runnable(wanted, selection, archive)
     if not wanted:
-        raise PipelineError("no task is left", where=f"selection {selection.model_dump(exclude_defaults=True)}")
+        raise _nothing_left(selection, listed)
     return wanted if selection.subset is None else balanced(wanted, selection.subset, selection.seed)
 
 
@@ -164,7 +143,8 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
     try:
         content = json.loads(file.read_text())
         names = EvaluationTask.__dataclass_fields__
-        listed = [EvaluationTask(**{name: task[name] for name in names}) for task in content["tasks"]]
+        described = [{name: task[name] for name in names} for task in content["tasks"]]
+        listed = TypeAdapter(list[EvaluationTask]).validate_python(described)
         drawn_under = content["seed"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise PipelineError(
@@ -234,34 +214,36 @@ def _matches(task: EvaluationTask, selection: Selection) -> bool:
     return all(not allowed or value in allowed for value, allowed in restricted) and (named or not selection.tasks)
 
 
-def _check_names(selection: Selection) -> None:
-    if selection.file is not None:
-        return
-    if selection.source == "pairs" and (selection.subset or selection.components):
-        raise PipelineError(
-            "pairs would lose some of their four combinations",
-            where="subset" if selection.subset else "components",
-            remedy="restrict pairs by suite, axis, level, task and episodes",
-        )
-    if "language" in selection.axes and selection.source in ("own", "pairs"):
-        raise PipelineError(
-            "language has no held-out draws: its rewrites are a list, and plans train on all of it",
-            where="axes",
-            expected=" or ".join(OWN_AXES),
-            remedy="--source libero_plus --axis language, whose 1,537 instructions every plan keeps clear of",
-        )
-    offered = {
-        "libero": {"clean"},
-        "libero_plus": {axis for axis, _ in benchmark.COUNTS},
-        "own": set(OWN_AXES),
-        "goals": {"goal"},
-        "pairs": set(OWN_AXES),
-    }[selection.source]
-    for field, named, known in (("suites", selection.suites, SUITES), ("axes", selection.axes, offered)):
-        if unknown := [name for name in named if name not in known]:
-            raise PipelineError(
-                f"{selection.source} has no {unknown[0]!r}", where=field, expected=" or ".join(sorted(known))
-            )
+def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
+    """Have every name that chooses among the listed tasks be one of theirs.
+
+    Raises:
+        PipelineError: when one is not.
+    """
+    # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
+    for field in () if selection.source == "pairs" else ("axes", "components", "levels"):
+        check(field, getattr(selection, field), {getattr(task, COLUMNS[field]) for task in listed}, selection)
+    names = {name for task in listed for name in (task.name, task.base)}
+    names |= {task.name for suite in SUITES for task in tasks(suite)}
+    for pattern in selection.tasks:
+        if not fnmatch.filter(names, pattern):
+            closest = difflib.get_close_matches(pattern, names, cutoff=0)
+            raise PipelineError(f"no task is named {pattern!r}", where="tasks", expected=" or ".join(closest))
+
+
+def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> PipelineError:
+    """What there is of each restriction among the tasks that keep to all others."""
+    there = []
+    for field, column in COLUMNS.items():
+        if getattr(selection, field):
+            others = selection.model_copy(update={field: ()})
+            values = {getattr(task, column) for task in listed if _matches(task, others)}
+            there += [f"{field} {' or '.join(str(value) for value in sorted(values))}"] if values else []
+    return PipelineError(
+        "no task is left",
+        where=f"selection {selection.model_dump(mode='json', exclude_defaults=True)}",
+        expected="with the other restrictions as they are, " + "; or ".join(there) if there else None,
+    )
 
 
 def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
