@@ -13,17 +13,21 @@ from pipeline.evaluation.results import Row
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.types import Frame
 
+FILM_STEPS = 8
+"""A video has a frame of at most so many steps, also where the policy looks less often, or at nothing."""
+
 
 def roll_out_policy(
     environment: EpisodeEnvironment,
     policy: Policy,
     task: EvaluationTask,
-    seen: dict[int, Frame] | None = None,
+    film: dict[int, Frame] | None = None,
 ) -> Row:
     """Run one episode to its end; returns what is recorded of it.
 
     Args:
-        seen: where the agent view of each look goes, by the number of steps before it.
+        film: where agent views go, by the number of steps before each: of every look, and one whenever
+            ``FILM_STEPS`` went by without a look at it.
 
     Raises:
         PolicyError: when the policy answers with anything but actions.
@@ -37,12 +41,18 @@ def roll_out_policy(
         nonlocal looks
         looks += 1
         observation = environment.observation(wanted)
-        if seen is not None and wanted.images:
-            seen[environment.progress.steps] = observation["images"]["agentview"]
+        if film is not None and wanted.images:
+            film[environment.progress.steps] = observation["images"]["agentview"]
         return observation
+
+    def record() -> None:
+        steps = environment.progress.steps
+        if film is not None and steps - max(film, default=-FILM_STEPS) >= FILM_STEPS:
+            film[steps] = environment.image("agentview")
 
     while not progress.over:
         for action in checked_actions(policy.act(look), policy.name):
+            record()
             progress = environment.step(action)
             if progress.over:
                 break
