@@ -99,7 +99,7 @@ class Ours:
 
     def __init__(self, address: str, both_views: bool, times: Times):
         self._environment, self._server = EpisodeEnvironment(), Server(address)
-        self._server._wanted = Wanted(wrist=both_views, state=both_views)
+        self._server.wanted = Wanted(wrist=both_views, state=both_views)
         self._times = times
 
     def run(self, task: EvaluationTask, steps: int) -> int:

@@ -102,7 +102,7 @@ def harness(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Pa
 def ours(tasks: Sequence[tuple[str, ...]], states: int, address: str, out: Path, *options: str) -> list[str]:
     suites, names = (list(dict.fromkeys(column)) for column in zip(*tasks, strict=True))
     program = [sys.executable, "-m", "pipeline", "evaluate", str(out), "--server", address, *options]
-    return [*program, "--suite", *suites, "--task", *names, "--episodes", str(states)]
+    return [*program, "--label", out.name, "--suite", *suites, "--task", *names, "--episodes", str(states)]
 
 
 def timed(commands: Sequence[Sequence[str]], episodes: int) -> dict[str, Any]:

@@ -235,7 +235,8 @@ def _read_record(file: Path) -> object:
 
 
 def _result() -> bytes:
-    return json.dumps({"episode": "a", "success": True, "steps": 12, "settings": {"seed": 0}}).encode()
+    policy = {"policy": "a", "identity": "claimed:a", "settings": {"seed": 0}}
+    return json.dumps({"episode": "a", **policy, "success": True, "steps": 12}).encode()
 
 
 @cache

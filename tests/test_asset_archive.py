@@ -148,6 +148,29 @@ def test_files_are_those_that_the_benchmarks_classes_name() -> None:
     assert "new_objects/bag_of_yeast/ibvtik/usd/MJCF/ibvtik.xml" in paths
 
 
+def test_results_depend_on_the_files_of_their_task_wherever_they_are(
+    tasks: dict[str, TestTask], tmp_path: Path
+) -> None:
+    one = stand_in(tmp_path / "one", tasks.values())
+    two = shutil.copytree(one, tmp_path / "two")
+    for axis in AXES:
+        assert asset_archive.contents(tasks[axis], one) == asset_archive.contents(tasks[axis], two)
+    scene = two / asset_archive.scene_files(tasks["light"]).scene_xml
+    scene.write_text(scene.read_text().replace(DIFFUSE, "0.9 0.9 0.9"))
+    (two / asset_archive.scene_files(tasks["background"]).wall).write_bytes(b"another image")
+    model = two / next(iter(asset_archive.object_models(tasks["layout"]).values()))
+    described = ET.parse(model)
+    mesh = next(described.iterfind(".//*[@file]"))
+    copied = Path(shutil.copy(mesh.attrib["file"], model.parent))
+    mesh.set("file", copied.name)
+    described.write(model)
+    with_copy = asset_archive.contents(tasks["layout"], two)
+    copied.write_bytes(b"another mesh")
+    assert asset_archive.contents(tasks["layout"], two) != with_copy, "what a file refers to counts too"
+    for axis in AXES:
+        assert asset_archive.contents(tasks[axis], one) != asset_archive.contents(tasks[axis], two), axis
+
+
 @pytest.mark.slow
 def test_scenes_of_the_archive_are_seen(environment: EpisodeEnvironment, tasks: dict[str, TestTask]) -> None:
     clean = EvaluationTask("libero", STOVE.suite, STOVE.name, "clean", "clean", "clean", 0, 0)

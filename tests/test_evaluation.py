@@ -200,7 +200,8 @@ def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -
 def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
     with replaying(8) as address:
         ours = tmp_path / "ours"
-        arguments = ["--suite", "libero_goal", "--server", address, "--workers", "1", "--videos", "all"]
+        arguments = ["--suite", "libero_goal", "--server", address, "--label", "replay"]
+        arguments += ["--workers", "1", "--videos", "all"]
         subprocess.run(command(ours, *arguments), cwd=REPOSITORY, check=True)
         ((episode, row),) = rows(ours).items()
         assert row["success"]

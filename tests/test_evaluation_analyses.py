@@ -30,12 +30,12 @@ from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.run import plan
 
-SETTINGS: dict[str, Any] = {"prompt": "clean"}
+BY: dict[str, Any] = {"policy": "p", "identity": "claimed:p", "settings": {"prompt": "clean"}}
 
 
 def result(task: EvaluationTask, success: bool, reason: str = "step_limit") -> dict[str, Any]:
     """What an episode's file holds, as far as the analyses read it."""
-    row = {"success": success, "reason": "success" if success else reason, "policy": "p", "settings": SETTINGS}
+    row = {"success": success, "reason": "success" if success else reason, **BY}
     return {**asdict(task), **row, "seed": 0, "episode": f"{task.source}_{task.name}"}
 
 
@@ -106,7 +106,7 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
     assert names == ["robot", "camera", "noise"]
     assert shown[0, 1] == pytest.approx(80 * 70 / 220**2), "the product stands above the diagonal"
     assert shown[1, 0] == pytest.approx(1 / 11)
-    EpisodeFiles(tmp_path).save({**result(tasks[0], True), "policy": "q", "episode": "other"})
+    EpisodeFiles(tmp_path).save({**result(tasks[0], True), "identity": "claimed:q", "episode": "other"})
     with pytest.raises(PipelineError, match="several policies"):
         analyse("gap", str(tmp_path))
 

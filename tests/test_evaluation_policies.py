@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import REPOSITORY
-from test_evaluation import rows
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.evaluate import PolicyConfig, _environment, evaluate
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.job import _environment
 from pipeline.evaluation.policies import PolicyError, checked_actions
+from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.replay_server import running
+from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import Selection
 from pipeline.run.compute import loop
@@ -51,7 +53,7 @@ def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
             evaluate(FAULTY_AND_STOVE, RECORDED, policy, tmp_path, loop)
     for told in ("within 10 s", "pick_up_the_milk", "no such camera", "push_the_plate"):
         assert told in str(raised.value)
-    (row,) = rows(tmp_path).values()
+    (row,) = EpisodeFiles(tmp_path).rows()
     assert row["base"] == "turn_on_the_stove"
     assert row["success"]
     assert json.loads((tmp_path / "summary.json").read_text())["all"]["episodes"] == 1
@@ -63,8 +65,9 @@ def test_a_server_that_dies_ends_the_run(tmp_path: Path) -> None:
     options = ["--initial-states", "demonstration", "--workers", "1"]
     with running(FAULTY_SERVER, "--args.dies", "true") as address:
         command = [sys.executable, "-m", "pipeline", "evaluate", str(tmp_path), *suites, *options, "--server", address]
+        command += ["--label", "faulty"]
         stopped = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert stopped.returncode == 1
     assert "Traceback" not in stopped.stderr
     assert "run the same command again" in stopped.stderr
-    assert not any(row["base"].startswith("pick_up_the_milk") for row in rows(tmp_path).values())
+    assert not any(row["base"].startswith("pick_up_the_milk") for row in EpisodeFiles(tmp_path).rows())

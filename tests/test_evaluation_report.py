@@ -33,6 +33,7 @@ def result(task: EvaluationTask, policy: str, success: bool, prompt: str = "clea
         **asdict(task),
         "episode": digest(str(task), policy, prompt)[:16],
         "policy": policy,
+        "identity": f"claimed:{policy}",
         "success": success,
         "reason": "success" if success else "step_limit",
         "steps": steps,

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import PipelineError
+from pipeline.files import Edition, checksum, edition
 from pipeline.libero.assets import libero_assets
 from pipeline.physics.environment import control_env
 from pipeline.testset import benchmark
@@ -88,6 +89,34 @@ def having(test: TestTask, archive: Path | None) -> Assets | None:
     """
     folders = [libero_assets(), *([] if archive is None else [archive])]
     return next((assets for assets in map(Assets, folders) if assets.holds(test)), None)
+
+
+def contents(test: TestTask, archive: Path | None) -> list[str]:
+    """SHA-256 of each file of LIBERO's assets or the archive that a light, background or layout task is made from:
+    those that it names, then those that they refer to. Empty for tasks of other axes."""
+    assets = having(test, archive) if test.axis in ("light", "background", "layout") else None
+    if assets is None:
+        return []
+    named = object_models(test).values() if test.axis == "layout" else scene_files(test)
+    files = [assets.root / path for path in named]
+    for file in files:
+        if file.suffix == ".xml":
+            read = (file.parent / path for path in _referred(file, edition(file)))
+            files += [path.resolve() for path in read if path.is_file() and path.resolve() not in files]
+    return [_checksum(file, edition(file)) for file in files]
+
+
+@cache
+def _referred(file: Path, version: Edition) -> tuple[str, ...]:
+    try:
+        return tuple(element.attrib["file"] for element in ET.parse(file).iterfind(".//*[@file]"))
+    except ET.ParseError as error:
+        raise PipelineError(f"not XML ({error})", where=file, remedy="unpack the archive again") from error
+
+
+@cache
+def _checksum(file: Path, version: Edition) -> str:
+    return checksum(file)
 
 
 def scene_files(test: TestTask) -> SceneFiles:

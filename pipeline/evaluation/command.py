@@ -56,7 +56,11 @@ def add_commands(commands: Any) -> None:
     )
     command.add_argument("--subset", type=positive, metavar="N", help="so many, spread evenly over all of these")
     command.add_argument(
-        "--episodes", type=positive, default=1, metavar="N", help="initial states or draws of each task (default: 1)"
+        "--episodes",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="initial states, of which LIBERO has 50, or draws of each task (default: 1)",
     )
     command.add_argument(
         "--prompt",
@@ -78,9 +82,20 @@ def add_commands(commands: Any) -> None:
         help="LIBERO's own (default), or the first state of the starter set's demonstration",
     )
     command.add_argument("--seed", type=int, default=0, help="of the subset and of every draw (default: 0)")
-    command.add_argument("--label", default="", help="name of the policy in the results (default: its address)")
     command.add_argument(
-        "--look-every", type=positive, default=1, metavar="N", help="the server uses one observation in N (default: 1)"
+        "--label",
+        default="",
+        metavar="NAME",
+        help="name of the policy in the results; a server must have one, another for each policy (default of a "
+        "checkpoint: its folder and a part of the hash of its content)",
+    )
+    command.add_argument(
+        "--look-every",
+        type=positive,
+        default=1,
+        metavar="N",
+        help="a server that keeps its chunk of actions to itself takes N of each: it is shown the scene once in N "
+        "control steps (default: 1)",
     )
     command.add_argument(
         "--assets",
@@ -100,7 +115,7 @@ def add_commands(commands: Any) -> None:
         "--videos",
         choices=("none", "failures", "all"),
         default="none",
-        help="of which episodes to keep a video, of the frames that the policy looked at and the last (default: none)",
+        help="of which episodes to keep a video (default: none)",
     )
     command.set_defaults(run=_evaluate)
 
@@ -109,7 +124,8 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     # The simulator takes seconds to import, which the other commands can do without.
     from dask.system import CPU_COUNT
 
-    from pipeline.evaluation.evaluate import PolicyConfig, evaluate
+    from pipeline.evaluation.evaluate import evaluate
+    from pipeline.evaluation.policy_config import PolicyConfig
     from pipeline.evaluation.settings import Settings
     from pipeline.evaluation.tasks import Selection
 
@@ -131,12 +147,12 @@ def _evaluate(arguments: argparse.Namespace) -> int:
         initial_states=arguments.initial_states,
         black=arguments.black,
         plan=arguments.plan,
+        look_every=arguments.look_every,
     )
     policy = PolicyConfig(
         kind=arguments.replay or ("checkpoint" if arguments.checkpoint else "server"),
         address=str(arguments.checkpoint or arguments.server or ""),
         label=arguments.label,
-        look_every=arguments.look_every,
         timeout_s=arguments.timeout,
     )
     workers = arguments.workers or CPU_COUNT

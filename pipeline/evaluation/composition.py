@@ -98,7 +98,7 @@ def pairs(rows: Iterable[Row]) -> list[Pair]:
         PipelineError: when they are of several policies or settings, or have no complete trial.
     """
     listed = [row for row in rows if row["source"] in ("libero", "own") and row["reason"] != REFUSED]
-    if len({json.dumps([row["policy"], row["settings"]], sort_keys=True) for row in listed}) > 1:
+    if len({json.dumps([row["identity"], row["settings"]], sort_keys=True) for row in listed}) > 1:
         raise PipelineError(
             "these are results of several policies or settings",
             expected="one policy under one setting",

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import REFUSED, EpisodeFiles, Row
+from pipeline.evaluation.results import REFUSED, EpisodeFiles, Row, refuse_shared_names
 from pipeline.seeding import digest
 
 OUTCOME = ("success", "reason", "steps")
@@ -43,34 +43,36 @@ def read(folders: Sequence[Path]) -> list[Evaluated]:
     """Read the folders that ``evaluate`` wrote; what several of them hold counts once.
 
     Raises:
-        PipelineError: when a folder has no results, or two results of an episode differ.
+        PipelineError: when a folder has no results, two results of an episode differ, or two policies have one name.
     """
+    read_from = [(row, folder) for folder in folders for row in EpisodeFiles(folder).some_rows()]
+    refuse_shared_names(read_from)
     results: dict[str, tuple[Row, EpisodeFiles]] = {}
-    for folder in folders:
+    for row, folder in read_from:
         files = EpisodeFiles(folder)
-        for row in files.some_rows():
-            earlier, where = results.setdefault(row["episode"], (row, files))
-            if any(row[name] != earlier[name] for name in OUTCOME):
-                raise PipelineError(
-                    f"two results of {row['source']}/{row['suite']}/{row['name']} by {row['policy']} differ: "
-                    + " and ".join(str({name: one[name] for name in OUTCOME}) for one in (earlier, row)),
-                    where=f"{where.path(row['episode'])} and {files.path(row['episode'])}",
-                    expected="one result of each episode, the same wherever it was run",
-                    remedy="leave one of the folders out, or run them again with another --label for each policy",
-                )
+        earlier, where = results.setdefault(row["episode"], (row, files))
+        if any(row[name] != earlier[name] for name in OUTCOME):
+            raise PipelineError(
+                f"two results of {row['source']}/{row['suite']}/{row['name']} by {row['policy']} differ: "
+                + " and ".join(str({name: one[name] for name in OUTCOME}) for one in (earlier, row)),
+                where=f"{where.path(row['episode'])} and {files.path(row['episode'])}",
+                expected="one result of each episode, the same wherever it was run",
+                remedy="leave one of the folders out; run the one again that other versions of the packages made, or "
+                "give each of two policies behind a server a --label of its own",
+            )
     return _by_policy(list(results.values()))
 
 
 def _by_policy(results: Sequence[tuple[Row, EpisodeFiles]]) -> list[Evaluated]:
-    """Results by policy and settings, in the order of the folders."""
+    """Results by identity and settings, in the order of the folders; a policy has the first of its names."""
     groups: dict[tuple[str, str], list[tuple[Row, EpisodeFiles]]] = defaultdict(list)
     for row, files in results:
-        groups[row["policy"], digest(row["settings"])].append((row, files))
+        groups[row["identity"], digest(row["settings"])].append((row, files))
     policies = []
-    for (policy, _), group in groups.items():
-        settings = group[0][0]["settings"]
-        others = [rows[0][0]["settings"] for (name, _), rows in groups.items() if name == policy]
-        differing = [key for key in settings if any(other.get(key) != settings[key] for other in others)]
+    for (identity, _), group in groups.items():
+        alike = [rows[0][0] for (other, _), rows in groups.items() if other == identity]
+        policy, settings = alike[0]["policy"], group[0][0]["settings"]
+        differing = [key for key in settings if any(other["settings"].get(key) != settings[key] for other in alike)]
         videos = {row["episode"]: files.video(row["episode"]) for row, files in group}
         policies.append(
             Evaluated(

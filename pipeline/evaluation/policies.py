@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.settings import VIEWS, Wanted
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.rendering.jpeg import resized
+from pipeline.seeding import digest
 from pipeline.types import Floats
 
 Look = Callable[[Wanted], dict[str, Any]]
@@ -48,6 +48,8 @@ class Policy(Protocol):
     """Asked for actions until the episode is over."""
 
     name: str
+    wanted: Wanted
+    """What it looks at."""
 
     def begin(self, task: EvaluationTask) -> None:
         """An episode begins."""
@@ -91,7 +93,7 @@ class NextLook:
     def looked(self) -> None:
         self._left = self._every
 
-    def answered(self, actions: ArrayLike) -> None:
+    def answered(self, actions: Any) -> None:
         """Args: actions: (n, 7) or (7,), all of which are taken before the next question."""
         self._left = self._left - 1 if np.ndim(actions) == 1 else 0
 
@@ -122,12 +124,6 @@ class Server:
         self._loop = asyncio.new_event_loop()
         self._connection = Connection(address, timeout=timeout_s, max_retries=3)
         self._connect()
-        wanted = self._connection.server_info.get("observation_params") or {}
-        self._wanted = Wanted(
-            bool(wanted.get("send_wrist_image")),
-            bool(wanted.get("send_state")),
-            not wanted.get("quat_no_antipodal"),
-        )
         self._seen: dict[str, Any] = {}
 
     def begin(self, task: EvaluationTask) -> None:
@@ -138,7 +134,7 @@ class Server:
 
     def act(self, look: Look) -> Any:
         if self._next_look.due:
-            self._seen = look(self._wanted)
+            self._seen = look(self.wanted)
             self._next_look.looked()
         if not self._connection.is_connected:
             raise self._fault("the connection was closed")
@@ -171,6 +167,12 @@ class Server:
                 remedy="check its address and its log, start it, and run the same command again: finished episodes are "
                 "kept",
             ) from error
+        wanted = self._connection.server_info.get("observation_params") or {}
+        self.wanted = Wanted(
+            bool(wanted.get("send_wrist_image")),
+            bool(wanted.get("send_state")),
+            not wanted.get("quat_no_antipodal"),
+        )
 
     def _run(self, awaited: Any, limit_s: float | None = None) -> Any:
         from websockets.exceptions import WebSocketException
@@ -193,11 +195,13 @@ class Checkpoint:
     """A policy that lerobot saved, run in this process.
 
     It is asked for a chunk where it makes chunks, so that it looks once in ``n_action_steps``. Frames get the size of
-    those that it was trained on.
+    those that it was trained on. Random numbers, such as a diffusion policy draws, follow from the task alone.
 
     Args:
         folder: with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
     """
+
+    wanted = Wanted()
 
     def __init__(self, folder: Path):
         # lerobot and its models take seconds to import.
@@ -205,8 +209,6 @@ class Checkpoint:
         from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 
-        if not (folder / "config.json").is_file():
-            raise PipelineError("no config.json", where=folder, expected="a folder that lerobot saved a policy in")
         self.name, self._torch = str(folder), torch
         config = PreTrainedConfig.from_pretrained(folder)
         config.pretrained_path = folder
@@ -229,10 +231,12 @@ class Checkpoint:
         self._chunk = int(getattr(config, "n_action_steps", 1)) if chunked else 1
 
     def begin(self, task: EvaluationTask) -> None:
+        # lerobot's policies draw from this generator alone.
+        self._torch.manual_seed(int(digest("policy", str(task))[:15], 16))
         self._policy.reset()
 
     def act(self, look: Look) -> Floats:
-        seen = look(Wanted())
+        seen = look(self.wanted)
         batch: dict[str, Any] = {}
         for key, name in self._cameras.items():
             frame = resized(seen["images"][name], *self._sizes_px[key])

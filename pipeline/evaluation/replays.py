@@ -30,6 +30,7 @@ class Replay:
     """
 
     name = "replay"
+    wanted = Wanted(wrist=False, state=False, images=False)
 
     def __init__(self, chunk: int = 8):
         self._chunk = chunk
@@ -57,13 +58,14 @@ class TrackedReplay:
     """
 
     name = "tracked replay"
+    wanted = Wanted(wrist=False, images=False)
 
     def begin(self, task: EvaluationTask) -> None:
         self._reference = _reference(task.suite, task.base)
         self._actions: Iterator[Floats] | None = None
 
     def act(self, look: Look) -> Floats:
-        position, axis_angle, _ = np.split(look(Wanted(images=False))["states"].astype(np.float64), (3, 6))
+        position, axis_angle, _ = np.split(look(self.wanted)["states"].astype(np.float64), (3, 6))
         self._hand: Hand = position, Rotation.from_rotvec(axis_angle)
         if self._actions is None:
             route = Route.through(self._reference, self._hand, {})

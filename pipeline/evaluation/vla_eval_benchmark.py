@@ -23,6 +23,7 @@ from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import NextLook
+from pipeline.evaluation.selection import check_settings
 from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 
@@ -35,7 +36,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     Args:
         selection: fields of ``Selection``, such as ``{"source": "libero_plus", "axes": ["camera"], "subset": 100}``.
-        settings: fields of ``Settings``, such as ``{"prompt": "benchmark"}``.
+        settings: fields of ``Settings``, such as ``{"prompt": "benchmark"}``; the seed is the selection's.
         look_every: a server that answers with one action from a chunk of its own is shown one observation in so many
             control steps, the number of actions that it takes from a chunk; in between the last one is sent again, and
             nothing is rendered. 1 renders every step. After a chunk that a server answers with it is always looked.
@@ -70,10 +71,13 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         super().__init__()
         del seed
         self._selection = Selection.model_validate(selection or {})
-        fixtures = {} if env_seed is None else {"fixture_seed": env_seed}
+        given = {"seed": self._selection.seed, "look_every": look_every, **(settings or {})}
+        if env_seed is not None:
+            given = {"fixture_seed": env_seed, **given}
         self._archive = None if assets is None else Path(assets)
-        self._environment = EpisodeEnvironment(Settings.model_validate({**fixtures, **(settings or {})}), self._archive)
-        self._next_look = NextLook(look_every)
+        self._environment = EpisodeEnvironment(Settings.model_validate(given), self._archive)
+        check_settings(self._selection, self._environment.settings)
+        self._next_look = NextLook(self._environment.settings.look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
     def get_tasks(self) -> list[dict[str, Any]]:

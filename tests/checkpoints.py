@@ -1,0 +1,75 @@
+"""Small policies as lerobot saves them, whose actions are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+from lerobot.policies.factory import make_pre_post_processors
+from safetensors.torch import load_file, save_file
+
+CHUNK = 2
+BIAS = "model.action_head.bias"
+
+
+def save(folder: Path, action: float, scale: float = 1.0) -> Path:
+    """An ACT policy whose every action is ``action`` times ``scale`` in all seven numbers, taken two at a time.
+
+    Args:
+        action: what the network says: all of its weights are zero but the last bias.
+        scale: by which the processor after it multiplies.
+    """
+    config = ACTConfig(
+        input_features={
+            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        **{"chunk_size": CHUNK, "n_action_steps": CHUNK, "pretrained_backbone_weights": None, "use_vae": False},
+        **{"dim_model": 8, "n_heads": 1, "dim_feedforward": 8, "n_encoder_layers": 1, "n_decoder_layers": 1},
+        device="cpu",
+        push_to_hub=False,
+    )
+    policy = ACTPolicy(config)
+    with torch.no_grad():
+        for weights in policy.parameters():
+            weights.zero_()
+        policy.get_parameter(BIAS).fill_(action)
+    sizes = {"observation.images.image": (3, 1, 1), "observation.state": (8,), "action": (7,)}
+    stats = {name: {"mean": torch.zeros(size), "std": torch.ones(size)} for name, size in sizes.items()}
+    stats["action"]["std"] *= scale
+    for part in (policy, *make_pre_post_processors(config, dataset_stats=stats)):
+        part.save_pretrained(folder)
+    return folder
+
+
+def save_diffusion(folder: Path) -> Path:
+    """A diffusion policy with random weights, which begins each chunk from random numbers."""
+    config = DiffusionConfig(
+        input_features={
+            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
+        **{"horizon": 4, "n_action_steps": 1, "down_dims": (8, 16), "n_groups": 4, "crop_shape": None},
+        **{"num_train_timesteps": 2, "num_inference_steps": 2, "diffusion_step_embed_dim": 8},
+        device="cpu",
+        push_to_hub=False,
+    )
+    ones = {"observation.images.image": (3, 1, 1), "observation.state": (8,), "action": (7,)}
+    bounds = {name: {"min": -torch.ones(size), "max": torch.ones(size)} for name, size in ones.items()}
+    stats = {name: {**one, "mean": one["max"] * 0, "std": one["max"]} for name, one in bounds.items()}
+    for part in (DiffusionPolicy(config), *make_pre_post_processors(config, dataset_stats=stats)):
+        part.save_pretrained(folder)
+    return folder
+
+
+def retrain(folder: Path, action: float) -> None:
+    """Change the weights where they are."""
+    weights = load_file(folder / "model.safetensors")
+    save_file({**weights, BIAS: torch.full_like(weights[BIAS], action)}, folder / "model.safetensors")

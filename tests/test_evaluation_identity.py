@@ -1,0 +1,238 @@
+"""A stored result is of the policy, settings and versions that it is asked for, or it does not count."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import checkpoints
+import numpy as np
+import pytest
+from conftest import STOVE
+
+from pipeline.errors import PipelineError
+from pipeline.evaluation import episode, merging, results
+from pipeline.evaluation.episode import EpisodeEnvironment
+from pipeline.evaluation.evaluate import evaluate
+from pipeline.evaluation.job import _environment
+from pipeline.evaluation.policies import Checkpoint
+from pipeline.evaluation.policy_config import PolicyConfig
+from pipeline.evaluation.replay_server import running
+from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.settings import Settings
+from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.run.compute import loop
+
+STEPS = 4
+CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
+SETTINGS = Settings()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short() -> Iterator[None]:
+    """Episodes of a few steps; afterwards the process gives back the environment that it keeps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(episode.STEP_LIMITS, STOVE.suite, STEPS)
+        yield
+    _environment(SETTINGS, None).close()
+
+
+@pytest.fixture
+def taken(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The first number of every action that the environment takes."""
+    actions: list[float] = []
+    step = EpisodeEnvironment.step
+
+    def recorded(self: EpisodeEnvironment, action: Any) -> Any:
+        actions.append(round(float(np.asarray(action)[0]), 6))
+        return step(self, action)
+
+    monkeypatch.setattr(EpisodeEnvironment, "step", recorded)
+    return actions
+
+
+def run(out: Path, checkpoint: Path, label: str = "", settings: Settings = SETTINGS) -> dict[str, Any]:
+    policy = PolicyConfig(kind="checkpoint", address=str(checkpoint), label=label)
+    return evaluate(CHOSEN, settings, policy, out, loop)
+
+
+def rescale(folder: Path) -> None:
+    """Other statistics in the processor after the network."""
+    shutil.copytree(checkpoints.save(folder.with_name("scaled"), 0.1, scale=3.0), folder, dirs_exist_ok=True)
+
+
+def shorten(folder: Path) -> None:
+    file = folder / "config.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"n_action_steps": 1}))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "actions", "looks"),
+    [
+        (lambda folder: checkpoints.retrain(folder, 0.2), [0.2] * STEPS, STEPS // checkpoints.CHUNK),
+        (rescale, [0.3] * STEPS, STEPS // checkpoints.CHUNK),
+        (shorten, [0.1] * STEPS, STEPS),
+    ],
+    ids=["weights", "processor", "configuration"],
+)
+def test_a_checkpoint_that_changes_where_it_is_is_evaluated_anew(
+    tmp_path: Path, taken: list[float], change: Callable[[Path], None], actions: list[float], looks: int
+) -> None:
+    checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
+    first = run(out, checkpoint)
+    assert taken == [0.1] * STEPS
+    assert run(out, checkpoint) == first
+    assert len(taken) == STEPS, "a finished episode is not run again"
+    taken.clear()
+    change(checkpoint)
+    second = run(out, checkpoint)
+    assert taken == actions
+    assert second["all"]["episodes"] == 1
+    assert second["policy"] != first["policy"]
+    both = merging.read([out])
+    assert [policy.rows[0]["looks"] for policy in sorted(both, key=lambda one: one.rows[0]["looks"])] == sorted(
+        [STEPS // checkpoints.CHUNK, looks]
+    )
+    assert len({policy.name for policy in both}) == 2, "the old results are another policy's"
+
+
+@pytest.mark.slow
+def test_a_copy_is_the_same_policy(tmp_path: Path, taken: list[float]) -> None:
+    checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
+    run(out, checkpoint)
+    copy = shutil.copytree(checkpoint, tmp_path / "elsewhere" / "copied")
+    (copy / "train_config.json").write_text('{"job": "another"}')
+    (copy / "README.md").write_text("a card")
+    run(out, copy)
+    assert len(taken) == STEPS
+    run(tmp_path / "other_out", copy)
+    (policy,) = merging.read([out, tmp_path / "other_out"])
+    assert len(policy.rows) == 1
+
+
+@pytest.mark.slow
+def test_one_name_is_not_given_to_two_policies(tmp_path: Path, taken: list[float]) -> None:
+    one, two = (checkpoints.save(tmp_path / f"policy_{action}", action) for action in (0.1, 0.2))
+    run(tmp_path / "one", one, "act")
+    with pytest.raises(PipelineError, match="two policies have the name 'act'") as caught:
+        run(tmp_path / "one", two, "act")
+    assert "--label" in str(caught.value)
+    assert len(taken) == STEPS, "it says so before anything is run"
+    run(tmp_path / "two", two, "act")
+    with pytest.raises(PipelineError, match="two policies have the name 'act'") as caught:
+        merging.read([tmp_path / "one", tmp_path / "two"])
+    assert str(tmp_path / "one") in str(caught.value)
+    assert str(tmp_path / "two") in str(caught.value)
+
+
+@pytest.mark.slow
+def test_results_of_other_versions_are_made_again(
+    tmp_path: Path, taken: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
+    first = run(out, checkpoint)
+    monkeypatch.setattr(results, "RECIPE", results.RECIPE + 1)
+    second = run(out, checkpoint)
+    assert len(taken) == 2 * STEPS
+    assert second == first
+    assert len(list(EpisodeFiles(out).rows())) == 1, "in the place of the old ones"
+
+
+@pytest.mark.slow
+def test_a_checkpoint_that_changes_during_the_run_stops_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = checkpoints.save(tmp_path / "policy", 0.1)
+
+    def retrained_first(fn: Any, items: Any, description: str) -> Any:
+        checkpoints.retrain(checkpoint, 0.2)
+        return loop(fn, items, description)
+
+    policy = PolicyConfig(kind="checkpoint", address=str(checkpoint))
+    with pytest.raises(PipelineError, match="has changed since the evaluation began"):
+        evaluate(CHOSEN, SETTINGS, policy, tmp_path / "out", retrained_first)
+    assert not list(EpisodeFiles(tmp_path / "out").rows())
+
+
+@pytest.mark.slow
+def test_a_video_shows_what_the_policy_does_not_look_at(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(episode.STEP_LIMITS, STOVE.suite, 20)
+    chosen = CHOSEN.model_copy(update={"episodes": 2})
+    evaluate(chosen, SETTINGS, PolicyConfig(kind="open_loop"), tmp_path, loop, videos="all")
+    assert "evaluate, episodes: 2/2, " in capsys.readouterr().err, "progress is counted in episodes"
+    for row in EpisodeFiles(tmp_path).rows():
+        assert row["looks"] == 0
+        with av.open(str(EpisodeFiles(tmp_path).video(row["episode"]))) as video:
+            assert [round(frame.time * 20) for frame in video.decode(video=0)] == [0, 8, 16, 20]
+
+
+@pytest.mark.slow
+def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Path) -> None:
+    """So that an episode's result depends neither on those before it nor on the worker."""
+    policy = Checkpoint(checkpoints.save_diffusion(tmp_path / "policy"))
+    one, other = select(CHOSEN.model_copy(update={"episodes": 2}))
+    shown = {
+        "images": {view: np.zeros((256, 256, 3), np.uint8) for view in ("agentview", "wrist")},
+        "states": np.zeros(8, np.float32),
+        "task_description": "",
+    }
+
+    def actions(task: EvaluationTask) -> list[list[float]]:
+        policy.begin(task)
+        return [policy.act(lambda _: shown).tolist()[0] for _ in range(2)]
+
+    first = actions(one)
+    assert first != actions(other)
+    assert actions(one) == first
+
+
+def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
+    """As the versions before wrote them."""
+    old = {"episode": "a", "source": "libero", "policy": "policy", "settings": {}, "success": True, "reason": "success"}
+    EpisodeFiles(tmp_path).save(old)
+    for use in (lambda: merging.read([tmp_path]), lambda: run(tmp_path, checkpoints.save(tmp_path / "policy", 0.1))):
+        with pytest.raises(PipelineError, match="does not say which policy") as caught:
+            use()
+        assert "a.json" in str(caught.value)
+
+
+def test_a_server_needs_a_label(tmp_path: Path) -> None:
+    policy = PolicyConfig(kind="server", address="ws://localhost:1")
+    with pytest.raises(PipelineError, match="no label") as caught:
+        evaluate(CHOSEN, SETTINGS, policy, tmp_path, loop)
+    assert "--label" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_a_server_that_is_shown_something_else_is_not_counted_as_the_same(tmp_path: Path) -> None:
+    """One label for two servers, of which the second looks at the state too."""
+    server = ("-m", "pipeline.evaluation.replay_server", "--args.tracked")
+    with running(*server, "false") as address:
+        policy = PolicyConfig(kind="server", address=address, label="act")
+        found = evaluate(CHOSEN, SETTINGS, policy, tmp_path, loop)
+    assert found["settings"] | {"state": False, "images": True} == found["settings"]
+    assert found["policy"] == {"name": "act", "identity": "claimed:act"}
+    more = CHOSEN.model_copy(update={"episodes": 2})
+    with running(*server, "true") as address, pytest.raises(PipelineError, match="seen in different ways: state"):
+        evaluate(more, SETTINGS, PolicyConfig(kind="server", address=address, label="act"), tmp_path, loop)
+    assert json.loads((tmp_path / "summary.json").read_text()) == found, "no summary of both together"
+    assert {policy.name for policy in merging.read([tmp_path])} == {"act, state False", "act, state True"}
+
+
+def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path) -> None:
+    policy = PolicyConfig(kind="open_loop")
+    with pytest.raises(PipelineError, match="look_every"):
+        evaluate(CHOSEN, Settings(look_every=8), policy, tmp_path, loop)
+    plan = tmp_path / "plan.parquet"
+    with pytest.raises(PipelineError, match="cannot be read"):
+        evaluate(CHOSEN, Settings(plan=plan), policy, tmp_path, loop)
+    plan.touch()
+    with pytest.raises(PipelineError, match="plan"):
+        evaluate(CHOSEN, Settings(plan=plan), policy, tmp_path, loop)
+    with pytest.raises(PipelineError, match="seed"):
+        evaluate(CHOSEN, Settings(seed=1), policy, tmp_path, loop)
