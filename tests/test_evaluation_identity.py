@@ -18,7 +18,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import episode, merging, results
 from pipeline.evaluation.episode import EpisodeEnvironment
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.job import _environment
+from pipeline.evaluation.job import EvaluationJob, _environment, episode_id
 from pipeline.evaluation.policies import Checkpoint
 from pipeline.evaluation.policy_config import PolicyConfig
 from pipeline.evaluation.replay_server import running
@@ -189,6 +189,18 @@ def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Pat
     first = actions(one)
     assert first != actions(other)
     assert actions(one) == first
+
+
+def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
+    tasks = tuple(select(CHOSEN.model_copy(update={"episodes": 2})))
+    policy = PolicyConfig(kind="open_loop")
+    job = EvaluationJob(tasks, SETTINGS, policy, policy.identity(), tmp_path, "", "none")
+    assert job.episodes() == 2
+    assert job.limit_s() > 3600
+    assert job.lost() == [f"worker_lost ({task})" for task in tasks]
+    name = {"episode": episode_id(tasks[0], SETTINGS, policy.identity()), "policy": "replay", "settings": {}}
+    EpisodeFiles(tmp_path).save({**name, "identity": policy.identity(), "made_by": results.made_by(False, [])})
+    assert job.lost() == [f"worker_lost ({tasks[1]})"]
 
 
 def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
