@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from conftest import MILK, STOVE
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
+from pipeline.libero.assets import libero_folder
 from pipeline.libero.tasks import SUITES, find_task, tasks
 
 
@@ -33,6 +35,23 @@ def test_a_task_as_its_file_defines_it() -> None:
 def test_only_what_is_put_somewhere_is_a_target() -> None:
     assert bddl.read(STOVE.bddl_file).targets == ()
     assert bddl.read(MILK.bddl_file).targets == ("milk_1",)
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_every_task_has_the_arena_that_libero_builds(suite: str) -> None:
+    """By the source of the class that LIBERO builds the scene with."""
+    for task in tasks(suite):
+        read = bddl.read(task.bddl_file)
+        source = (libero_folder() / "envs/problems" / f"{read.problem}.py").read_text()
+        (built,) = re.findall(r'"arena_type": "(\w+)"', source)
+        assert read.arena == {"table": "tabletop"}.get(built, built), task.name
+
+
+def test_a_scene_of_no_known_arena_is_refused() -> None:
+    assert bddl.arena("libero_kitchen_tabletop_manipulation_kitchen_table_wood") == "kitchen"
+    for problem in ("libero_coffee_table_manipulation", "LIBERO_Kitchen_Tabletop_Manipulation"):
+        with pytest.raises(PipelineError, match="arena"):
+            bddl.arena(problem)
 
 
 @pytest.mark.parametrize("suite", SUITES)

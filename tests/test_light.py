@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from statistics import mean
 from typing import get_args
 
@@ -27,6 +28,18 @@ NOTICED_LEVELS, NOTICED_SHARE = 8, 0.05
 def drawn(component: Component, level: Level, key: str | int, task: Task = MILK) -> LightPerturbation:
     axis = LightAxis(components=(component,), levels=(level,))
     return axis.sample(rng("light", component, level, key), task, 0)
+
+
+def weakest_and_strongest(task: Task) -> Iterator[LightPerturbation]:
+    """A draw of each component at levels 1 and 5; of ``diffuse`` a darker, a brighter and a tinted one, where drawn."""
+    for component in COMPONENTS:
+        levels: tuple[Level, ...] = (1, 5)
+        for level in levels:
+            kinds: dict[object, LightPerturbation] = {}
+            for key in range(20 if component == "diffuse" else 1):
+                one = drawn(component, level, key, task)
+                kinds["tinted" if len({*one.diffuse_scale_rgb}) > 1 else one.diffuse_scale_rgb[0] > 1] = one
+            yield from kinds.values()
 
 
 def share_changed(before: Frame, after: Frame) -> float:
@@ -77,10 +90,10 @@ def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
         restored = frames(shown)
         assert all(np.array_equal(clean[view], restored[view]) for view in clean)
 
-        for component in COMPONENTS:
-            with shown.perturbed([drawn(component, 1, arena, TASKS[arena])]):
-                weakest = frames(shown, ["agentview"])["agentview"]
-            assert share_changed(clean["agentview"], weakest) >= NOTICED_SHARE, component
+        for perturbation in weakest_and_strongest(TASKS[arena]):
+            with shown.perturbed([perturbation]):
+                after = frames(shown, ["agentview"])
+            assert share_changed(clean["agentview"], after["agentview"]) >= NOTICED_SHARE, perturbation
 
         # The corners of the ranges: as little light as there can be, and as much.
         assert [exposure(frame) for frame in clean.values()] == [None, None]

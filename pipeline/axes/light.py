@@ -186,7 +186,7 @@ class LightAxis(Axis):
                 # Not both: a brighter lamp drives its tint back to white.
                 if rng.random() < 0.5:
                     scales = ranges.brightness_scale
-                    if "Kitchen" in bddl.read(task.bddl_file).problem:
+                    if bddl.read(task.bddl_file).arena == "kitchen":
                         # It is as bright as can be already.
                         scales = tuple((low, high) for low, high in scales if high <= 1) or scales
                     return {"diffuse_scale_rgb": [draw(rng, scales)] * 3}

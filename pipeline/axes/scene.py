@@ -13,6 +13,7 @@ from pydantic import Field
 
 from pipeline.axes.base import Frozen, Level, PhysicsPerturbation, on_task
 from pipeline.libero import bddl
+from pipeline.libero.bddl import Arena
 from pipeline.libero.relations import relation_holds
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
@@ -26,7 +27,13 @@ WIDER_M = {"LIVING_ROOM_SCENE1": 0.02}
 BASE_M = {"akita_black_bowl_1": (0.35, 0.05), "cream_cheese_1": (0.15, 0.10), "wine_bottle_1": (0.0, 0.05)}
 """How far LIBERO-Plus puts things of the goal suite from LIBERO's own places before its disks apply."""
 
-ROBOT_X_M = {"tabletop": -0.66, "kitchen": -0.66, "study": -0.55, "living_room": -0.51, "floor": -0.6}
+ROBOT_X_M: dict[Arena, float] = {
+    "tabletop": -0.66,
+    "kitchen": -0.66,
+    "study": -0.55,
+    "living_room": -0.51,
+    "floor": -0.6,
+}
 """Where the robot's base stands, by arena, in the frame of the working surface."""
 
 REACH_M = 0.75
@@ -159,7 +166,6 @@ def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
     known = bddl.read(task.bddl_file)
     if thing not in known.objects or thing not in known.of_interest:
         return True
-    # Such as libero_kitchen_tabletop_manipulation; the plain tabletop is called libero_tabletop_manipulation.
-    robot_m = next((x_m, 0.0) for arena, x_m in ROBOT_X_M.items() if known.problem.startswith(f"libero_{arena}_"))
+    robot_m = (ROBOT_X_M[known.arena], 0.0)
     was_m = known.regions[known.places[known.carriers[thing]]]
     return math.dist(place_m, robot_m) <= max(REACH_M, math.dist(was_m, robot_m))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 from bddl.parsing import scan_tokens
 
@@ -16,6 +16,10 @@ from pipeline.errors import PipelineError
 Fact = tuple[str, ...]
 """A predicate and its arguments, such as ``("on", "plate_1", "main_table_plate_region")``."""
 
+Arena = Literal["tabletop", "kitchen", "living_room", "study", "floor"]
+"""LIBERO's rooms: table or floor, walls, lamps and where the agent view is."""
+
+_ARENA = re.compile(rf"libero_({'|'.join(get_args(Arena))})(?:_tabletop)?_manipulation")
 _PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
 _LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
 
@@ -51,6 +55,11 @@ class Bddl:
     of_interest: tuple[str, ...]
     start: tuple[Fact, ...]
     goal: tuple[Fact, ...]
+
+    @property
+    def arena(self) -> Arena:
+        """Where the scene is."""
+        return arena(self.problem)
 
     @property
     def places(self) -> dict[str, str]:
@@ -157,6 +166,24 @@ def heading(text: str, where: object) -> Heading:
     if problem is None or language is None:
         raise PipelineError("not a BDDL file", where=where, expected="a BDDL problem with :language")
     return Heading(problem[1], " ".join(language[1].split()))
+
+
+def arena(problem: str) -> Arena:
+    """The arena of a scene's class, by its name in lower case, such as libero_kitchen_tabletop_manipulation.
+
+    LIBERO-Plus's names go on after that.
+
+    Raises:
+        PipelineError: when the name has none.
+    """
+    match = _ARENA.match(problem)
+    if match is None:
+        raise PipelineError(
+            f"the scene class {problem!r} names no known arena",
+            expected=f"libero_<arena>_manipulation or libero_<arena>_tabletop_manipulation, <arena> being one of "
+            f"{', '.join(get_args(Arena))}",
+        )
+    return cast(Arena, match[1])
 
 
 def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:

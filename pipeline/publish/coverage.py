@@ -206,7 +206,7 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     for draw in draws:
         if isinstance(draw.made, LayoutPerturbation):
             counts.append(len(draw.made.objects))
-            centre = STUDY_TABLE_M if "study" in bddl.read(draw.task.bddl_file).problem else np.zeros(2)
+            centre = STUDY_TABLE_M if bddl.read(draw.task.bddl_file).arena == "study" else np.zeros(2)
             placed = draw.resolved["objects"] if draw.resolved else ()
             own += [np.array(thing["position_m"][:2]) - centre for thing in placed]
     categories = {

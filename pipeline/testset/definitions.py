@@ -166,7 +166,7 @@ class Reader:
             surface, wall = f"{file['surface']}.png", file["wall"] and f"{file['wall']}.png"
         else:
             surface, wall = self._floors[settings["floor_style"]], None
-        files: dict[str, Value] = {"arena": _arena(problem), "surface": surface}
+        files: dict[str, Value] = {"arena": bddl.arena(problem), "surface": surface}
         return files | {"wall": wall or self._walls[settings["wall_style"]]} if theme else files
 
 
@@ -201,20 +201,12 @@ def _row(element: ast.expr) -> tuple[float, ...]:
     return row if isinstance(row, tuple) else (row,)
 
 
-def _arena(problem: str) -> str:
-    """``tabletop``, ``kitchen``, ``living_room``, ``study`` or ``floor``, from the name of a scene's class."""
-    match = re.search(r"libero_(\w+?)_manipulation", problem)
-    if match is None:
-        raise PipelineError(f"the scene class {problem!r} names no arena", expected="libero_<arena>_manipulation")
-    return match[1] if match[1] in ("tabletop", "floor") else match[1].removesuffix("_tabletop")
-
-
 def _added(scene: Bddl) -> dict[str, Value]:
     """The objects that were added to a scene: categories, and positions (x, y) in metres in the same order."""
     added = {name: place for name, place in scene.places.items() if "_add_object_region_" in place}
     positions = [scene.regions[place] for place in added.values()]
     return {
-        "arena": _arena(scene.problem),
+        "arena": scene.arena,
         "count": len(added),
         "category": ",".join(scene.objects[name] for name in added),
         "positions": ";".join(f"{x:.4g},{y:.4g}" for x, y in positions),
