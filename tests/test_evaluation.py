@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import av
 import numpy as np
@@ -25,6 +25,8 @@ import robosuite.utils.transform_utils as transform  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 
 from pipeline.axes.camera import CameraPerturbation  # noqa: E402
+from pipeline.axes.corruptions import Gaussian  # noqa: E402
+from pipeline.axes.noise import NoisePerturbation  # noqa: E402
 from pipeline.errors import PipelineError  # noqa: E402
 from pipeline.evaluation import libero_plus  # noqa: E402
 from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
@@ -146,6 +148,23 @@ def test_moved_scenes_noise_and_held_out_draws_can_be_seen(evaluated: EpisodeEnv
     listed = list(pictures.values())
     assert len(pictures) == 5
     assert all(not np.array_equal(one, other) for at, one in enumerate(listed) for other in listed[:at])
+
+
+class WristNoise(NoisePerturbation):
+    """Noise of the other view than the shipped axis changes."""
+
+    views: ClassVar[frozenset[str]] = frozenset({"wrist_image"})
+
+
+@pytest.mark.slow
+def test_noise_changes_the_views_that_it_names(evaluated: EpisodeEnvironment) -> None:
+    evaluated.reset(FIRST)
+    clean = evaluated.observation(Wanted())["images"]
+    for kind, noisy in ((NoisePerturbation, "agentview"), (WristNoise, "wrist")):
+        evaluated.reset(FIRST)
+        evaluated._perturbations = (kind(component="gaussian", effect=Gaussian(sigma_px=3), level=1, seed=0),)
+        seen = evaluated.observation(Wanted())["images"]
+        assert {view for view in clean if not np.array_equal(seen[view], clean[view])} == {noisy}
 
 
 @pytest.mark.slow

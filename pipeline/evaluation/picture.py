@@ -47,7 +47,7 @@ class Picture:
         renderer.restore(state, observed.site_alpha)
         frame = renderer.frame(SCHEMA.views[VIEWS[view]].camera)
         for noise in of_layer(perturbations, PixelPerturbation):
-            if view == "agentview":
+            if VIEWS[view] in noise.views:
                 frame = noise.apply(frame, step)
         return to_policy(frame)
 
