@@ -151,8 +151,8 @@ def _range(
 class LightAxis(Axis):
     """The ranges to draw from, chosen by looking at all arenas: from just noticeable to as far as all still shows.
 
-    Noticeable: of the agent view's pixels, 5 % differ by 8 grey levels or more, at level 1 of every component in every
-    arena.
+    Noticeable: of the agent view's pixels, 5 % differ by 8 grey levels or more. So it was at levels 1 and 5 of every
+    component in every arena, twelve draws each, but for a weak tint in the study (see docs/axes.md).
 
     Attributes:
         components: which of them, each as often as the others; ``combined`` draws all four properties.

@@ -82,7 +82,7 @@ class Simulator(Environment):
     """An environment in which episodes start in one of two ways, then settle.
 
     The model is the one that LIBERO's own reset compiles, not one read back from MJCF, so that states and frames are
-    those of an evaluation bit for bit. A reset takes 1.3 s; episodes with the same seed and posture share one.
+    those of LIBERO's evaluation. A reset takes 1.3 s; episodes with the same seed and posture share one.
 
     Args:
         task: the task to build.
