@@ -71,9 +71,8 @@ def test_the_experiments_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch)
 
 
 def result(axis: str, number: int, success: bool) -> dict[str, Any]:
-    return {"source": "own", "suite": "libero_goal", "name": f"{axis} {number}", "seed": 0, "axis": axis} | {
-        "success": success
-    }
+    task = {"source": "own", "suite": "libero_goal", "base": "stove", "name": f"{axis} {number}", "axis": axis}
+    return {**task, "seed": 0, "success": success}
 
 
 def test_the_table_pairs_episodes_seed_by_seed() -> None:
@@ -84,6 +83,8 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     assert line["arms"]["clean"]["successes"] == 4
     assert line["arms"]["perturbed"]["successes"] == 9
     assert line["p_values"] == {"perturbed": 2 / 2**5}
+    assert line["differences"]["perturbed"]["value"] == 0.5
+    assert line["differences"]["perturbed"]["resampled"] == "5 trials", "both seeds act in the same five"
     # Wilson's interval of 4 in 10: (0.4 + 0.19207) / 1.38415 and 0.25958 to either side.
     assert "| light | own draws | 10 | 40 % (17-69) | 90 % (60-98) | 0.062 |" in markdown([line])
 

@@ -97,9 +97,11 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
         EpisodeFiles(tmp_path).save(result(task, success and not refused, "refused" if refused else "step_limit"))
     assert analyse("gap", str(tmp_path)) == 0
     (pair,) = composition.pairs(EpisodeFiles(tmp_path).rows())
-    assert pair == Pair("robot", "noise", trials=2, neither=2, only_one=0, only_other=1, both=0)
+    assert replace(pair, interval=None) == Pair("robot", "noise", 2, neither=2, only_one=0, only_other=1, both=0)
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert printed["robot+noise"]["trials"] == 2
+    assert printed["robot+noise"]["bootstrap"]["resampled"] == "2 trials"
+    assert printed["robot+noise"]["papers_chi_square"] == {"statistic": None, "p_value": None}
     assert json.loads((tmp_path / "gap.json").read_text()) == printed
     assert (tmp_path / "gap.png").read_bytes().startswith(b"\x89PNG")
     names, shown = composition.matrix([pair, Pair("robot", "camera", 100, 90, 60, 50, 20)])

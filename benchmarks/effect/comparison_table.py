@@ -25,8 +25,9 @@ def table(results: Results) -> list[dict[str, Any]]:
     Episodes of all seeds count alike. Those of two arms are paired seed by seed: the same task, initial state and draw.
 
     Returns:
-        ``source``, ``axis``, ``arms`` (name to episodes, successes, rate and Wilson's 95 % interval), and ``p_values``
-        (name of each arm but the first to McNemar's exact test against the first).
+        ``source``, ``axis``, ``arms`` (name to episodes, successes, rate and Wilson's 95 % interval), ``p_values``
+        (name of each arm but the first to McNemar's exact test against the first), and ``differences`` (to its rate
+        minus the first's, with the interval of ``compare``).
     """
     first = next(iter(results))
     present = {(row["source"], row["axis"]) for row in _all(results[first])}
@@ -36,7 +37,7 @@ def table(results: Results) -> list[dict[str, Any]]:
             arm: [[row for row in rows if (row["source"], row["axis"]) == (source, axis)] for rows in policies]
             for arm, policies in results.items()
         }
-        p_values = {
+        compared = {
             arm: compare([pair for one, other in zip(of[first], policies, strict=True) for pair in paired(one, other)])
             for arm, policies in of.items()
             if arm != first
@@ -46,7 +47,8 @@ def table(results: Results) -> list[dict[str, Any]]:
                 "source": source,
                 "axis": axis,
                 "arms": {arm: success_rate(_all(policies)) for arm, policies in of.items()},
-                "p_values": {arm: found["all"]["p_value"] for arm, found in p_values.items()},
+                "p_values": {arm: found["all"]["p_value"] for arm, found in compared.items()},
+                "differences": {arm: found["all"]["difference"] for arm, found in compared.items()},
             }
         )
     return lines

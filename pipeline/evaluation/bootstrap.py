@@ -1,0 +1,115 @@
+"""Intervals and p-values of what happened in the same trials, by bootstrap (Efron, 1979).
+
+A trial is what all outcomes that are compared have in common: a test task that two policies act in, or an initial state
+on which the four combinations of two axes were run. Its outcomes stay together, so what makes a trial easy or hard for
+all of them cancels.
+
+Trials of one base task are alike, so it matters what is drawn anew:
+
+* With ``SAMPLE`` base tasks or more these are a sample, and are drawn, each with all its trials. The interval says what
+  other tasks of this kind would show. Trials are not drawn again within the drawn tasks: their scatter would count
+  twice, and simulated intervals cover 98 to 99.5 %.
+* Fewer are fixed: trials are drawn within each of them, and the interval is about these tasks alone. They tell too
+  little of others: simulated, a plain bootstrap that draws four base tasks anew covers 75 to 88 % instead of 95 %.
+* Where some base task has fewer than ``FEW`` trials, all trials are drawn as if of one. This is wider.
+
+Of n, n - 1 are drawn, which makes the variance of a mean unbiased (Rao and Wu, 1988); and the percentiles are those at
+which the normal distribution has what Student's t has outside of its 95 % (Hesterberg, 2015).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm, t
+
+from pipeline import seeding
+from pipeline.types import Floats
+
+SAMPLE = 10
+"""So many base tasks are a sample. Simulated, intervals of ten cover 94 to 96 % (tests/test_bootstrap.py)."""
+
+FEW = 5
+"""Fewer trials of a base task say too little about how they scatter."""
+
+RESAMPLES = 10_000
+
+Name = str | int | tuple[str | int, ...]
+Statistic = Callable[[Floats], Floats]
+"""Sums of outcomes over trials (n, outcomes) to n figures; NaN where one is not defined."""
+
+
+class Interval(NamedTuple):
+    """The 95 % interval of a figure.
+
+    Attributes:
+        low, high: None where it is not defined: outcomes never differ, or hardly any is a success.
+        p_value: two-sided, of the figure being 0: below 0.05 where 0 is outside the interval; at least 0.0002.
+        resampled: what was drawn anew.
+    """
+
+    low: float | None
+    high: float | None
+    p_value: float | None
+    resampled: str
+
+
+def interval(
+    base_tasks: Sequence[Name], trials: Sequence[Name], outcomes: NDArray[np.generic], statistic: Statistic
+) -> Interval:
+    """The interval of ``statistic``; the same whatever the order of the results.
+
+    Args:
+        base_tasks: of each result; names of one kind, so that they can be sorted.
+        trials: of each result; results of one trial are drawn together.
+        outcomes: (results, outcomes) numbers, which are summed.
+    """
+    bases = {name: place for place, name in enumerate(sorted(set(base_tasks)))}
+    of_trial = dict(zip(trials, base_tasks, strict=True))
+    units = {name: place for place, name in enumerate(sorted(of_trial))}
+    member, strata = [units[name] for name in trials], [bases[of_trial[name]] for name in units]
+    resampled = f"{len(units)} trials, within each of {len(bases)} base tasks"
+    if len(bases) >= SAMPLE:
+        resampled = f"{len(bases)} base tasks, each with its trials"
+        member, strata = [bases[name] for name in base_tasks], [0] * len(bases)
+    elif len(bases) == 1 or min(np.bincount(strata)) < FEW:
+        resampled, strata = f"{len(units)} trials", [0] * len(units)
+    sums = np.zeros((len(strata), outcomes.shape[1]))
+    np.add.at(sums, member, outcomes)
+    low, high, p_value = _percentiles(sums, np.array(strata), statistic)
+    return Interval(low, high, p_value, resampled)
+
+
+def _percentiles(
+    sums: Floats, strata: NDArray[np.int64], statistic: Statistic
+) -> tuple[float, float, float] | tuple[None, None, None]:
+    """Low, high and p.
+
+    Args:
+        sums: (units, outcomes) of what is drawn.
+        strata: (units,) those within which they are drawn.
+    """
+    groups = [sums[strata == stratum] for stratum in np.unique(strata)]
+    freedom = len(sums) - len(groups)
+    if freedom < 1:
+        return None, None, None
+    draws = seeding.rng("evaluation", "bootstrap")
+    # Rounded, so that what is 0 but for the order of a sum counts as 0.
+    figures = np.round(statistic(np.sum([_drawn(group, draws) for group in groups], axis=0)), 12)
+    if bool(np.isnan(figures).any()) or figures.min() == figures.max():
+        return None, None, None
+    outside = norm.cdf(t.ppf(0.025, freedom))
+    low, high = np.quantile(figures, [outside, 1 - outside])
+    beyond = min((figures <= 0).sum(), (figures >= 0).sum())
+    p_value = 2 * t.cdf(norm.ppf((1 + beyond) / (1 + RESAMPLES)), freedom)
+    return float(low), float(high), min(1.0, float(p_value))
+
+
+def _drawn(group: Floats, draws: np.random.Generator) -> Floats:
+    """(RESAMPLES, outcomes) sums over as many units as there are, from one unit less."""
+    picked = draws.integers(len(group), size=(RESAMPLES, len(group) - 1), dtype=np.int32)
+    sums = np.stack([outcome[picked].sum(axis=1) for outcome in np.ascontiguousarray(group.T)], axis=1)
+    return np.asarray(sums * (len(group) / (len(group) - 1)), float)
