@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from html_page import Page, needs_nothing_beside_itself, screenshot
+from scipy.stats import binomtest
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.comparison import compare, mcnemar, paired
@@ -152,6 +154,10 @@ def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) ->
             for group in (*one["by_axis"].values(), *one["by_level"].values(), *one["by_suite"].values()):
                 assert f"), {group['successes']}/{group['episodes']}" in words
     assert "confounding objects (829 tasks)" in words
+    for comparison in found["comparisons"]:
+        for line in (comparison["all"], *comparison["by_axis"].values()):
+            assert f"{100 * line['difference']['value']:+.1f}" in words
+            assert line["difference"]["resampled"] in words
     assert "ran the same 60 episodes" in words
     assert "better (first) and worse (second)" in words
     failures = found["failures"]
@@ -159,6 +165,43 @@ def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) ->
     assert len(failures) <= FAILURES * len(axes)
     assert len(page.of("video")) == sum(failure["policy"] == "worse" for failure in failures) > 5
     assert all(failure["episode"] in words for failure in failures)
+
+
+def test_the_overall_rate_of_each_policy_comes_first(written: Path) -> None:
+    words = " ".join(Page(written.read_text()).text.split())
+    top = words[words.index("Evaluation of 2 policies") : words.index("Beside published models")]
+    # Of 70 episodes every fourth fails, or is solved; intervals as of Wilson's formula in SciPy.
+    for name, solved in (("better", 52), ("worse", 18)):
+        low, high = binomtest(solved, 70).proportion_ci(method="wilson")
+        shown = f"{name} {100 * solved / 70:.1f} % {100 * low:.0f} to {100 * high:.0f} % (95 % interval)"
+        assert f"{shown} {solved} of 70 episodes" in top
+    assert "did not run the same episodes" not in top
+    assert "Bars below figures: successes failures" in top
+
+
+def test_one_policy_of_few_episodes_is_not_set_beside_published_ones_as_an_equal(
+    subset: list[EvaluationTask], tmp_path: Path
+) -> None:
+    folder = write(tmp_path / "few", [result(subset[0], "alone", True)])
+    evaluation_report.write(read([folder]), tmp_path / "report.html")
+    html = (tmp_path / "report.html").read_text()
+    words = " ".join(Page(html).text.split())
+    assert "Evaluation of alone Overall success" in words
+    assert "1 of 1 episode " in words
+    assert not re.search(r"\b1 (policies|episodes)", words)
+    # Wilson's interval of 1 in 1 begins at 1 / (1 + 1.96^2).
+    own = words[words.index("this evaluation alone") : words.index("published OpenVLA")]
+    assert "21 to 100" in own
+    assert "rate 100.0 1 episode" in own
+    assert "<b>" not in html[html.index('class="own"') :].split("</tr>")[0]
+
+
+def test_policies_of_different_episodes_are_said_to_be(subset: list[EvaluationTask], tmp_path: Path) -> None:
+    one = write(tmp_path / "one", [result(task, "one", True) for task in subset[:20]])
+    other = write(tmp_path / "other", [result(task, "other", False) for task in subset[5:20]])
+    evaluation_report.write(read([one, other]), tmp_path / "report.html")
+    words = " ".join(Page((tmp_path / "report.html").read_text()).text.split())
+    assert "The policies did not run the same episodes" in words[: words.index("Beside published models")]
 
 
 @pytest.mark.parametrize("width_px", [360, 1200])

@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.evaluation.comparison import compare, paired
 from pipeline.evaluation.merging import Evaluated
 from pipeline.evaluation.paper_table import paper_table
-from pipeline.evaluation.results import Row, summary
+from pipeline.evaluation.results import Row, success_rate, summary
 
 SOURCES = ("libero_plus", "own", "libero")
 """Of tasks, in a report's order; others follow."""
@@ -25,7 +25,8 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     """The findings, JSON-serialisable.
 
     Returns:
-        ``policies``: name to settings, versions, number of refused episodes, and ``results``: ``summary`` by source.
+        ``policies``: name to settings, versions, number of refused episodes, ``overall``: the ``success_rate`` of all
+        its episodes, and ``results``: ``summary`` by source.
         ``paper_table``: see ``PaperTable``; None where no test task was run.
         ``comparisons``: each two policies on the episodes of a source that both ran, see ``compare``.
         ``common``: source to the number of episodes that all policies ran which ran any of it.
@@ -40,6 +41,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
                 "settings": policy.settings,
                 "versions": _versions(policy.rows),
                 "refused": policy.refused,
+                "overall": success_rate(policy.rows),
                 "results": {source: summary(rows) for source in sources if (rows := policy.of(source))},
             }
             for policy in policies

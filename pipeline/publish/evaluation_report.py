@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import PipelineError
+from pipeline.evaluation.bootstrap import FEW, RESAMPLES, SAMPLE
 from pipeline.evaluation.findings import FAILURES, findings
 from pipeline.evaluation.merging import Evaluated
+from pipeline.evaluation.results import wilson
 from pipeline.files import replaced
 from pipeline.publish import clips, figures, pages
 from pipeline.publish.figures import Panel, Share
@@ -32,6 +34,10 @@ GROUPINGS = {
 }
 CLOSER = {"by_axis_and_level": "by axis and level", "by_suite_and_axis": "by suite and axis"}
 """Groupings of ``summary`` to their titles; those of ``CLOSER`` are folded away and not plotted."""
+
+
+WIDE = 0.2
+"""A rate whose interval is wider is not set beside published ones: the interval stands in its place."""
 
 
 class Section(NamedTuple):
@@ -77,17 +83,20 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
     """
     policies = found["policies"]
     colours = dict(zip(policies, cycle(figures.COLOURS.values()), strict=False))
-    totals = [one["all"] for policy in policies.values() for one in policy["results"].values()]
+    paper = found["paper_table"]
     return pages.render(
         "evaluation_report.html.j2",
         colours=colours,
-        headline={
-            "policies": len(policies),
-            "episodes": sum(total["episodes"] for total in totals),
-            "successes": sum(total["successes"] for total in totals),
-        },
+        overall={name: policy["overall"] for name, policy in policies.items()},
+        by_source=_by_source(found),
         refused=sum(policy["refused"] for policy in policies.values()),
-        paper=found["paper_table"],
+        paper=paper,
+        differ=_differ(found),
+        published_points=_points(paper["tasks"]) if paper else None,
+        wide=WIDE,
+        resamples=RESAMPLES,
+        sample=SAMPLE,
+        few=FEW,
         sections=[_section(source, found, colours) for source in found["common"]],
         failures=[
             {**failure, "video": clips.video_of(videos[failure["episode"]]) if failure["video"] else None}
@@ -97,6 +106,38 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
         titles=TITLES,
         made_with={name: _made_with(policy) for name, policy in policies.items()},
     )
+
+
+def _by_source(found: Mapping[str, Any]) -> Table | None:
+    """Each policy's rate on each source; None where there is one source, whose rate is the overall one."""
+    sources = list(found["common"])
+    if len(sources) < 2:
+        return None
+    rows = [
+        (Cell(name), *(_rate(policy["results"].get(source, {}).get("all")) for source in sources))
+        for name, policy in found["policies"].items()
+    ]
+    return Table("By source of the tasks", ("", *(TITLES.get(source, source) for source in sources)), rows)
+
+
+def _differ(found: Mapping[str, Any]) -> bool:
+    """Whether some policy ran episodes that another did not."""
+    policies = found["policies"].values()
+    return any(
+        policy["results"].get(source, {"all": {"episodes": 0}})["all"]["episodes"] != common
+        for source, common in found["common"].items()
+        for policy in policies
+    )
+
+
+def _points(tasks: Mapping[str, int]) -> tuple[float, float]:
+    """How wide intervals of published rates are at most, in points: of the total, and of the smallest column."""
+
+    def widest(count: int) -> float:
+        low, high = wilson(count / 2, count)
+        return 100 * (high - low)
+
+    return widest(sum(tasks.values())), widest(min(tasks.values()))
 
 
 def _section(source: str, found: Mapping[str, Any], colours: Mapping[str, str]) -> Section:
@@ -124,15 +165,14 @@ def _section(source: str, found: Mapping[str, Any], colours: Mapping[str, str]) 
                 rows[name].append(Share(group["rate"], group["low"], group["high"], colours[policy]))
         return figures.intervals(title, rows, "success rate")
 
-    whole = Table("all", ("", *results), [(Cell("all"), *(_rate(one["all"]) for one in results.values()))])
-    # Where a grouping has one group, it repeats the whole.
+    # Where a grouping has one group, it repeats the whole, which stands at the top of the page.
     several = [grouping for grouping in (*GROUPINGS, *CLOSER) if len(names(grouping)) > 1]
     shown = {grouping: title for grouping, title in GROUPINGS.items() if grouping in several}
     return Section(
         TITLES.get(source, source),
         _alike([one["all"]["episodes"] for one in results.values()], found["common"][source]),
         [plot(grouping, title) for grouping, title in shown.items()],
-        [whole, *(table(grouping, title) for grouping, title in shown.items())],
+        [table(grouping, title) for grouping, title in shown.items()],
         [table(grouping, title) for grouping, title in CLOSER.items() if grouping in several],
         [_comparison(one) for one in found["comparisons"] if one["source"] == source],
     )
@@ -152,7 +192,7 @@ def _alike(episodes: Sequence[int], common: int) -> str:
     if len(episodes) < 2:
         return ""
     if set(episodes) == {common}:
-        return f"All policies ran the same {common:,} episodes."
+        return f"All policies ran the same {pages.counted(common, 'episode')}."
     return (
         f"The policies did not run the same episodes: {common:,} are common to all. Each column has all of its own "
         "policy's; the comparisons have the common ones of two."
@@ -161,19 +201,29 @@ def _alike(episodes: Sequence[int], common: int) -> str:
 
 def _comparison(one: Mapping[str, Any]) -> Table:
     lines = {**({"all": one["all"]} if len(one["by_axis"]) > 1 else {}), **one["by_axis"]}
+    counts = ("episodes", "both", "only_first", "only_second", "neither")
     return Table(
         f"{one['first']} (first) and {one['second']} (second)",
-        ("", "episodes", "both", "only first", "only second", "neither", "second minus first", "p"),
+        (
+            *("", *(name.replace("_", " ") for name in counts)),
+            *("second minus first", "p", "McNemar's p", "drawn anew"),
+        ),
         [
             (
                 Cell(name),
-                *(Cell(f"{line[key]:,}") for key in ("episodes", "both", "only_first", "only_second", "neither")),
-                Cell(f"{100 * (line['second_rate'] - line['first_rate']):+.1f} points"),
-                Cell(f"{line['p_value']:.2g}"),
+                *(Cell(f"{line[key]:,}") for key in counts),
+                Cell(_difference(line["difference"])),
+                *(Cell("-" if p is None else f"{p:.2g}") for p in (line["difference"]["p_value"], line["p_value"])),
+                Cell(line["difference"]["resampled"]),
             )
             for name, line in lines.items()
         ],
     )
+
+
+def _difference(found: Mapping[str, Any]) -> str:
+    value = f"{100 * found['value']:+.1f}"
+    return value if found["low"] is None else f"{value} ({100 * found['low']:+.0f} to {100 * found['high']:+.0f})"
 
 
 def _made_with(policy: Mapping[str, Any]) -> dict[str, str]:

@@ -21,7 +21,13 @@ def render(template: str, **values: Any) -> str:
         lstrip_blocks=True,
     )
     environment.globals["colour"] = figures.colour
+    environment.filters["counted"] = counted
     return environment.get_template(template).render(**values)
+
+
+def counted(number: int, one: str, several: str = "") -> str:
+    """Such as ``1 episode`` and ``10,030 episodes``; ``several`` where it is not ``one`` with an s."""
+    return f"{number:,} {one if number == 1 else several or f'{one}s'}"
 
 
 def write(html: str, path: Path) -> None:
