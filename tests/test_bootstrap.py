@@ -69,7 +69,7 @@ def test_of_a_few_fixed_base_tasks_the_interval_covers_their_own_difference(effe
         simulated(draws, rates, (12, 12, 12, 12)).interval(lambda sums: (sums[:, 1] - sums[:, 0]) / 48)
         for _ in range(SIMULATIONS)
     ]
-    assert found[0].resampled == "48 trials, within each of 4 base tasks"
+    assert found[0].resampled == "48 trials within 4 base tasks"
     assert missed(found, effect) in EXPECTED
     assert rejected(found) in EXPECTED if effect == 0 else rejected(found) > 100
 
@@ -85,7 +85,7 @@ def test_of_a_sample_of_base_tasks_the_interval_covers_what_others_would_show(ba
         trials = simulated(draws, np.stack([first, second], axis=1), draws.integers(3, 9, base_tasks).tolist())
         outcomes = np.column_stack([trials.outcomes, np.ones(len(trials.outcomes))])
         found.append(trials._replace(outcomes=outcomes).interval(difference))
-    assert found[0].resampled == f"{base_tasks} base tasks, each with its trials"
+    assert found[0].resampled == f"{base_tasks} base tasks"
     assert missed(found, mean) in EXPECTED
     assert rejected(found) in EXPECTED if mean == 0 else rejected(found) > 150
 

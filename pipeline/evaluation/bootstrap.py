@@ -8,13 +8,13 @@ Trials of one base task are alike, so it matters what is drawn anew:
 
 * With ``SAMPLE`` base tasks or more these are a sample, and are drawn, each with all its trials. The interval says what
   other tasks of this kind would show. Trials are not drawn again within the drawn tasks: their scatter would count
-  twice, and simulated intervals cover 98 to 99.5 %.
+  twice, and simulated intervals of five trials a task cover 98 to 99.5 %.
 * Fewer are fixed: trials are drawn within each of them, and the interval is about these tasks alone. They tell too
   little of others: simulated, a plain bootstrap that draws four base tasks anew covers 75 to 88 % instead of 95 %.
 * Where some base task has fewer than ``FEW`` trials, all trials are drawn as if of one. This is wider.
 
-Of n, n - 1 are drawn, which makes the variance of a mean unbiased (Rao and Wu, 1988); and the percentiles are those at
-which the normal distribution has what Student's t has outside of its 95 % (Hesterberg, 2015).
+Of n units n - 1 are drawn, which makes the variance of a mean unbiased (Rao and Wu, 1988). The percentiles are not 2.5
+and 97.5 but further out, by as much as Student's t is wider than the normal distribution (Hesterberg, 2015).
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ def interval(
     of_trial = dict(zip(trials, base_tasks, strict=True))
     units = {name: place for place, name in enumerate(sorted(of_trial))}
     member, strata = [units[name] for name in trials], [bases[of_trial[name]] for name in units]
-    resampled = f"{len(units)} trials, within each of {len(bases)} base tasks"
+    resampled = f"{len(units)} trials within {len(bases)} base tasks"
     if len(bases) >= SAMPLE:
-        resampled = f"{len(bases)} base tasks, each with its trials"
+        resampled = f"{len(bases)} base tasks"
         member, strata = [bases[name] for name in base_tasks], [0] * len(bases)
     elif len(bases) == 1 or min(np.bincount(strata)) < FEW:
         resampled, strata = f"{len(units)} trials", [0] * len(units)
