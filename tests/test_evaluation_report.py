@@ -159,7 +159,8 @@ def test_the_page_needs_nothing_and_says_what_the_findings_say(written: Path) ->
             assert f"{100 * line['difference']['value']:+.1f}" in words
             assert line["difference"]["resampled"] in words
     assert "ran the same 60 episodes" in words
-    assert "better (first) and worse (second)" in words
+    assert words.count("better (first) and worse (second)") == 2
+    assert words.count("by bootstrap: it is computed 10,000 times") == 1, "explained once"
     failures = found["failures"]
     axes = {(failure["policy"], failure["source"], failure["axis"]) for failure in failures}
     assert len(failures) <= FAILURES * len(axes)
