@@ -22,10 +22,12 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+# Before NumPy, whose machine code it fixes: else one side would compute with other kernels than the other.
+from pipeline import gl, identity  # isort: skip
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import gl
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.evaluation.episode import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import RUNNABLE, by_name
@@ -95,7 +97,7 @@ def main() -> None:
     arguments = parser.parse_args()
     chosen = some_tasks(arguments.axis, arguments.per_suite, arguments.assets)
     choice = gl.choose()
-    print(f"{choice}; {len(chosen)} tasks", flush=True)
+    print(f"{choice}; {identity.machine_code()}; {len(chosen)} tasks", flush=True)
     benchmarks(arguments.python, chosen, arguments.reference)
     environment = EpisodeEnvironment(archive=arguments.assets)
     rows = [compare(environment, task, arguments.reference) for task in chosen]
