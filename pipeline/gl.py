@@ -154,17 +154,6 @@ def prepare() -> GlChoice:
     return choice
 
 
-def calls() -> Any:
-    """PyOpenGL's functions for the current context; what MuJoCo's own calls have left is forgotten, or they raise it.
-
-    PyOpenGL chooses its platform when it is imported, so nothing imports it before a context is there.
-    """
-    from OpenGL import GL
-
-    GL.glGetError()
-    return GL
-
-
 def import_mujoco() -> None:
     """Import MuJoCo without OpenGL: left to itself, it loads what ``MUJOCO_GL`` names, and fails where that is not."""
     with left_out():

@@ -14,6 +14,7 @@ from arenas import TASKS
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.culling import Culling
+from pipeline.rendering.opengl import say_once
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame
 
@@ -77,7 +78,8 @@ def test_the_same_pixels_with_less_drawn(renderer: Renderer) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("arena", TASKS)
-def test_the_same_pixels_in_every_arena(arena: str) -> None:
+def test_the_same_pixels_in_every_arena(arena: str, caplog: pytest.LogCaptureFixture) -> None:
+    say_once.cache_clear()
     opened = arenas.renderer(arena)
     rng = seeding.rng("test_culling", arena)
     left_out, boxes = [0, 0], opened._culling.boxes
@@ -95,6 +97,7 @@ def test_the_same_pixels_in_every_arena(arena: str) -> None:
             opened.frame(camera)
             assert np.array_equal(opened.geoms(camera), shown), "which pieces a frame was drawn of does not matter"
         assert min(left_out) > 30, "pieces of meshes that are in the picture, or that the last lamp lights"
+        assert caplog.records == [], "OpenGL reports no error"
     finally:
         opened.close()
 

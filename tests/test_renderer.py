@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from arenas import TASKS, frames
 
-from pipeline import gl
 from pipeline.axes.light import LightPerturbation
 from pipeline.physics.environment import Environment
 from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Floats, Frame
 
@@ -87,7 +87,7 @@ def test_scenes_that_come_and_go_leave_nothing_in_the_context() -> None:
 
         def held() -> tuple[int, int]:
             """How many display lists and textures there are."""
-            opengl = gl.calls()
+            opengl = calls()
             last = opengl.glGenLists(1), int(opengl.glGenTextures(1))
             opengl.glDeleteLists(last[0], 1)
             opengl.glDeleteTextures([last[1]])

@@ -16,6 +16,7 @@ from test_culling import plain
 from pipeline import gl, seeding
 from pipeline.rendering.faces import Faces
 from pipeline.rendering.mesh_pieces import BATCH_FACES, PIECE_FACES
+from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.samples import Projection, faces_that_show, room
 from pipeline.rendering.skins import GEOM, SKINS
@@ -146,7 +147,7 @@ class Drawing:
             listed: numbers of the corners.
             by_list: whether from a display list, as MuJoCo draws meshes, or from buffers, as it draws skins.
         """
-        opengl, context = gl.calls(), self._renderer._mjr_context
+        opengl, context = calls(), self._renderer._mjr_context
         opengl.glViewport(0, 0, *SIZE_PX)
         opengl.glClipControl(opengl.GL_LOWER_LEFT, opengl.GL_ZERO_TO_ONE)
         for setting in (opengl.GL_LIGHTING, opengl.GL_DEPTH_TEST):

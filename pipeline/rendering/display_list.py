@@ -8,28 +8,28 @@ from contextlib import contextmanager
 import mujoco
 import numpy as np
 
-from pipeline import gl
+from pipeline.rendering.opengl import calls
 
 
 def new(count: int = 1) -> int:
     """The first number of so many new lists, which do nothing yet."""
-    number: int = gl.calls().glGenLists(count)
+    number: int = calls().glGenLists(count)
     return number
 
 
 def free(number: int, count: int = 1) -> None:
     """Have OpenGL forget so many lists."""
-    gl.calls().glDeleteLists(number, count)
+    calls().glDeleteLists(number, count)
 
 
 @contextmanager
 def recorded(number: int) -> Iterator[None]:
     """Have a list do, whenever it is called, what OpenGL is asked to do meanwhile."""
-    gl.calls().glNewList(number, gl.calls().GL_COMPILE)
+    calls().glNewList(number, calls().GL_COMPILE)
     try:
         yield
     finally:
-        gl.calls().glEndList()
+        calls().glEndList()
 
 
 def add(number: int, scene: mujoco.MjvScene, context: mujoco.MjrContext) -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mujoco
 
-from pipeline import gl
 from pipeline.rendering import display_list
+from pipeline.rendering.opengl import calls, failure
 
 VERTICES = "#version 400 compatibility\nvoid main() { gl_Position = gl_Vertex; }"
 
@@ -38,11 +38,11 @@ class Layer:
     @staticmethod
     def possible() -> bool:
         """Whether the current OpenGL has shaders that run once for each sample."""
-        opengl = gl.calls()
+        opengl = calls()
         return bool(opengl.glGetIntegerv(opengl.GL_MAJOR_VERSION) >= 4)
 
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
-        opengl = gl.calls()
+        opengl = calls()
         self._buffer, self._height, self._width = context.offFBO, height, width
         self._textures = [
             self._texture(context.offColor, context.offSamples),
@@ -63,7 +63,7 @@ class Layer:
     def keep(self, content: bytes) -> None:
         """Copy what is drawn in the off-screen buffer."""
         # Of less than all, OpenGL here does not copy each sample by itself.
-        opengl, rectangle = gl.calls(), (0, 0, self._width, self._height)
+        opengl, rectangle = calls(), (0, 0, self._width, self._height)
         opengl.glPushAttrib(opengl.GL_SCISSOR_BIT)
         opengl.glDisable(opengl.GL_SCISSOR_TEST)
         opengl.glBindFramebuffer(opengl.GL_READ_FRAMEBUFFER, self._buffer)
@@ -76,7 +76,7 @@ class Layer:
         self.content = content
 
     def _draw(self) -> None:
-        opengl = gl.calls()
+        opengl = calls()
         opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)
         for setting in (
             opengl.GL_ALPHA_TEST,
@@ -103,7 +103,7 @@ class Layer:
 
     def _texture(self, renderbuffer: int, samples: int) -> int:
         """A texture for as many samples as a renderbuffer has, in its format: others cannot be copied as they are."""
-        opengl = gl.calls()
+        opengl = calls()
         opengl.glBindRenderbuffer(opengl.GL_RENDERBUFFER, renderbuffer)
         kind = opengl.glGetRenderbufferParameteriv(opengl.GL_RENDERBUFFER, opengl.GL_RENDERBUFFER_INTERNAL_FORMAT)
         texture: int = opengl.glGenTextures(1)
@@ -113,14 +113,17 @@ class Layer:
         return texture
 
     def _shaders(self) -> int:
-        from OpenGL.GL import shaders
-
-        opengl = gl.calls()
-        program: int = shaders.compileProgram(
-            shaders.compileShader(VERTICES, opengl.GL_VERTEX_SHADER),
-            shaders.compileShader(SAMPLES, opengl.GL_FRAGMENT_SHADER),
-            validate=False,
-        )
+        opengl = calls()
+        program: int = opengl.glCreateProgram()
+        for kind, text in ((opengl.GL_VERTEX_SHADER, VERTICES), (opengl.GL_FRAGMENT_SHADER, SAMPLES)):
+            shader = opengl.glCreateShader(kind)
+            opengl.glShaderSource(shader, text)
+            opengl.glCompileShader(shader)
+            opengl.glAttachShader(program, shader)
+            opengl.glDeleteShader(shader)
+        opengl.glLinkProgram(program)
+        if not opengl.glGetProgramiv(program, opengl.GL_LINK_STATUS):
+            raise failure(f"OpenGL refuses the shaders of layers: {opengl.glGetProgramInfoLog(program)!r}")
         opengl.glUseProgram(program)
         for unit, name in enumerate(("colours", "depths")):
             opengl.glUniform1i(opengl.glGetUniformLocation(program, name), unit)

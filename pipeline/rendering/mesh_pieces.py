@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import gl
 from pipeline.rendering import display_list
 from pipeline.rendering.layer import Layer
+from pipeline.rendering.opengl import calls, check
 from pipeline.types import Floats
 
 BATCH_FACES = 341
@@ -150,7 +150,7 @@ class MeshPieces:
         display_list.free(self._close, len(self._meshes))
         for lists in (lists for made in self._passes.values() for lists in made):
             display_list.free(lists.base, 2 * len(self._meshes) + 1)
-        gl.calls().glDeleteQueries(1, [self._nothing])
+        calls().glDeleteQueries(1, [self._nothing])
         # Of each mesh one for its faces and one for its convex hull.
         self._context.rangeMesh = 2 * meshes
         self._context.baseMesh = display_list.new(self._context.rangeMesh)
@@ -192,10 +192,10 @@ class MeshPieces:
             if lists.end != end:
                 with display_list.recorded(lists.base + len(self._meshes)):
                     for layer in end[1:]:
-                        gl.calls().glCallList(layer)
-                    gl.calls().glListBase(then.base)
+                        calls().glCallList(layer)
+                    calls().glListBase(then.base)
                 lists.end = end
-        gl.calls().glListBase(made[0].base)
+        calls().glListBase(made[0].base)
         display_list.add(self._turn, scene, self._context)
 
     def _write(
@@ -215,16 +215,16 @@ class MeshPieces:
             most = len(pieces) > MOST_PARTS * len(parts)
             with display_list.recorded(lists.base + mesh):
                 for number in [whole] if most else [parts[piece] for piece in pieces]:
-                    gl.calls().glCallList(number)
+                    calls().glCallList(number)
                 if opened[mesh]:
-                    gl.calls().glPushMatrix()
+                    calls().glPushMatrix()
                 if shut[mesh]:
-                    gl.calls().glBeginConditionalRender(self._nothing, gl.calls().GL_QUERY_WAIT)
+                    calls().glBeginConditionalRender(self._nothing, calls().GL_QUERY_WAIT)
             with display_list.recorded(lists.closing + mesh):
                 if shut[mesh]:
-                    gl.calls().glEndConditionalRender()
+                    calls().glEndConditionalRender()
                 if opened[mesh]:
-                    gl.calls().glPopMatrix()
+                    calls().glPopMatrix()
         lists.shown, lists.opened, lists.shut = shown, opened, shut
 
 
@@ -286,7 +286,7 @@ class _Lists:
 
 def _query_of_nothing() -> int:
     """A query whether something was drawn, answered with no."""
-    opengl = gl.calls()
+    opengl = calls()
     number = int(opengl.glGenQueries(1)[0])
     opengl.glBeginQuery(opengl.GL_ANY_SAMPLES_PASSED, number)
     opengl.glEndQuery(opengl.GL_ANY_SAMPLES_PASSED)
@@ -294,7 +294,7 @@ def _query_of_nothing() -> int:
 
 
 def _call_from_base(number: int) -> None:
-    gl.calls().glCallLists(np.array([number], np.uint32))
+    calls().glCallLists(np.array([number], np.uint32))
 
 
 def _upload(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, first: int, faces: int) -> int:
@@ -308,6 +308,7 @@ def _upload(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int, first:
         model.mesh_graphadr[mesh] = -1
         context.baseMesh = number - 2 * mesh
         mujoco.mjr_uploadMesh(model, context, mesh)
+        check("mjr_uploadMesh")
     finally:
         context.baseMesh = base
         model.mesh_faceadr[mesh], model.mesh_facenum[mesh], model.mesh_graphadr[mesh] = start, count, graph

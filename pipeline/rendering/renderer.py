@@ -17,6 +17,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.culling import Culling, Picture
 from pipeline.rendering.layer import Layer
 from pipeline.rendering.mesh_pieces import MeshPieces
+from pipeline.rendering.opengl import check, making_context
 from pipeline.rendering.samples import SAMPLES
 from pipeline.rendering.skins import SKINS, Skins, bare
 from pipeline.rendering.still import Still
@@ -79,7 +80,8 @@ class Renderer:
         model = compiled(scene) if isinstance(scene, str) else scene
         # A context is made for what all scenes have alike, and then goes on with this one.
         first = bare(model, SKINS if software else 0) if _shares(model) else model
-        self._renderer = mujoco.Renderer(first, height, width, max_geom=1000)
+        with making_context():
+            self._renderer = mujoco.Renderer(first, height, width, max_geom=1000)
         self._option = mujoco.MjvOption()
         # As robosuite's off-screen context: visual meshes without the collision geometry.
         self._option.geomgroup[0], self._option.geomgroup[1] = 0, 1
@@ -146,6 +148,7 @@ class Renderer:
             self._draw(picture, picture.opaque, camera)
         frame = np.empty(SCHEMA.frame.shape, np.uint8)
         mujoco.mjr_readPixels(frame, None, self._renderer._rect, self._renderer._mjr_context)
+        check("mjr_readPixels")
         return frame
 
     def _draw_layers(self, picture: Picture, camera: str) -> None:
@@ -242,6 +245,7 @@ class Renderer:
                 skinned = self._skins.put(self.data, picture.projection, wanted)
             self._pieces.show((camera, last), [*before, main, *after], scene, len(before), layers, skinned)
             mujoco.mjr_render(self._renderer._rect, scene, self._renderer._mjr_context)
+            check("mjr_render")
         finally:
             self.model.geom_group[:] = groups
             self.model.site_group[:] = site_groups
@@ -273,11 +277,13 @@ class Renderer:
             self._renderer.update_scene(self.data, camera, self._option)
             self._pieces.show("everything", [everything], self._renderer.scene)
             number, kind = np.moveaxis(self._renderer.render()[::-1], -1, 0)
+            check("mjr_render")
         finally:
             self._renderer.disable_segmentation_rendering()
         # The depth buffer still has what was drawn last: one drawing serves both.
         buffer = np.empty(number.shape, np.float32)
         mujoco.mjr_readPixels(None, buffer, self._renderer._rect, self._renderer._mjr_context)
+        check("mjr_readPixels")
         near, far = np.array([self.model.vis.map.znear, self.model.vis.map.zfar]) * self.model.stat.extent
         # MuJoCo's buffer is 1 at the near plane and 0 at the far one, as mujoco.Renderer inverts it.
         depth_m = near * far / (near + buffer.astype(float) * (far - near))

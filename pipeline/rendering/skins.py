@@ -15,9 +15,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import gl
 from pipeline.rendering.faces import Faces, faces_of
 from pipeline.rendering.mesh_pieces import Boxes, MeshPieces
+from pipeline.rendering.opengl import calls
 from pipeline.rendering.samples import SAMPLES, Projection, faces_that_show, room
 
 SKINS = 64
@@ -94,7 +94,7 @@ def _kept(scene: mujoco.MjvScene) -> _Kept:
     scene.nskin = 0
     first = scene.geoms[0].size.ctypes.data - GEOM.fields["size"][1]  # type: ignore[index]
     memory = (ctypes.c_byte * (GEOM.itemsize * scene.maxgeom)).from_address(first)
-    opengl = gl.calls()
+    opengl = calls()
     places = [opengl.glGetMultisamplefv(opengl.GL_SAMPLE_POSITION, sample) for sample in range(SAMPLES)]
     return _Kept(drawn, np.frombuffer(memory, GEOM), np.array(places, np.float32), {})
 
@@ -145,7 +145,7 @@ class Skins:
         """Copy a mesh's vertices to a skin, unless they are there."""
         if skin < 0 or self._kept.filled.get(skin) == content:
             return
-        opengl, context = gl.calls(), self._context
+        opengl, context = calls(), self._context
         buffers = [(context.skinvertVBO, faces.vertices_m), (context.skinnormalVBO, faces.normals)]
         if faces.texture is not None:
             buffers.append((context.skintexcoordVBO, faces.texture))
@@ -174,7 +174,7 @@ class Skins:
         skins[np.isin(self._mesh[geoms], self._mesh[geoms[of_mesh & (shown["rgba"][:, 3] < OPAQUE)]])] = -1
         if len(shown) + 2 * np.count_nonzero(skins >= 0) >= self._scene.maxgeom:
             skins[:] = -1
-        opengl = gl.calls()
+        opengl = calls()
         for geom in geoms[skins >= 0].tolist():
             skin, count = self._skin[geom], 0
             pieces = wanted[slice(*np.searchsorted(self._boxes.geom, (geom, geom + 1)))]

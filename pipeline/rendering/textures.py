@@ -10,8 +10,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import gl
 from pipeline.axes import RenderPerturbation
+from pipeline.rendering.opengl import calls, check
 from pipeline.scenes.compiled import Images
 
 
@@ -54,12 +54,12 @@ class Textures:
         for texture in range(model.ntex):
             same = (number for number in range(len(left)) if left[number] and self._same(texture, former, number))
             if (number := next(same, None)) is None:
-                self._own[texture] = gl.calls().glGenTextures(1)
+                self._own[texture] = calls().glGenTextures(1)
                 copied.append(texture)
             else:
                 self._own[texture], left[number] = left[number], 0
         # OpenGL passes over the zeros.
-        gl.calls().glDeleteTextures(left)
+        calls().glDeleteTextures(left)
         context.ntexture, context.textureType[: model.ntex] = model.ntex, model.tex_type
         context.mat_texid[: model.mat_texid.size] = model.mat_texid.ravel()
         context.mat_texrepeat[: model.mat_texrepeat.size] = model.mat_texrepeat.ravel()
@@ -67,7 +67,7 @@ class Textures:
         self.show({})
         for texture in copied:
             if not self._contents[texture]:
-                mujoco.mjr_uploadTexture(model, context, texture)
+                self._copy(model, texture)
         self._load([texture for texture in copied if self._contents[texture]])
 
     def _load(self, textures: Sequence[int]) -> None:
@@ -78,7 +78,7 @@ class Textures:
         try:
             self._context.texture[: len(textures)] = self._own[[*textures]]
             for number in range(len(textures)):
-                mujoco.mjr_uploadTexture(loaded, self._context, number)
+                self._copy(loaded, number)
         finally:
             self.show({})
 
@@ -116,7 +116,11 @@ class Textures:
     def upload(self, textures: Iterable[int]) -> None:
         """Copy textures of the model with its images to the context."""
         for texture in textures:
-            mujoco.mjr_uploadTexture(self.model, self._context, texture)
+            self._copy(self.model, texture)
+
+    def _copy(self, model: mujoco.MjModel, texture: int) -> None:
+        mujoco.mjr_uploadTexture(model, self._context, texture)
+        check("mjr_uploadTexture")
 
     @contextmanager
     def held(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[dict[int, int]]]:
@@ -132,7 +136,7 @@ class Textures:
             yield held
         finally:
             self.show({})
-            gl.calls().glDeleteTextures([name for names in held for name in names.values()])
+            calls().glDeleteTextures([name for names in held for name in names.values()])
 
     def _changed(self, perturbations: Sequence[RenderPerturbation]) -> dict[int, int]:
         if not perturbations:
@@ -146,7 +150,7 @@ class Textures:
                     perturbation.apply(self.model)
             finally:
                 former = self.former()
-            opengl = gl.calls()
+            opengl = calls()
             for texture in former:
                 names[texture] = int(opengl.glGenTextures(1))
             self.show(names)
