@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +11,9 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from conftest import MILK, STOVE
+from conftest import MILK, REPOSITORY, STOVE
 
-from pipeline import gl
+from pipeline import axes, gl
 
 # LIBERO's environment renders with what robosuite finds in MUJOCO_GL when it is imported.
 gl.choose()
@@ -35,6 +36,10 @@ from pipeline.run.streams import Stream, streams_of  # noqa: E402
 from pipeline.scenes.compiled import proprioception  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
 from pipeline.types import Frame, Task, Trajectory  # noqa: E402
+
+sys.path.append(str(REPOSITORY / "examples"))
+
+from add_axis import LensPerturbation  # noqa: E402
 
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
 
@@ -225,6 +230,19 @@ def test_a_camera_that_loses_sight_of_the_task_is_rejected_with_its_reason(
     rendered = render(trajectory, MILK, list(streams.values()), RenderConfig(), opened)
     assert rendered.rejected == {streams[name].stream_id: name for name in cameras if name != "seen"}
     assert set(rendered.streams) == {streams["seen"].stream_id}
+
+
+def test_a_lens_that_loses_sight_of_the_task_is_rejected_too(
+    whole: dict[Task, Trajectory], opened: LastScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As a change of pipeline/axes/__init__.py would have it.
+    monkeypatch.setitem(axes._PLACE, "lens", 0)
+    trajectory = replace(whole[MILK], states=whole[MILK].states[:3], actions=whole[MILK].actions[:2])
+    lenses = [LensPerturbation(component="zoom", level=5, fovy_scale=scale) for scale in (0.3, 0.97)]
+    lost, seen = (Stream("image", (lens,)) for lens in lenses)  # type: ignore[arg-type]
+    rendered = render(trajectory, MILK, [lost, seen], RenderConfig(), opened)
+    assert rendered.rejected == {lost.stream_id: "task_object_not_seen"}
+    assert set(rendered.streams) == {seen.stream_id}
 
 
 def test_what_the_original_does_not_show_either_is_no_reason() -> None:

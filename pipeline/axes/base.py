@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from pipeline.errors import PipelineError
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
 
 if TYPE_CHECKING:
@@ -143,15 +144,42 @@ class PixelPerturbation(Perturbation):
         raise NotImplementedError
 
 
+CAMERA_FIELDS = ("cam_fovy", "cam_pos", "cam_quat")
+OPACITY_FIELDS = ("geom_matid", "geom_rgba", "mat_rgba")
+LIGHT_FIELDS = (
+    *("light_active", "light_ambient", "light_attenuation", "light_castshadow", "light_cutoff", "light_diffuse"),
+    *("light_dir", "light_directional", "light_exponent", "light_pos", "light_specular"),
+    *("mat_emission", "mat_reflectance", "mat_shininess", "mat_specular"),
+)
+FIELDS = (*CAMERA_FIELDS, *OPACITY_FIELDS, *LIGHT_FIELDS, "tex_data")
+"""Arrays of MuJoCo's model that the render layer can change: each is compared with MuJoCo's own drawing by the tests.
+
+What a scene is made of, such as ``geom_size`` or ``mesh_vert``, is kept from one picture to the next."""
+
+
 class RenderPerturbation(Perturbation):
     """Changes what a scene looks like and nothing that moves in it.
 
     Attributes:
-        fields: the arrays of the model that ``apply`` may write; they are put back afterwards.
+        fields: the arrays of the model that ``apply`` may write, of ``FIELDS``; they are put back afterwards.
+
+    Raises:
+        PipelineError: when a class is made whose ``fields`` has another one.
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
     fields: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: object) -> None:
+        for field in getattr(cls, "fields", ()):
+            if field not in FIELDS:
+                raise PipelineError(
+                    f"a render perturbation writes {field}, which pictures would not follow",
+                    where=f"{cls.__module__}.{cls.__qualname__}",
+                    expected=f"fields of {', '.join(FIELDS)}",
+                    remedy="make it a PhysicsPerturbation, which changes the scene before it is replayed",
+                )
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Write the change into the model's ``fields``."""
@@ -161,6 +189,11 @@ class RenderPerturbation(Perturbation):
     def paints(self) -> bool:
         """Whether it writes textures and nothing else."""
         return self.fields == ("tex_data",)
+
+    @property
+    def sees_otherwise(self) -> bool:
+        """Whether it sees other surfaces: from another place, through another lens, or through what was opaque."""
+        return not {*CAMERA_FIELDS, *OPACITY_FIELDS}.isdisjoint(self.fields)
 
 
 class PhysicsPerturbation(Perturbation):

@@ -81,8 +81,7 @@ class Culling:
         fixed = ((model.body_weldid == 0) & (model.body_mocapid[model.body_rootid] < 0))[model.geom_bodyid]
         wide = (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX) & (np.sort(model.geom_size)[:, 1] > LEAST_SCREEN_M)
         self._screens = np.flatnonzero(self._shown & fixed & wide)
-        flat = np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX))
-        self._flat = np.flatnonzero(flat & (model.geom_matid >= 0))
+        self._flat = np.flatnonzero(np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX)))
 
     def picture(self, data: mujoco.MjData, camera: str) -> Picture:
         """What has to be drawn of the data's state; positions must be up to date."""
@@ -208,7 +207,8 @@ class Culling:
         The second value is false when the camera is about in its plane, or when it can be seen through: what MuJoCo
         does then is a matter of rounding.
         """
-        reflects = self._model.mat_reflectance[self._model.geom_matid[self._flat]] > 0
+        # The last is for geoms without a material, whose number is -1.
+        reflects = np.append(self._model.mat_reflectance, 0)[self._model.geom_matid[self._flat]] > 0
         for mirror in self._flat[reflects & self._shown[self._flat]].tolist():
             height_m = float(self._heights(data, mirror, view.position_m))
             if abs(height_m) < MARGIN_M or clear[mirror]:

@@ -73,7 +73,7 @@ def render(
         variants = list(shared.values())
         changes = [of_layer(members[0].perturbations, RenderPerturbation) for members in variants]
         common = [change for change in changes[0] if not change.paints]
-        moved = any("cam_pos" in change.fields for change in common)
+        moved = any(change.sees_otherwise for change in common)
         painted = [[change for change in each if change.paints] for each in changes]
         with renderer.perturbed(common), renderer.painted(painted) as shows:
             for step in range(steps):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline import gl
 from pipeline.axes import RenderPerturbation
+from pipeline.axes.base import FIELDS
 from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.culling import Culling, Picture
 from pipeline.rendering.layer import Layer
@@ -25,11 +26,8 @@ from pipeline.rendering.textures import Textures
 from pipeline.scenes.compiled import Images, compiled
 from pipeline.types import Frame
 
-_LOOK = (
-    *(name for name in dir(mujoco.MjModel) if name.startswith(("cam_", "light_", "mat_"))),
-    *("geom_matid", "geom_rgba"),
-)
-"""What a picture depends on in a model, beside meshes and textures, and where its geoms and sites are."""
+_LOOK = tuple(name for name in FIELDS if name != "tex_data")
+"""What a picture depends on in a model, of what may change, beside textures and where its geoms and sites are."""
 
 _CULLED = mujoco.mjNGROUP - 1
 """A group of geoms and sites that nothing in LIBERO is in, and that is not drawn."""

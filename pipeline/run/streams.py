@@ -27,9 +27,9 @@ class Stream:
 
     @property
     def geometry(self) -> Stream:
-        """The view under what changes its camera alone: streams that have it in common see the same surfaces."""
+        """The view under what changes its surfaces alone: streams that have it in common share their geometry."""
         changes = (p for p in self.perturbations if isinstance(p, RenderPerturbation))
-        return Stream(self.view, tuple(p for p in changes if any(name.startswith("cam_") for name in p.fields)))
+        return Stream(self.view, tuple(p for p in changes if p.sees_otherwise))
 
 
 def streams_of(perturbations_json: str) -> dict[str, Stream]:
