@@ -5,8 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 from contextlib import closing
+from pathlib import Path
 
 import arenas
+import cv2
 import mujoco
 import numpy as np
 import pytest
@@ -101,6 +103,37 @@ def test_scenes_that_come_and_go_leave_nothing_in_the_context() -> None:
             turns.append(held())
         assert turns[1] == turns[2]
         assert min(turns[2]) > 10
+
+
+def painted(shape: str, image: Path) -> str:
+    """A shape under an image, before a camera."""
+    return f"""
+    <mujoco>
+      <asset><texture name="image" type="2d" file="{image}"/><material name="image" texture="image"/></asset>
+      <worldbody>
+        <light pos="0 0 3"/>
+        <camera name="agentview" pos="0 0 2"/>
+        <geom type="{shape}" size="0.3 0.3 0.3" group="1" material="image"/>
+      </worldbody>
+    </mujoco>"""
+
+
+def test_a_scene_after_one_that_failed_half_way_is_shown_as_it_is(tmp_path: Path) -> None:
+    image, broken = tmp_path / "image.png", tmp_path / "broken.png"
+    cv2.imwrite(str(image), np.arange(192, dtype=np.uint8).reshape(8, 8, 3))
+    broken.write_bytes(image.read_bytes()[:40])
+    scene = painted("box", image)
+    with closing(Renderer(scene)) as alone:
+        mujoco.mj_forward(alone.model, alone.data)
+        expected = alone.frame("agentview")
+    with closing(LastScene()) as opened:
+        opened.renderer(scene)
+        # Its image is read when its geoms have taken the place of the others.
+        with pytest.raises(ValueError, match=r"broken\.png"):
+            opened.renderer(painted("sphere", broken))
+        renderer = opened.renderer(scene)
+        mujoco.mj_forward(renderer.model, renderer.data)
+        assert np.array_equal(renderer.frame("agentview"), expected)
 
 
 LEFT_OPEN = '''

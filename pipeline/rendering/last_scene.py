@@ -28,18 +28,27 @@ class LastScene:
 
         Raises:
             PipelineError: when nothing renders on this machine.
+            ValueError: when MuJoCo refuses the scene or one of its images; the next scene gets another context.
         """
         if self._renderer is None or not self._is_last(scene):
             # Of its images, a new scene mostly needs none: the context has them.
             images = Images(scene) if isinstance(scene, str) else None
             model = physics_of(scene) if isinstance(scene, str) else copy.copy(scene)
-            if self._renderer is None or not self._renderer.adopted(model, images):
+            if self._renderer is None or not self._adopted(self._renderer, model, images):
                 self.close()
                 self._renderer = Renderer(model, images)
                 # Of a process that ends before anyone is done, MuJoCo ends OpenGL, after what is registered later.
                 atexit.register(self.close)
             self._scene = scene
         return self._renderer
+
+    def _adopted(self, renderer: Renderer, model: mujoco.MjModel, images: Images | None) -> bool:
+        try:
+            return renderer.adopted(model, images)
+        except BaseException:
+            # It shows something of both scenes now.
+            self.close()
+            raise
 
     def _is_last(self, scene: str | mujoco.MjModel) -> bool:
         return scene is self._scene or (isinstance(scene, str) and scene == self._scene)

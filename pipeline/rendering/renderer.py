@@ -99,7 +99,8 @@ class Renderer:
         """Go on with another model in the same GL context, where the meshes and textures that both have stay.
 
         Returns:
-            Whether that can be, and the model belongs to the renderer now; else nothing is changed.
+            Whether that can be, and the model belongs to the renderer now; else nothing is changed. Where it raises,
+            something is: the renderer has to be closed then.
         """
         if not _shares(model) or not _shares(self.model) or _fixed(model) != _fixed(self.model):
             return False
