@@ -73,7 +73,7 @@ def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Fra
     """What is shown to the frames of an episode, as a policy sees them and before they are encoded."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        ReplayJob("measured", entry.demo_id, "[]", "measured", demos, ReplayConfig(), folder)()
+        ReplayJob("measured", entry.demo_id, entry.sha256, "[]", "measured", demos, ReplayConfig(), folder)()
         trajectory = TrajectoryStore(folder).load("measured")
     raw: dict[str, list[Frame]] = {view: [] for view in SCHEMA.views}
     renderer = Renderer(trajectory.model_xml)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import h5py
 import numpy as np
 import pytest
 from conftest import BOWL, MILK, STOVE
@@ -17,13 +19,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.axes import PhysicsPerturbation
-from pipeline.config import ReplayConfig
+from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
-from pipeline.physics.replay import replay
+from pipeline.physics.replay import replay, replay_plan
 from pipeline.physics.success import verdict
+from pipeline.run import plan
+from pipeline.run.compute import loop
 from pipeline.scenes.noops import NOOP_NORM, kept_actions
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task, Trajectory
 
 ACTIONS = st.lists(st.tuples(st.sampled_from([0.0, 5e-5, 0.3]), st.sampled_from([-1.0, 1.0])), min_size=1, max_size=30)
@@ -115,6 +120,21 @@ def test_replay_starts_from_the_recorded_state_and_reaches_the_recorded_goal(
     assert len(trajectory.states) == len(trajectory.actions) + 1 == trajectory.kept_mask.sum() + 1
     control_step_s = np.diff(trajectory.states[:, 0])
     assert np.allclose(control_step_s, 1 / 20)
+
+
+def test_a_demonstration_that_changed_since_the_plan_is_refused(short_demos: Path, tmp_path: Path) -> None:
+    root = tmp_path / "demos"
+    shutil.copytree(short_demos / STOVE.suite, root / STOVE.suite)
+    demos = DemosConfig(source="hdf5", root=root, tasks=(f"{STOVE.suite}/{STOVE.name}",))
+    wanted = PlanConfig.model_validate({"seed": 7, "axes": {}, "episodes": {}})
+    rows = plan.make(demos.index().entries, wanted, ReplayConfig(), TestSet(()))
+    file = root / STOVE.suite / f"{STOVE.name}_demo.hdf5"
+    with h5py.File(file, "r+") as opened:
+        opened["data/demo_0/actions"][0, 0] += 0.01
+    with pytest.raises(PipelineError, match=r"changed since the plan(?s:.*)run the plan stage again") as caught:
+        replay_plan(rows, demos, ReplayConfig(), tmp_path / "trajectories", loop)
+    assert f"{file} demo_0" in str(caught.value)
+    assert not list(tmp_path.rglob("*.h5"))
 
 
 class PathSeen(PhysicsPerturbation):

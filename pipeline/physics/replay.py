@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.axes import PhysicsPerturbation, from_json, of_layer
 from pipeline.config import DemosConfig, ReplayConfig
-from pipeline.errors import RefusedError
+from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import Edition, edition
 from pipeline.physics.environment import Environment, UnusableSceneError, shared
 from pipeline.physics.reference import Reference
@@ -136,7 +136,7 @@ class ReplayJob:
     """One trajectory's replay, as it is sent to a worker.
 
     Attributes:
-        trajectory_id, demo_id, perturbations: as in the plan's row.
+        trajectory_id, demo_id, demo_sha256, perturbations: as in the plan's row.
         twin: trajectory of the same demonstration without perturbations, which tracking follows.
         demos, config: sections of the run's configuration.
         folder: of the trajectory store.
@@ -144,6 +144,7 @@ class ReplayJob:
 
     trajectory_id: str
     demo_id: str
+    demo_sha256: str
     perturbations: str
     twin: str
     demos: DemosConfig
@@ -151,8 +152,19 @@ class ReplayJob:
     folder: Path
 
     def __call__(self) -> Verdict:
-        """Replay, judge and store; returns the verdict."""
+        """Replay, judge and store; returns the verdict.
+
+        Raises:
+            PipelineError: when the demonstration is not there, or another than the plan was drawn for.
+        """
         demo = self.demos.open().load(self.demo_id)
+        if demo.sha256 != self.demo_sha256:
+            raise PipelineError(
+                "the demonstration has changed since the plan",
+                where=(self.demos.root or Path()) / demo.source,
+                expected=f"content with the hash {self.demo_sha256}",
+                remedy="put the file back, or run the plan stage again, which draws for what is there now",
+            )
         physics = of_layer(from_json(self.perturbations), PhysicsPerturbation)
         environment = shared(demo.task)
 
@@ -231,6 +243,7 @@ def _replay(
             ReplayJob(
                 trajectory_id,
                 row_of[trajectory_id].demo_id,
+                row_of[trajectory_id].demo_sha256,
                 row_of[trajectory_id].perturbations,
                 twin_of[row_of[trajectory_id].demo_id],
                 demos,

@@ -122,6 +122,7 @@ def _rebuild(
         job = ReplayJob(
             trajectory_id=planned["trajectory_id"],
             demo_id=planned["demo_id"],
+            demo_sha256=planned["demo_sha256"],
             perturbations=planned["perturbations"],
             twin=twin["trajectory_id"],
             demos=demos,
