@@ -19,6 +19,9 @@ from unittest.mock import patch
 
 os.environ |= {"LP_NUM_THREADS": "1"}
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import numpy as np
 
 from pipeline.config import load

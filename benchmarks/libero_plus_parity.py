@@ -22,12 +22,13 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-# Before NumPy, whose machine code it fixes: else one side would compute with other kernels than the other.
-from pipeline import gl, identity  # isort: skip
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
+# isort: split
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline import gl, identity
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.evaluation.episode import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import RUNNABLE, by_name

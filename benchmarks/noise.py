@@ -10,6 +10,9 @@ import math
 import time
 from collections.abc import Callable
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import zoom

@@ -13,6 +13,9 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+import pipeline  # before NumPy, whose machine code it fixes
+
+# isort: split
 import cv2
 import numpy as np
 

@@ -18,6 +18,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import numpy as np
 from rich.console import Console
 from rich.table import Table

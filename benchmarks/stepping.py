@@ -13,6 +13,9 @@ import json
 import time
 from statistics import median
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import numpy as np
 
 from pipeline.libero.demonstrations import StarterSource

@@ -8,6 +8,9 @@ import sys
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import mujoco
 import numpy as np
 

@@ -1,18 +1,16 @@
 """Perturbed robot fine-tuning data from LIBERO demonstrations.
 
-Importing this package fixes which machine code computes, so it must come before NumPy. OpenBLAS and NumPy choose theirs
-by the processor, and the last bits of a torque follow from that choice; a contact turns such bits into decimetres.
-Every x86 processor with AVX2 uses the code for AVX2 here, so that one demonstration has one trajectory everywhere.
+Importing this package fixes which machine code computes, so it must come before NumPy: see ``pipeline.machine_code``.
 
 It also fixes how much free memory a process keeps. Dask has its workers give back to the system every 64 KB that are
 free; where software renders, each frame may then ask for thousands of pages anew, up to a tenth of a worker's time.
 """
 
 import ctypes
-import os
 
-os.environ["OPENBLAS_CORETYPE"] = "Haswell"
-os.environ["NPY_DISABLE_CPU_FEATURES"] = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL"
+from pipeline.machine_code import fix
+
+fix()
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Numbers of glibc's malloc.h. What another C library has instead, it keeps as it is."""

@@ -8,8 +8,9 @@ fingerprint counts as missing. Four things go into it, and into those of all lay
   edit that changes neither, such as a new comment, leaves it alone, and no finished work is thrown away. The golden
   episodes of ``tests/golden.json`` fail when results change and the number does not.
 * ``PACKAGES``, the versions of what computes the layer.
-* the machine code that NumPy and OpenBLAS chose (see ``pipeline/__init__.py``), and the OpenGL device, which frames
-  are stored with.
+* the machine code that NumPy and OpenBLAS chose (see ``pipeline.machine_code``), and the OpenGL device, which frames
+  are stored with. Where it is not the fixed one, nothing has a fingerprint: every file of a run would count as another
+  version's, and what was stored would for all others.
 * the settings that the caller names, such as the quality of a JPEG.
 
 DVC asks for less: it runs a stage again when any file that the stage imports or reads has changed, even in a comment.
@@ -18,16 +19,12 @@ The stage then asks its store what is current, and makes only the rest.
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Iterable
 from functools import cache
-from importlib import import_module
 from importlib.metadata import version
-from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
+from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
 
 Layer = Literal["physics", "pixels", "encoding"]
@@ -64,6 +61,9 @@ def fingerprint(layer: Layer, *settings: object) -> str:
     Args:
         layer: the last layer of the file; those before it count as well.
         settings: JSON-serialisable, what else the bytes depend on.
+
+    Raises:
+        PipelineError: when NumPy computes with other machine code than is fixed.
     """
     return digest(_recipe(layer), *settings)[:16]
 
@@ -75,7 +75,7 @@ def _recipe(layer: Layer) -> list[object]:
     return [
         {each: RECIPES[each] for each in layers},
         _versions(packages),
-        machine_code(),
+        fixed_machine_code(),
     ]
 
 
@@ -85,25 +85,10 @@ def _versions(packages: Iterable[str]) -> dict[str, str]:
 
 @cache
 def machine() -> dict[str, str]:
-    """What a run should keep to from start to end, but for the recipes: package versions and machine code, by name."""
+    """What a run should keep to from start to end, but for the recipes: package versions and machine code, by name.
+
+    Raises:
+        PipelineError: when NumPy computes with other machine code than is fixed.
+    """
     names = [name for packages in PACKAGES.values() for name in packages]
-    return {**_versions(names), "machine code": machine_code()}
-
-
-@cache
-def machine_code() -> str:
-    """Which kernels OpenBLAS and NumPy compute with in this process, such as ``Haswell AVX2``."""
-    features = import_module("numpy._core._multiarray_umath").__cpu_features__
-    widest = next((name for name in ("AVX512_SKX", "AVX512F", "AVX2", "AVX") if features.get(name)), "baseline")
-    return f"{_openblas_kernel()} {widest}"
-
-
-def _openblas_kernel() -> str:
-    """The kernel of the OpenBLAS that NumPy's wheel brings; ``unknown`` for another build of NumPy."""
-    folder = Path(np.__file__).parent.parent / "numpy.libs"
-    for library in sorted(folder.glob("libscipy_openblas*")):
-        corename = getattr(ctypes.CDLL(str(library)), "scipy_openblas_get_corename64_", None)
-        if corename is not None:
-            corename.restype = ctypes.c_char_p
-            return str(corename().decode())
-    return "unknown"
+    return {**_versions(names), "machine code": fixed_machine_code()}

@@ -15,12 +15,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 if __name__ == "__main__":  # run as a script, from anywhere
     sys.path[:0] = [os.fspath(Path(__file__).parent.parent)]
 
-from pipeline import gl, identity
+from pipeline import gl, identity  # before NumPy, whose machine code this fixes
+
+# isort: split
+import numpy as np
+
 from pipeline.axes import PhysicsPerturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer
 from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.libero.demonstrations import StarterSource

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import runpy
 import shutil
 import subprocess
@@ -21,6 +22,7 @@ from PIL import Image
 from pipeline import gl
 from pipeline.config import ComputeConfig, RenderConfig
 from pipeline.errors import PipelineError
+from pipeline.machine_code import SETTINGS
 from pipeline.rendering.render import RenderJob
 from pipeline.run.cluster import Workplace
 from pipeline.run.compute import runner
@@ -129,23 +131,30 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
         shutil.copytree(REPOSITORY / name, edited / name, ignore=shutil.ignore_patterns("__pycache__"))
     with (edited / "pipeline" / "seeding.py").open("a") as file:
         file.write("# edited\n")
-    address = cluster((1, {}), (1, {"PYTHONPATH": str(edited)}), (2, {}))
+    # A worker has NumPy before it has this project: with the machine code that its environment asks for.
+    other = {"OPENBLAS_CORETYPE": "Sandybridge", "NPY_DISABLE_CPU_FEATURES": ""}
+    address = cluster((1, {}), (1, {"PYTHONPATH": str(edited)}), (2, {}), (1, other))
     # Every process has its own folder at this path.
     folder = Path("/proc/self/cwd") / "data"
     with pytest.raises(PipelineError) as caught, runner(ComputeConfig(cluster=address), folder):
         pass
     message = str(caught.value)
-    assert "3 of 3 workers" in message
+    assert "4 of 4 workers" in message
     assert f"does not see {folder}" in message
     assert "has code of pipeline " in message
     assert "runs 2 threads" in message
+    assert re.search(r"has machine code Sandybridge \w+, the run has Haswell AVX2", message)
+    assert f'OPENBLAS_CORETYPE="{SETTINGS["OPENBLAS_CORETYPE"]}"' in message
     assert "dask worker ADDRESS --nthreads 1" in message
     assert not list((tmp_path / "elsewhere").rglob("data"))
 
     from distributed import Client
 
     # As a worker finds out that joins when the work is under way.
-    with Client(address) as client, pytest.raises(PipelineError, match=r"does not see .* other packages or other code"):
+    with (
+        Client(address) as client,
+        pytest.raises(PipelineError, match=r"does not see .* other packages, code or machine code"),
+    ):
         client.submit(Workplace(Path.cwd(), folder / "token", "another setup").enter).result()
 
 

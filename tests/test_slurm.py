@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from pipeline.config import ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
+from pipeline.machine_code import machine_code
 from pipeline.run.compute import runner
 
 DEADLINE_S = 60.0
@@ -78,21 +79,24 @@ def asked(*command: str) -> str:
 
 
 def job_of(item: int) -> tuple[int, str, str]:
-    """In a worker: the item, the job that it runs in, and how many threads that may start."""
+    """In a worker: the item, the job that it runs in, how many threads that may start, and its machine code."""
     time.sleep(0.5)
-    return item, os.environ["SLURM_JOB_ID"], os.environ["LP_NUM_THREADS"]
+    return item, os.environ["SLURM_JOB_ID"], f"{os.environ['LP_NUM_THREADS']} {machine_code()}"
 
 
 @pytest.mark.slow
 def test_the_work_is_done_by_jobs_of_slurm_and_again_where_one_is_ended(slurm: Path, tmp_path: Path) -> None:
-    compute = ComputeConfig(cluster="slurm", workers=2, slurm=SlurmConfig(partition="cpu", memory_gb=0.9))
+    # A site may keep from jobs what importing this project has set where the run was started.
+    options = ("--export=PATH,PYTHONPATH,SLURM_CONF",)
+    asks = SlurmConfig(partition="cpu", memory_gb=0.9, options=options)
+    compute = ComputeConfig(cluster="slurm", workers=2, slurm=asks)
     with runner(compute, tmp_path / "data") as work:
         first = work(job_of, range(6), "first")
         asked("scancel", first[0][1])
         second = work(job_of, range(6), "second")
     assert [item for item, _, _ in first] == [item for item, _, _ in second] == list(range(6))
     assert len({job for _, job, _ in first}) == 2
-    assert {threads for _, _, threads in first} == {"1"}
+    assert {works_with for _, _, works_with in first} == {f"1 {machine_code()}"}
     ended = first[0][1]
     assert ended not in {job for _, job, _ in second}
     deadline = time.monotonic() + DEADLINE_S

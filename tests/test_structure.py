@@ -36,6 +36,7 @@ FLOORS = (
     "types",
     "arguments",
     "exit_status",
+    "machine_code",
     "errors",
 )
 """Rooms of ``pipeline`` and modules at its root, top to bottom: what stands above may import what stands below."""

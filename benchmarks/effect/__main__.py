@@ -23,6 +23,9 @@ from contextlib import contextmanager
 from multiprocessing import get_context
 from pathlib import Path
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import comparison_table
 from arms import chosen, provenance, write_small
 from experiment import Experiment, read

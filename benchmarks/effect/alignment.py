@@ -14,6 +14,9 @@ import argparse
 import json
 from pathlib import Path
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import numpy as np
 import pyarrow.parquet as pq
 from arms import provenance

@@ -22,6 +22,7 @@ from packaging.requirements import Requirement
 
 from pipeline.errors import PipelineError
 from pipeline.files import schema_file
+from pipeline.machine_code import SETTINGS, in_shell, machine_code
 from pipeline.seeding import digest
 
 Item = TypeVar("Item")
@@ -58,7 +59,7 @@ class Workplace:
 
         faults = [] if self.token.is_file() else [_not_shared(self)]
         if digest("setup", setup()) != self.setup:
-            faults.append("has other packages or other code than the run")
+            faults.append("has other packages, code or machine code than the run")
         faults += _crowded(get_worker().state.nthreads)
         if faults:
             raise _refusal(f"worker on {platform.node()}", faults)
@@ -85,11 +86,12 @@ class InPlace(Generic[Item, Result]):
 
 @cache
 def setup() -> dict[str, str]:
-    """What a result may depend on beside its input: versions of Python and the packages, and a digest of the code.
+    """What a result may depend on beside its input: versions of Python and the packages, code and machine code.
 
     A process keeps the code that it imported first, so this is found out once and not again.
     """
-    versions = {"Python": platform.python_version()}
+    # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
+    versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
         for name in (PACKAGE, *(Requirement(line).name for line in requires(PACKAGE) or [])):
             versions[name] = version(name)
@@ -162,9 +164,9 @@ def _refusal(where: str, faults: list[str]) -> PipelineError:
     return PipelineError(
         "; ".join(faults),
         where=where,
-        expected="workers that share the run's folders, packages and code, with one thread each",
+        expected="workers that share the run's folders, packages, code and machine code, with one thread each",
         remedy="mount the repository and its data at the same path everywhere, install the same requirements.lock, and "
-        "start the workers again with `dask worker ADDRESS --nthreads 1`",
+        f"start the workers again with `export {in_shell(SETTINGS)}; dask worker ADDRESS --nthreads 1`",
     )
 
 

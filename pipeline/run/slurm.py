@@ -11,6 +11,7 @@ from typing import Any
 
 from pipeline.config import ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
+from pipeline.machine_code import SETTINGS, in_shell
 
 LOGS = Path(".work") / "slurm"
 """Where a run's folder keeps what the jobs print."""
@@ -45,7 +46,8 @@ def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
         account=asked.account,
         walltime=asked.walltime,
         job_extra_directives=list(asked.options),
-        job_script_prologue=[f"export {name}=1" for name in ONE_THREAD],
+        # Not every site hands on the environment that a job is asked for in.
+        job_script_prologue=[f"export {in_shell(SETTINGS | dict.fromkeys(ONE_THREAD, '1'))}"],
         log_directory=str(logs),
         # SLURM watches memory itself.
         worker_extra_args=["--memory-limit", "0"],
