@@ -25,6 +25,9 @@ from pipeline.tables import read_table, write_table
 SCHEMA_FILE = schema_file("manifest.json")
 """Column names, types and meanings."""
 
+OWN_VERSION = "pipeline_version"
+"""The column for the version of this project, which is information: what is current, recipe numbers decide."""
+
 _TYPES = {"string": pa.string(), "int": pa.int64(), "bool": pa.bool_()}
 _SETTINGS = b"settings"
 

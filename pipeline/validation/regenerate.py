@@ -47,7 +47,8 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     Returns:
         JSON-serialisable: ``identical`` (None when no dataset lies there), ``reason`` (``kept``, or what the replay or
         the rendering came to this time), ``versions`` and ``gl_device`` where the manifest's are not those here, and
-        ``differs``, column to the steps or values that are not the same.
+        ``differs``, column to the steps or values that are not the same. This project's own version, which is in the
+        dataset too, makes no difference.
 
     Raises:
         PipelineError: when the manifest has no such kept episode, or its demonstration is not there or another.
@@ -66,9 +67,13 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), out, root)
     dataset = next(manifest_file.parent.glob(f"rlds/*/*/{row['rlds_shard']}"), None)
     stored = None if dataset is None else _Record.read(dataset, row["rlds_index"])
+    differs = _differences(stored.columns, rebuilt.columns) if stored and rebuilt else {}
+    other_version = differs.pop(METADATA + manifest.OWN_VERSION, None) is not None
     return {
         "episode_id": episode_id,
-        "identical": None if stored is None else rebuilt is not None and rebuilt.data == stored.data,
+        "identical": None
+        if stored is None
+        else rebuilt is not None and (rebuilt.data == stored.data or (other_version and not differs)),
         "reason": reason,
         "versions": {
             name: {"manifest": row[column], "here": here}
@@ -76,7 +81,7 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
             if row[column := manifest.version_column(name)] != here
         },
         "gl_device": {} if row["gl_device"] == device else {"manifest": row["gl_device"], "here": device},
-        "differs": _differences(stored.columns, rebuilt.columns) if stored and rebuilt else {},
+        "differs": differs,
     }
 
 
