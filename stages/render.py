@@ -1,24 +1,40 @@
-"""Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped."""
+"""Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped.
+
+Where frames are refused, it replays the reserves that take their place, as the stage replay does.
+"""
 
 from pipeline import gl
 from pipeline.config import Config
+from pipeline.files import read_json
+from pipeline.physics.replay import replay_plan
 from pipeline.rendering.render import render_plan
 from pipeline.run import plan
 from pipeline.run.compute import runner
-from pipeline.run.frame_store import FrameStore
+from pipeline.run.frame_store import FrameStore, shown_of
 from pipeline.run.machine import same_machine
+from pipeline.run.outcome import rejections
 from pipeline.run.stage import main
+from pipeline.run.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:
     print(gl.choose())
     same_machine(config.data, {"OpenGL device": gl.choose().device})
     rows = plan.read(config.data / "plan.parquet")
-    folder = config.data / "frames"
+    replayed = int(read_json(config.data / "replay.json")["replayed"])
+    trajectories = TrajectoryStore(config.data / "trajectories")
+    frames = FrameStore(config.data / "frames", config.render)
     with runner(config.compute, config.data, gl.Shared) as workers:
-        rendered = render_plan(rows, config, config.data / "trajectories", folder, workers)
-    FrameStore(folder, config.render).keep(rendered)
-    print(f"{len(rendered)} files of frames are in {folder}")
+        rejected: dict[str, str] | None = None
+        while (refused := rejections(rows, shown_of(frames.rows()))) != rejected:
+            rejected = refused
+            verdicts = replay_plan(rows, config.demos, config.replay, trajectories.root, workers, rejected)
+            rendered = render_plan(rows, config, trajectories.root, frames.root, workers)
+            frames.keep(rendered)
+    trajectories.keep(verdicts)
+    if further := len(verdicts) - replayed:
+        print(f"replayed {further} reserves, as frames before them were refused")
+    print(f"{len(rendered)} files of frames are in {frames.root}")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,8 @@ def run(config: Config) -> None:
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:
         verdicts = replay_plan(rows, config.demos, config.replay, folder, workers)
-    TrajectoryStore(folder).keep(verdicts)
+    # Of the reserves, those too that the stage render replayed because frames were refused.
+    TrajectoryStore(folder).keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
     (config.data / "replay.json").write_text(json.dumps({"replayed": len(verdicts), "kept": kept}) + "\n")
     print(f"replayed {len(verdicts)} trajectories, {kept} reach their goal")

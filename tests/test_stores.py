@@ -29,7 +29,7 @@ from pipeline.run.frame_store import FrameStore, shown_of
 from pipeline.run.sealed_file import sealed
 from pipeline.run.store import TABLE
 from pipeline.run.streams import Stream, streams_of
-from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
@@ -353,21 +353,34 @@ def test_a_rendering_that_is_given_up_is_dropped_with_its_reason_and_keeps_what_
     assert len(stored[twin[0].trajectory_id].streams) == 2, "the twin's own frames stay"
 
 
-def test_reserves_are_replayed_where_frames_may_be_rejected_after_all_physics(rows: list[plan.Row]) -> None:
+def test_a_reserve_is_replayed_once_frames_before_it_are_refused(rows: list[plan.Row]) -> None:
     start = RobotPerturbation(component="initial_joints", level=1, joint_offsets_rad=(0.01,) * 7)
-    both = [
+    first, second, third = (
         plan.Row(
-            **{**vars(row), "axis": "robot+light", "perturbations": to_json((start, NIGHT)), "trajectory_id": name}
+            **{**vars(without_twins(rows)[0]), "axis": "robot", "perturbations": to_json((start,)), "rank": rank}
+            | {"trajectory_id": name, "episode_id": name, "wanted": not rank}
         )
-        for row, name in zip(without_twins(rows), "ab", strict=True)
-    ]
-    assert [row.wanted for row in both] == [True, False]
-    assert plan.pending(both, {}) == ["a", "b"]
-    kept = {"a": Verdict(True, "kept"), "b": Verdict(True, "kept")}
-    assert [verdict.reason for verdict in plan.select(both, kept).values()] == ["kept", "reserve_not_needed"]
-    rejected = plan.select(both, kept, {both[0].episode_id: "too_dark"})
-    assert [verdict.reason for verdict in rejected.values()] == ["too_dark", "kept"]
-    assert plan.pending([row for row in both if row.wanted], verdicts_of({})) == ["a"]
+        for rank, name in enumerate("abc")
+    )
+    both, kept = [first, second, third], Verdict(True, "kept")
+    assert plan.pending(both, {}) == ["a"]
+    assert plan.pending(both, {"a": kept}) == []
+    assert plan.pending(both, {"a": kept}, {"a": "worker_lost"}) == ["b"]
+    assert plan.pending(both, {"a": kept, "b": kept}, {"a": "worker_lost", "b": "too_dark"}) == ["c"]
+    judged = plan.select(both, {"a": kept, "b": kept}, {"a": "worker_lost"})
+    assert [verdict.reason for verdict in judged.values()] == ["worker_lost", "kept", "reserve_not_needed"]
+
+
+def test_a_refusal_of_a_reserve_that_is_no_longer_needed_is_forgotten(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
+) -> None:
+    """As when the refused frames before it are deleted, to be tried again."""
+    store = FrameStore(tmp_path, config.render)
+    expected = render_plan(rows, config, replayed, tmp_path, loop)
+    store.keep(())
+    render_plan([replace(rows[2], wanted=True)], config, replayed, tmp_path, given_up)
+    assert outcome.rejections(rows, shown_of(store.rows())) == {rows[2].episode_id: "worker_lost"}
+    assert render_plan(rows, config, replayed, tmp_path, loop) == expected
 
 
 def test_a_file_has_the_same_bytes_whoever_still_holds_one_of_its_arrays(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
 from pipeline.axes.base import (
     Frozen,
-    Layer,
     Perturbation,
     PhysicsPerturbation,
     PixelPerturbation,
@@ -87,11 +86,6 @@ def axes_of(name: str) -> tuple[str, ...]:
     return tuple(sorted(axes, key=_PLACE.__getitem__))
 
 
-def layer_of(axis: str) -> Layer:
-    """The layer that an axis, by its name, changes."""
-    return kind_of(axis).layer
-
-
 def kind_of(axis: str) -> type[Perturbation]:
     """The perturbations of an axis, by its name; of several kinds the first."""
     return _KINDS[axis][0]
@@ -142,7 +136,6 @@ __all__ = [
     "from_json",
     "in_order",
     "kind_of",
-    "layer_of",
     "of_layer",
     "to_json",
 ]

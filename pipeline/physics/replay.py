@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -207,18 +207,30 @@ class ReplayJob:
 
 
 def replay_plan(
-    rows: Sequence[Row], demos: DemosConfig, config: ReplayConfig, folder: Path, run: Run
+    rows: Sequence[Row],
+    demos: DemosConfig,
+    config: ReplayConfig,
+    folder: Path,
+    run: Run,
+    rejected: Mapping[str, str] | None = None,
 ) -> dict[str, Verdict]:
     """Replay what the plan needs and ``folder`` does not hold yet; reserves only where a candidate failed.
 
     The twins come first, because tracking follows them.
 
+    Args:
+        rows: the plan.
+        demos, config: sections of the run's configuration.
+        folder: of the trajectory store.
+        run: where the work is done.
+        rejected: episode id to the reason why its frames were rejected, as far as frames were made.
+
     Returns:
         Trajectory id to verdict, for every trajectory that was needed.
     """
     twins = [row for row in rows if row.role == "twin"]
-    verdicts = _replay(twins, twins, {}, demos, config, folder, run)
-    verdicts = _replay(rows, twins, verdicts, demos, config, folder, run)
+    verdicts = _replay(twins, twins, {}, demos, config, folder, run, rejected)
+    verdicts = _replay(rows, twins, verdicts, demos, config, folder, run, rejected)
     # The table tells of what was just replayed, so that whoever comes next opens no file for it.
     TrajectoryStore(folder).refresh()
     return verdicts
@@ -232,11 +244,12 @@ def _replay(
     config: ReplayConfig,
     folder: Path,
     run: Run,
+    rejected: Mapping[str, str] | None,
 ) -> dict[str, Verdict]:
     row_of = {row.trajectory_id: row for row in rows}
     twin_of = {row.demo_id: row.trajectory_id for row in twins}
     stored = verdicts_of(TrajectoryStore(folder).refresh())
-    while needed := pending(rows, verdicts):
+    while needed := pending(rows, verdicts, rejected):
         verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed if trajectory_id in stored}
         # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
         jobs = [

@@ -26,7 +26,7 @@ from pipeline.rendering.last_scene import LastScene, scene_of_process
 from pipeline.rendering.sight import CAMERA, Sight
 from pipeline.run.compute import LOST, Expendable, Run
 from pipeline.run.frame_store import FrameStore, Rendered, file_name, joined, shown_of
-from pipeline.run.outcome import rejections, replayed
+from pipeline.run.outcome import rejections
 from pipeline.run.plan import Row, select
 from pipeline.run.streams import Stream, streams_of
 from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
@@ -207,17 +207,18 @@ def _scene(stream: Stream, textures: bool = True) -> str:
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, run: Run) -> set[str]:
     """Render the streams of every kept episode that ``folder`` does not hold yet.
 
-    Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing.
+    Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing that
+    can be made from the trajectories that are there.
 
     Returns:
         The files of ``folder`` that the plan needs: the same ones whatever was rendered before.
 
     Raises:
-        PipelineError: when a trajectory is missing, or rendering leaves the same work undone.
+        PipelineError: when rendering leaves the same work undone.
     """
     device = gl.choose().device
     store = FrameStore(folder, config.render)
-    judged = verdicts_of(replayed(rows, trajectories))
+    judged = verdicts_of(TrajectoryStore(trajectories).rows())
     steps = {row.trajectory_id: row.demo_steps for row in rows}
     demos = {row.trajectory_id: (row.suite, row.task, row.demo_id) for row in rows}
     planned: dict[str, dict[str, Stream]] = {row.trajectory_id: {} for row in rows}
@@ -233,8 +234,9 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
         outcome = select(rows, judged, rejected)
         needed: dict[str, set[str]] = {}
         for row in rows:
+            verdict = outcome[row.episode_id]
             # A rejected stream stays needed: without it, its episode would be tried again.
-            if outcome[row.episode_id].kept or row.episode_id in rejected:
+            if verdict.kept or verdict.reason == rejected.get(row.episode_id):
                 needed.setdefault(row.trajectory_id, set()).update(shown[row.episode_id])
         files = {
             file_name(trajectory_id, [stream.stream_id for stream in portion]): (trajectory_id, portion)

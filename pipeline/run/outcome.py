@@ -53,15 +53,24 @@ class Outcome:
         return frames.made_by, frames.device, frames.replay_mode
 
 
-def replayed(rows: Sequence[plan.Row], folder: Path) -> dict[str, dict[str, Any]]:
+def replayed(
+    rows: Sequence[plan.Row], folder: Path, rejected: Mapping[str, str] | None = None
+) -> dict[str, dict[str, Any]]:
     """Trajectory id to its row in the table of replays.
+
+    Args:
+        rows: the plan.
+        folder: of the trajectory store.
+        rejected: episode id to the reason why its frames were rejected.
 
     Raises:
         PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
     """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
-    _refuse_missing([store.path(name) for name in plan.pending(rows, verdicts_of(trajectories))], "replay")
+    needed = plan.pending(rows, verdicts_of(trajectories), rejected)
+    # What takes the place of refused frames, only the stage render replays.
+    _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
 
 
@@ -88,10 +97,11 @@ def read(config: Config) -> Outcome:
         PipelineError: when a trajectory or a frame that the plan needs is not there, or can no longer be read.
     """
     rows = plan.read(config.data / "plan.parquet")
-    trajectories = replayed(rows, config.data / "trajectories")
     store = FrameStore(config.data / "frames", config.render)
     frames = shown_of(store.rows())
-    judged = plan.select(rows, verdicts_of(trajectories), rejections(rows, frames))
+    rejected = rejections(rows, frames)
+    trajectories = replayed(rows, config.data / "trajectories", rejected)
+    judged = plan.select(rows, verdicts_of(trajectories), rejected)
     missing = dict.fromkeys(
         store.folder(row.trajectory_id)
         for row in rows
@@ -111,5 +121,5 @@ def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
         raise PipelineError(
             f"what the plan needs is missing, damaged or not current in {len(missing)} places, such as this one",
             where=missing[0],
-            remedy=f"run the {stage} stage again, it makes only those",
+            remedy=f"call `dvc repro`, or run the {stage} stage again: it makes only those",
         )

@@ -18,11 +18,9 @@ from pipeline.axes import (
     PhysicsPerturbation,
     TextPerturbation,
     in_order,
-    layer_of,
     of_layer,
     to_json,
 )
-from pipeline.axes.base import Layer
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry
@@ -230,28 +228,28 @@ def read(path: Path) -> list[Row]:
     return [Row(*row) for row in zip(*columns.values(), strict=True)]
 
 
-def pending(rows: Sequence[Row], verdicts: Mapping[str, Verdict]) -> list[str]:
+def pending(
+    rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
+) -> list[str]:
     """The trajectories that have to be replayed next, in plan order, given what is known so far.
 
     Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
+
+    Args:
+        rows: the plan.
+        verdicts: trajectory id to its verdict.
+        rejected: episode id to the reason why its frames were rejected.
     """
     wanted: dict[str, None] = {}
     for group in _groups(rows):
-        # Frames are made after all physics: where they may be rejected, every reserve must have been replayed by then.
-        need = len(group) if _frames_may_be_rejected(group[0]) else sum(row.wanted for row in group)
+        need = sum(row.wanted for row in group)
         for row in group:
             verdict = verdicts.get(row.trajectory_id)
-            if need and (verdict is None or verdict.kept):
+            if need and (verdict is None or (verdict.kept and row.episode_id not in (rejected or {}))):
                 need -= 1
                 if verdict is None:
                     wanted[row.trajectory_id] = None
     return list(wanted)
-
-
-def _frames_may_be_rejected(row: Row) -> bool:
-    """Whether a row has physics of its own and also a change of its scene's looks that may turn out black or white."""
-    layers = {layer_of(axis) for axis in row.axis.split("+") if axis != "clean"}
-    return {Layer.PHYSICS, Layer.RENDER} <= layers
 
 
 def select(

@@ -31,7 +31,7 @@ class TrajectoryStore(Store):
     """
 
     def __init__(self, root: Path):
-        super().__init__(root, fingerprint("physics"), "replay", _COLUMNS, _describe)
+        super().__init__(root, fingerprint("physics"), "render", _COLUMNS, _describe)
 
     def save(self, trajectory: Trajectory) -> None:
         attributes = {

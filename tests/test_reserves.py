@@ -1,0 +1,120 @@
+"""Where frames are refused, a reserve takes the place of the episode, also one that has to be replayed first."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import BOWL, dvc, in_a_clone, tiny_config
+from kills import contents
+
+from pipeline import gl
+from pipeline.config import Config
+from pipeline.libero.tasks import find_task
+from pipeline.rendering.render import RenderJob
+from pipeline.run import manifest, plan
+from pipeline.run.streams import streams_of
+
+AXES = ("layout", "pose", "robot")
+"""Each of their episodes has a replay of its own."""
+
+SEED = 3
+"""Under it, the camera of the first candidate of layout and camera together shows nothing of the added object."""
+
+
+def reserved(demos: Path, compute: dict[str, object]) -> dict[str, object]:
+    """One episode of each, and two in reserve; weak changes, so that a demonstration's last half second succeeds."""
+    return tiny_config(demos) | {
+        "demos": {"source": "hdf5", "root": str(demos), "tasks": [f"{BOWL.suite}/{BOWL.name}"]},
+        "plan": {
+            "seed": SEED,
+            "axes": {
+                "layout": {"levels": [1]},
+                "pose": {"components": ["receptacle"], "step_m": 0.0005, "step_deg": 0.1},
+                "robot": {"norm_rad": [0.002] * 5},
+                "camera": {"levels": [5], "distance": None, "spherical": None},
+            },
+            "episodes": dict.fromkeys((*AXES, "layout+camera"), 1),
+            "reserve": 2.0,
+        },
+        "compute": compute,
+    }
+
+
+def refuse_frames_of_first_candidates(clone: Path, fields: dict[str, object]) -> None:
+    """Store what a render stage stores where no worker survives the frames of the first candidates of ``AXES``."""
+    config = Config.model_validate(fields)
+    data = clone / config.data
+    for row in plan.read(data / "plan.parquet"):
+        if row.axis in AXES and row.rank == 0:
+            streams = tuple(streams_of(row.perturbations).values())
+            task, folders = find_task(row.suite, row.task), (data / "trajectories", data / "frames")
+            RenderJob(
+                row.trajectory_id, task, streams, row.demo_steps, *folders, config.render, gl.choose().device
+            ).lost()
+
+
+def made(clone: Path, target: str, *options: str) -> list[str]:
+    """Run a DVC target; returns the stages that were started."""
+    done = dvc(clone, "repro", target, *options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    prefix = "Running stage '"
+    return [line.removeprefix(prefix)[:-2] for line in done.stdout.splitlines() if line.startswith(prefix)]
+
+
+def remains(rows: list[dict[str, Any]]) -> dict[str, list[str]]:
+    """Axis to the reasons of its candidates, by rank."""
+    of_axis: dict[str, list[str]] = {}
+    for row in sorted(rows, key=lambda row: row["rank"]):
+        of_axis.setdefault(row["axis"], []).append(row["reason"])
+    return of_axis
+
+
+@pytest.mark.slow
+def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_nothing(
+    short_demos: Path, tmp_path: Path
+) -> None:
+    clone = tmp_path / "clone"
+    fields = reserved(short_demos, {"cluster": "loop"})
+    in_a_clone(fields, clone)
+    made(clone, "replay")
+    replayed = set((clone / "data/tiny/trajectories").glob("*.h5"))
+    assert len(replayed) == 5, "the twin and the first candidates"
+    refuse_frames_of_first_candidates(clone, fields)
+    made(clone, "validate")
+    rows = manifest.read(clone / "data/tiny/manifest.parquet")
+    lost = ["worker_lost", "kept", "reserve_not_needed"]
+    unseen = ["added_objects_not_seen", "kept", "reserve_not_needed"]
+    assert remains(rows) == {"clean": ["kept"], **dict.fromkeys(AXES, lost), "layout+camera": unseen}
+    exported = Counter(row["axis"] for row in rows if row["rlds_shard"] and row["lerobot_episode_index"] is not None)
+    assert exported == {"clean": 1, "layout+camera": 1, **dict.fromkeys(AXES, 1)}
+    validation = json.loads((clone / "data/tiny/validation.json").read_text())
+    assert not any(found["findings"] for found in validation.values())
+    before = contents(clone)
+
+    assert made(clone, "validate") == ["inputs"]
+    assert contents(clone) == before
+
+    # As a kill leaves it, after the refusals were stored and before the reserves had their frames: one of these has no
+    # trajectory either. Processes go on where a loop stopped.
+    reserves = sorted(set((clone / "data/tiny/trajectories").glob("*.h5")) - replayed)
+    assert len(reserves) == 4
+    reserves[0].unlink()
+    for reserve in reserves:
+        for file in (clone / "data/tiny/frames" / reserve.stem).iterdir():
+            file.unlink()
+    (clone / "data/tiny/frames/index.parquet").unlink()
+    file = clone / "configs/tiny.yaml"
+    file.write_text(file.read_text().replace("cluster: loop", "cluster: local\n  workers: 2"))
+    made(clone, "validate")
+    found = contents(clone)
+    assert {name: digest for name, digest in found.items() if name != "configs/tiny.yaml"} == {
+        name: digest for name, digest in before.items() if name != "configs/tiny.yaml"
+    }
+
+    # A replay stage that starts again, as after an edit of its code, leaves the reserves to the stage that needs them.
+    made(clone, "replay", "--force", "--single-item")
+    assert all(reserve.exists() for reserve in reserves)
