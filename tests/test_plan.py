@@ -10,7 +10,8 @@ from conftest import read_with_flipped_bits
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.axes import Axes, from_json
+from pipeline.axes import Axes, from_json, to_json
+from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis, deal
 from pipeline.axes.noise import NoiseAxis
@@ -158,6 +159,29 @@ def test_an_exhausted_axis_is_said_and_planned_as_far_as_it_goes() -> None:
     assert texts == bank, "every rewrite once"
     assert plan.shortage(rows, wanted) == {"language": 300 - len(bank)}
     assert plan.shortage(plan.make(entries(), config(), REPLAY, NO_TESTS), config()) == {}
+
+
+def test_a_demonstration_that_has_no_more_draws_leaves_the_places_to_the_others() -> None:
+    """The last different draws are found by chance: of 60, one demonstration finds more of them than another."""
+    few = BackgroundAxis(components=("surface",), sources=("libero",))
+    wanted = config(axes=Axes(background=few), episodes={"background": 2000}, reserve=0.0)
+    demos = entries()
+    drawn = {
+        demo.demo_id: {
+            to_json(draw)
+            for draw in plan.draws_of("background", (few,), demo.demo_id, demo.task, wanted.seed, NO_TESTS)
+        }
+        for demo in demos
+    }
+    of_task = {task.name: {len(drawn[demo.demo_id]) for demo in demos if demo.task == task} for task in TASKS}
+    assert any(len(numbers) > 1 for numbers in of_task.values()), "some end before others of their task"
+    rows = [row for row in plan.make(demos, wanted, REPLAY, NO_TESTS) if row.role == "perturbed"]
+    assert {name: {row.perturbations for row in rows if row.demo_id == name} for name in drawn} == drawn
+    for task in TASKS:
+        assert [row.rank for row in rows if row.task == task.name] == list(
+            range(sum(r.task == task.name for r in rows))
+        )
+    assert plan.shortage(rows, wanted) == {"background": 2000 - sum(map(len, drawn.values()))}
 
 
 def test_draws_that_overlap_with_a_test_task_are_drawn_anew() -> None:

@@ -129,15 +129,23 @@ def _candidates(
 ) -> Iterator[Row]:
     """A task's candidates: every demonstration's first variant, then every second one, and so on.
 
-    There are fewer than wanted when no more different draws are left that keep clear of the test set.
+    A demonstration of which no more different draws are left that keep clear of the test set is passed over; there are
+    fewer candidates than wanted when none is left of any.
     """
-    draws = [draws_of(name, axes, demo.demo_id, demo.task, plan.seed, test) for demo in group]
-    for rank in range(wanted + ceil(wanted * plan.reserve)):
-        variant, number = divmod(rank, len(group))
-        perturbations = next(draws[number], None)
-        if perturbations is None:
+    left = {demo: draws_of(name, axes, demo.demo_id, demo.task, plan.seed, test) for demo in group}
+    rank, candidates = 0, wanted + ceil(wanted * plan.reserve)
+    for variant in count():
+        for demo, draws in [*left.items()]:
+            if rank == candidates:
+                return
+            perturbations = next(draws, None)
+            if perturbations is None:
+                del left[demo]
+                continue
+            yield _row(demo, perturbations, plan.seed, variant, rank, rank < wanted, replay)
+            rank += 1
+        if not left:
             return
-        yield _row(group[number], perturbations, plan.seed, variant, rank, rank < wanted, replay)
 
 
 def draws_of(
