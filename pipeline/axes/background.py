@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, RenderPerturbation
+from pipeline.axes.base import Axis, Frozen, RenderPerturbation, Share
 from pipeline.catalogue import textures
 from pipeline.catalogue.texture_sources import Source, Texture
 from pipeline.errors import PipelineError
@@ -75,7 +75,7 @@ class BackgroundPerturbation(RenderPerturbation):
     axis: Literal["background"] = "background"
     component: Component
     coverings: tuple[Covering, ...]
-    colour_scale: float = Field(ge=0.0, le=1.0)
+    colour_scale: Share
 
     views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
     fields: ClassVar[tuple[str, ...]] = ("tex_data",)
@@ -126,8 +126,8 @@ class BackgroundAxis(Axis):
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("theme", "surface")
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")
-    image_share: float = Field(default=0.3, ge=0.0, le=1.0)
-    colour_scale: tuple[float, float, float, float, float] = (0.2, 0.4, 0.6, 0.8, 1.0)
+    image_share: Share = 0.3
+    colour_scale: tuple[Share, Share, Share, Share, Share] = (0.2, 0.4, 0.6, 0.8, 1.0)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
         component = self.components[rng.integers(len(self.components))]

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,17 +216,23 @@ class PhysicsPerturbation(Perturbation):
         raise NotImplementedError
 
 
-def _ordered(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+Number = TypeVar("Number", bound=float)
+
+
+def _ordered(intervals: tuple[tuple[Number, Number], ...]) -> tuple[tuple[Number, Number], ...]:
     if not intervals or any(low > high for low, high in intervals):
         raise ValueError(f"expected one or more [low, high] with low <= high, got {[list(i) for i in intervals]}")
     return intervals
 
 
-Intervals = Annotated[tuple[tuple[float, float], ...], AfterValidator(_ordered)]
+Intervals = Annotated[tuple[tuple[Number, Number], ...], AfterValidator(_ordered)]
 """A union of closed intervals, written ``[[low, high], ...]``: ranges with the test set's values cut out."""
 
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Degrees = Annotated[float, Field(ge=-180.0, le=180.0)]
 
-def draw(rng: np.random.Generator, intervals: Intervals) -> float:
+
+def draw(rng: np.random.Generator, intervals: Intervals[float]) -> float:
     """One number, uniform over the union of ``intervals`` and rounded to four decimals (as it will be recorded)."""
     lengths = [high - low for low, high in intervals]
     at = rng.uniform(0.0, sum(lengths))

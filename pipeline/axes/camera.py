@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from pipeline.axes.base import Axis, Frozen, Intervals, RenderPerturbation, draw
+from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, RenderPerturbation, draw
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -26,6 +26,9 @@ ORBIT_CENTRE_M = np.array([0.0, 0.0, 0.8])
 STEEPEST_DEG = 60.5
 """How far the study's agent view, the steepest of the five arenas, stands above the orbit centre's horizon. There a
 degree of azimuth spans the least of the sphere, so what is clear of the test cameras there is clear in every arena."""
+
+NEAREST = 0.01
+"""The least multiple of the distance that can be asked for; draws are recorded with four decimals."""
 
 
 class CameraPerturbation(RenderPerturbation):
@@ -130,19 +133,20 @@ def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
     return _embed(*distinct.T), which.reshape(-1)
 
 
-def _positive(intervals: Intervals) -> Intervals:
-    if any(low <= 0 for low, _ in intervals):
-        raise ValueError("a distance is a positive multiple of the nominal one")
+def _positive(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+    if any(low < NEAREST for low, _ in intervals):
+        raise ValueError(f"a distance is a positive multiple of the nominal one, {NEAREST} or more")
     return intervals
 
 
-Scales = Annotated[Intervals, AfterValidator(_positive)]
+Scales = Annotated[Intervals[Annotated[float, Field(le=10.0)]], AfterValidator(_positive)]
 
-ByLevel = tuple[Intervals, Intervals, Intervals, Intervals, Intervals]
+Angles = Intervals[Degrees]
+ByLevel = tuple[Angles, Angles, Angles, Angles, Angles]
 """What to draw from at each level, weakest first."""
 
 
-def _both_ways(low: float, high: float) -> Intervals:
+def _both_ways(low: float, high: float) -> Angles:
     return ((-high, -low), (low, high))
 
 
@@ -168,7 +172,7 @@ class SphericalRange(Frozen):
         _both_ways(45.0, 60.0),
         _both_ways(60.0, 75.0),
     )
-    elevation_deg: Intervals = ((-2.0, 17.0),)
+    elevation_deg: Angles = ((-2.0, 17.0),)
 
 
 class OrientationRange(Frozen):
@@ -202,9 +206,9 @@ class AsideRange(Frozen):
         turn_deg: angle of a turn in place, in any direction.
     """
 
-    elevation_deg: Intervals = ((-8.0, -5.1), (5.1, 9.9))
+    elevation_deg: Angles = ((-8.0, -5.1), (5.1, 9.9))
     distance_scale: Scales = ((0.87, 0.914), (1.094, 1.18))
-    turn_deg: Intervals = ((5.1, 8.0),)
+    turn_deg: Angles = ((5.1, 8.0),)
 
     def draw(self, rng: np.random.Generator, kind: Aside) -> dict[str, float]:
         """The parameters of one kind of change."""

@@ -12,14 +12,15 @@ from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field
 
 from pipeline.axes.base import Frozen
 from pipeline.jit import compiled
 from pipeline.types import Floats, Frame
 
 Component = Literal["motion", "gaussian", "zoom", "fog", "glass"]
-AboveOne = Annotated[float, Field(gt=1)]
+SigmaPx = Annotated[float, Field(ge=0.1, le=100.0)]
+"""Of a Gaussian: with less nothing changes, with more all of a frame has one colour."""
 Pixels = NDArray[np.float32]
 Samples = tuple[NDArray[np.intp], Floats]
 """Where to sample an axis: (N,) lower neighbours and (N,) fractions of the way to the next pixel."""
@@ -63,8 +64,8 @@ class Motion(Frozen):
 
     component: ClassVar[Component] = "motion"
     strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
-    radius_px: PositiveInt
-    sigma_px: PositiveFloat
+    radius_px: Annotated[int, Field(ge=1, le=100)]
+    sigma_px: SigmaPx
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         height, width, _ = frame.shape
@@ -86,7 +87,7 @@ class Gaussian(Frozen):
 
     component: ClassVar[Component] = "gaussian"
     strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
-    sigma_px: PositiveFloat
+    sigma_px: SigmaPx
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         return _to_frame(_gaussian_blur(frame / 255, self.sigma_px))
@@ -123,8 +124,8 @@ class Zoom(Frozen):
 
     component: ClassVar[Component] = "zoom"
     strength: ClassVar[tuple[str, float]] = ("max_scale", 1)
-    max_scale: AboveOne
-    copies: Annotated[int, Field(ge=2)]
+    max_scale: Annotated[float, Field(gt=1.0, le=10.0)]
+    copies: Annotated[int, Field(ge=2, le=100)]
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         height, width, _ = frame.shape
@@ -166,8 +167,8 @@ class Fog(Frozen):
 
     component: ClassVar[Component] = "fog"
     strength: ClassVar[tuple[str, float]] = ("density", 0)
-    density: PositiveFloat
-    roughness_decay: AboveOne
+    density: Annotated[float, Field(ge=0.01, le=100.0)]
+    roughness_decay: Annotated[float, Field(gt=1.0, le=10.0)]
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         height, width, _ = frame.shape
@@ -201,9 +202,9 @@ class Glass(Frozen):
 
     component: ClassVar[Component] = "glass"
     strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
-    sigma_px: PositiveFloat
-    delta_px: PositiveInt
-    passes: PositiveInt
+    sigma_px: SigmaPx
+    delta_px: Annotated[int, Field(ge=1, le=100)]
+    passes: Annotated[int, Field(ge=1, le=20)]
 
     def apply(self, frame: Frame, rng: np.random.Generator) -> Frame:
         shape = (self.passes, *frame.shape[:2], 2)

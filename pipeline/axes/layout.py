@@ -84,7 +84,7 @@ class LayoutAxis(Axis):
     """
 
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
-    area_m2: float = Field(default=0.12, gt=0.0)
+    area_m2: float = Field(default=0.12, gt=0.0, le=10.0)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LayoutPerturbation:
         level = self.draw_level(rng)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
-from pipeline.axes.base import Axis, Frozen, Intervals, Level, RenderPerturbation, draw
+from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, Level, RenderPerturbation, Share, draw
 from pipeline.libero import bddl
 from pipeline.types import Floats, Frame, Task
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 Property = Literal["diffuse", "direction", "specular", "shadows"]
 Component = Literal["diffuse", "direction", "specular", "shadows", "combined"]
+Multiple = Annotated[float, Field(ge=0.0, le=100.0)]
 
 SHADOWED_DIFFUSE, SHADOWED_SPECULAR = 0.7, 0.5
 """Most light that lamps with shadows may add up to. Without shadows all lamps are drawn in one pass, which cuts their
@@ -121,12 +122,12 @@ class LightRange(Frozen):
         fill_scale: share of the light that reaches into shadows.
     """
 
-    brightness_scale: Intervals
-    saturation: Intervals
-    specular_scale: Intervals
-    orbit_deg: Intervals
-    tilt_deg: Intervals
-    fill_scale: Intervals
+    brightness_scale: Intervals[Multiple]
+    saturation: Intervals[Share]
+    specular_scale: Intervals[Multiple]
+    orbit_deg: Intervals[Degrees]
+    tilt_deg: Intervals[Degrees]
+    fill_scale: Intervals[Share]
 
 
 def _range(

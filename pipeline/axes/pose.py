@@ -13,7 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, PositiveFloat
+from pydantic import Field
 
 from pipeline.axes.base import Axis, PhysicsPerturbation, on_task
 from pipeline.axes.scene import ScenePerturbation, draw_scene
@@ -174,8 +174,8 @@ class PoseAxis(Axis):
     """
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("target",)
-    step_m: PositiveFloat = 0.016
-    step_deg: PositiveFloat = 4.0
+    step_m: float = Field(default=0.016, ge=0.0001, le=0.2)
+    step_deg: float = Field(default=4.0, ge=0.01, le=36.0)
 
     def applies(self, task: Task) -> bool:
         """Whether there is something to move: some tasks only open, close or turn what stays where it is."""

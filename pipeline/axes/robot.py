@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import PositiveFloat
+from pydantic import Field
 
 from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation
 from pipeline.errors import RefusedError
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pipeline.testset.benchmark import TestSet
 
 Joints = tuple[float, float, float, float, float, float, float]
+Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
 
 HOME_RAD = np.array([0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4])
 """(7,) where LIBERO's reset puts the arm, before noise; LIBERO-Plus adds its test offsets to it."""
@@ -108,7 +109,7 @@ class RobotAxis(Axis):
         norm_rad: the norm of the offset at each level; the defaults are the benchmark's.
     """
 
-    norm_rad: tuple[PositiveFloat, PositiveFloat, PositiveFloat, PositiveFloat, PositiveFloat] = (
+    norm_rad: tuple[Norm, Norm, Norm, Norm, Norm] = (
         0.1,
         0.2,
         0.3,
