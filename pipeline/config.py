@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 from pipeline.axes import AnyAxis, Axes, axes_of
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
-from pipeline.export_config import Count, ExportConfig
+from pipeline.export_config import Count, ExportConfig, known_to_oft
 from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import select_tasks
 from pipeline.types import Extra
@@ -180,6 +180,16 @@ class Config(Frozen):
     render: RenderConfig
     export: ExportConfig
     compute: ComputeConfig = ComputeConfig()
+
+    @field_validator("export")
+    @classmethod
+    def _known_to_oft(cls, export: ExportConfig) -> ExportConfig:
+        if not known_to_oft(export.rlds.name):
+            raise ValueError(
+                f"export.rlds.name {export.rlds.name!r} would be read with another robot's constants and cameras by "
+                "OpenVLA-OFT, which goes by the name; expected a name with libero and without aloha in it"
+            )
+        return export
 
     @property
     def data(self) -> Path:

@@ -2,13 +2,45 @@
 
 from __future__ import annotations
 
+from itertools import count
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from pipeline.errors import PipelineError
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 """More than anybody has a use for would fill memory before anything is said."""
-Share = Annotated[float, Field(ge=0.0, le=0.5)]
+
+
+def held_out(share: float, demonstrations: int) -> int:
+    """How many of a task's demonstrations a share holds out: rounded, a half to the even number; never the only one."""
+    return round(share * demonstrations) if demonstrations > 1 else 0
+
+
+def too_few(share: float, where: str) -> PipelineError:
+    """The error that no task has enough demonstrations for a share above 0."""
+    least = next(number for number in count(max(2, int(0.5 / share))) if held_out(share, number))
+    return PipelineError(
+        f"no task has enough demonstrations to hold {share:g} of them out",
+        where=where,
+        expected=f"{least} or more demonstrations of a task",
+        remedy="use more demonstrations, a larger share, or 0",
+    )
+
+
+def known_to_oft(name: str) -> bool:
+    """Whether OpenVLA-OFT, which goes by the name, reads a set with LIBERO's constants and cameras."""
+    return "libero" in name and "aloha" not in name
+
+
+def _of_some(share: float) -> float:
+    if 0 < share < 0.001:
+        raise ValueError("expected 0, or 0.001 to 0.5")
+    return share
+
+
+Share = Annotated[float, Field(ge=0.0, le=0.5), AfterValidator(_of_some)]
 
 
 class _Frozen(BaseModel):
@@ -48,3 +80,17 @@ class LeRobotConfig(_Frozen):
 class ExportConfig(_Frozen):
     rlds: RldsConfig
     lerobot: LeRobotConfig
+
+    def refuse_too_few(self, demonstrations: int) -> None:
+        """Refuse a validation split that nothing could be in.
+
+        Args:
+            demonstrations: of the task that has most of them.
+
+        Raises:
+            PipelineError: when a share holds none of them out.
+        """
+        for name in ExportConfig.model_fields:
+            share: float = getattr(self, name).validation
+            if share and not held_out(share, demonstrations):
+                raise too_few(share, f"export.{name}.validation")

@@ -13,6 +13,7 @@ def run(config: Config) -> None:
     for problem in index.problems:
         print(f"left out: {problem.error}", file=sys.stderr)
     rows = plan.make(index.entries, config.plan, config.replay, benchmark.load())
+    config.export.refuse_too_few(plan.demonstrations(rows))
     for axis, number in plan.shortage(rows, config.plan).items():
         print(
             f"{axis}: {number} of {config.plan.episodes[axis]} wanted episodes cannot be planned, as no more "

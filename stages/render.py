@@ -21,6 +21,8 @@ def run(config: Config) -> None:
     print(gl.choose())
     same_machine(config.data, {"OpenGL device": gl.choose().device})
     rows = plan.read(config.data / "plan.parquet")
+    # The configuration may be another one since the plan was made.
+    config.export.refuse_too_few(plan.demonstrations(rows))
     replayed = int(read_json(config.data / "replay.json")["replayed"])
     trajectories = TrajectoryStore(config.data / "trajectories")
     frames = FrameStore(config.data / "frames", config.render)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from http.server import ThreadingHTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import pytest
 import yaml
@@ -168,7 +168,7 @@ def write_short_demos(whole: Mapping[Task, Trajectory], root: Path) -> None:
         hdf5.write(root / task.suite / f"{task.name}_demo.hdf5", task, recordings)
 
 
-def tiny_config(demos: Path) -> dict[str, object]:
+def tiny_config(demos: Path) -> dict[str, Any]:
     """A configuration of a whole run on the short demonstrations; tests change what they are about."""
     return {
         "name": "tiny",

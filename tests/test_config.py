@@ -75,6 +75,11 @@ def test_schema_file_is_that_of_the_code() -> None:
         ({"wind": {}}, ("plan", "axes"), "plan.axes.wind: Extra inputs"),
         ("/tmp", ("demos", "root"), "root goes with source: hdf5"),
         ("carrier pigeon", ("compute",), "compute"),
+        ("my_set", ("export", "rlds", "name"), "export.rlds.name"),
+        ("libero_aloha", ("export", "rlds", "name"), "a name with libero and without aloha in it"),
+        (0.6, ("export", "rlds", "validation"), "export.rlds.validation: Input should be less than or equal to 0.5"),
+        (1e-320, ("export", "lerobot", "validation"), "export.lerobot.validation"),
+        ({"background": {"colour_scale": [0.2, 0.4, 0.6, 0.8, 2.0]}}, ("plan", "axes"), "colour_scale.4"),
     ],
 )
 def test_faults_name_file_and_field(tmp_path: Path, value: Any, keys: tuple[str, ...], message: str) -> None:

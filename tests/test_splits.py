@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tensorflow_datasets as tfds
+import yaml
+from conftest import REPOSITORY, link_testset, tiny_config
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
@@ -38,8 +43,43 @@ def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
     sides = [{DEMOS[episode_id] for episode_id in ids} for ids in splits.values()]
     assert not sides[0] & sides[1]
     assert episodes.by_split(0.0) == {"train": IDS}
-    with pytest.raises(PipelineError, match=r"(?s)no task has enough demonstrations.*5 or more"):
+    with pytest.raises(PipelineError, match=r"(?s)no task has enough demonstrations.*6 or more"):
         episodes.by_split(0.1)
+
+
+@pytest.mark.parametrize("share", [0.001, 0.01, 0.05, 0.07, 0.1, 0.125, 0.15, 0.2, 0.3, 1 / 3, 0.34, 0.35, 0.5])
+def test_as_many_demonstrations_as_a_refusal_asks_for_are_enough_and_one_fewer_is_not(share: float) -> None:
+    def splits(demonstrations: int) -> dict[str, list[str]]:
+        ids = [f"{number}" for number in range(demonstrations)]
+        demos = {name: f"libero_goal/task/demo_{name}" for name in ids}
+        same = dict.fromkeys(ids, "libero_goal")
+        return Episodes(ids, episode, same, same, demos).by_split(share)
+
+    with pytest.raises(PipelineError) as caught:
+        splits(1)
+    (least,) = map(int, re.findall(r"(\d+) or more demonstrations of a task", str(caught.value)))
+    assert len(splits(least)["val"]) == 1
+    with pytest.raises(PipelineError, match=f"{least} or more"):
+        splits(least - 1)
+
+
+@pytest.mark.slow
+def test_too_small_a_share_is_refused_before_any_work(short_demos: Path, tmp_path: Path) -> None:
+    """The milk has two demonstrations, the others one. The last share is another than the plan was made with."""
+    link_testset(tmp_path)
+    file = tmp_path / "tiny.yaml"
+    for stage, share, refused in (("plan", 0.25, True), ("plan", 0.26, False), ("render", 0.25, True)):
+        fields = tiny_config(short_demos)
+        fields["export"]["lerobot"]["validation"] = share
+        file.write_text(yaml.safe_dump(fields))
+        command = [sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(file)]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == refused, done.stderr
+        if refused:
+            assert (
+                "export.lerobot.validation: no task has enough demonstrations to hold 0.25 of them out" in done.stderr
+            )
+            assert "3 or more demonstrations of a task" in done.stderr
 
 
 def test_tfds_finds_both_splits(episodes: Episodes, tmp_path: Path) -> None:

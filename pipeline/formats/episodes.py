@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from math import ceil
 
 from pipeline.errors import PipelineError
+from pipeline.export_config import held_out, too_few
 from pipeline.seeding import digest
 from pipeline.types import Episode
 
@@ -52,22 +52,16 @@ class Episodes:
         for episode_id in self.ids:
             demo = self.demos[episode_id]
             by_task.setdefault(demo.rpartition("/")[0], set()).add(demo)
-        held_out = {
+        chosen = {
             demo
             for demos in by_task.values()
-            for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: round(validation * len(demos))]
-            if len(demos) > 1
+            for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: held_out(validation, len(demos))]
         }
-        if not held_out:
-            raise PipelineError(
-                f"no task has enough demonstrations to hold {validation:g} of them out",
-                where="export.<format>.validation",
-                expected=f"{ceil(0.5 / validation)} or more demonstrations of a task",
-                remedy="use more demonstrations, a larger share, or 0",
-            )
+        if not chosen:
+            raise too_few(validation, "export.<format>.validation")
         splits: dict[str, list[str]] = {"train": [], "val": []}
         for episode_id in self.ids:
-            splits["val" if self.demos[episode_id] in held_out else "train"].append(episode_id)
+            splits["val" if self.demos[episode_id] in chosen else "train"].append(episode_id)
         return splits
 
     def slices(self, members: Sequence[str], pieces: int) -> list[list[str]]:

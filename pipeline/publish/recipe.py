@@ -15,6 +15,7 @@ import yaml
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.export_config import known_to_oft
 from pipeline.files import checksum, replaced, schema_file
 from pipeline.formats.rlds_layout import dataset_of
 from pipeline.run import motion_statistics
@@ -78,7 +79,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, 
     Raises:
         PipelineError: when nothing was kept, or OFT would take the name for another robot's.
     """
-    if "libero" not in name or "aloha" in name:
+    if not known_to_oft(name):
         raise PipelineError(
             f"{name} would be read with another robot's constants and cameras by OpenVLA-OFT, which goes by the name",
             where="export.rlds.name",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
@@ -103,6 +103,11 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
         for group, wanted in zip(groups, _shares(episodes, len(groups)), strict=True):
             rows += _candidates(name, axes, group, wanted, plan, replay, test)
     return rows
+
+
+def demonstrations(rows: Sequence[Row]) -> int:
+    """Of the task that has most of them."""
+    return max(Counter((row.suite, row.task) for row in rows if row.role == "twin").values())
 
 
 def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
