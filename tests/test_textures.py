@@ -14,16 +14,18 @@ from typing import get_args
 import cv2
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from conftest import REPOSITORY, STOVE
 from libero.libero import get_libero_path
 from numpy.typing import NDArray
 
+from pipeline.axes.background import BackgroundAxis
 from pipeline.catalogue import procedural, texture_sources, textures
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.texture_sources import Package, Texture, from_file
 from pipeline.catalogue.textures import catalogue, find, pixels, refusal
 from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
+from pipeline.seeding import rng
 
 OFFLINE = catalogue(("libero", "robosuite", "procedural"))
 LIBERO = Path(get_libero_path("assets")) / "textures"
@@ -99,19 +101,36 @@ def test_test_images_are_refused_by_content_and_name_and_data_maps_by_name() -> 
         assert refusal(name, "0" * 64) is None
 
 
-def test_a_folder_of_images(tmp_path: Path) -> None:
-    oak = tmp_path / "oak_COL.png"
+def test_a_folder_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "mine"
+    (folder / "wood").mkdir(parents=True)
+    oak = folder / "wood" / "oak_COL.png"
     cv2.imwrite(str(oak), np.full((8, 8, 3), (10, 20, 200), np.uint8))
-    offered = catalogue((Folder(folder=tmp_path, licence="CC-BY 4.0 Jane Doe"),))
+    offered = catalogue((Folder(folder=folder, licence="CC-BY 4.0 Jane Doe"),))
     (texture,) = offered.values()
     assert texture.licence == "CC-BY 4.0 Jane Doe"
     assert texture.load()[0, 0].tolist() == [200, 20, 10]
-    assert np.array_equal(pixels(texture.name, texture.sha256), texture.load())
-    with pytest.raises(PipelineError, match="has changed"):
-        find(texture.name, "0" * 64)
+    # A name that every machine may know, and that two images of one name do not share.
+    assert texture.name == f"folder:{texture.sha256[:8]}/wood/oak_COL.png"
+    # What was drawn is shown, whatever becomes of the folder.
+    BackgroundAxis(sources=(Folder(folder=folder, licence="CC-BY 4.0 Jane Doe"),)).sample(rng("oak"), STOVE, 0)
     oak.unlink()
-    with pytest.raises(PipelineError, match="oak_COL"):
+    assert pixels(texture.name, texture.sha256)[0, 0].tolist() == [200, 20, 10]
+    with pytest.raises(PipelineError, match=r"oak_COL.png is missing(?s:.*)run the plan stage again"):
+        find(texture.name, "0" * 64)
+    (tmp_path / texture_sources.FOLDER / "own" / texture.sha256).write_bytes(b"rot")
+    with pytest.raises(PipelineError, match=r"oak_COL.png is damaged(?s:.*)run the plan stage again"):
         find(texture.name, texture.sha256)
+
+
+def test_two_images_of_one_name_are_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folders = [Folder(folder=tmp_path / name, licence="CC0") for name in ("one", "other")]
+    for shade, source in enumerate(folders):
+        source.folder.mkdir()
+        cv2.imwrite(str(source.folder / "oak.png"), np.full((8, 8, 3), shade, np.uint8))
+    assert sorted(texture.load().max() for texture in catalogue(tuple(folders)).values()) == [0, 1]
 
 
 @pytest.mark.parametrize("fault", ["copy of a test image", "normal map", "not an image", "empty", "missing"])

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from pipeline.axes.base import Axis, Frozen, RenderPerturbation, Share
 from pipeline.catalogue import textures
-from pipeline.catalogue.texture_sources import Source, Texture
+from pipeline.catalogue.texture_sources import Source, Texture, keep
 from pipeline.errors import PipelineError
 from pipeline.types import Floats, Frame, Task
 
@@ -143,6 +143,7 @@ class BackgroundAxis(Axis):
         procedural, images = _offered(self.sources)
         choices = images if images and (rng.random() < self.image_share or not procedural) else procedural
         texture = choices[rng.integers(len(choices))]
+        keep(texture)
         return Covering(
             part=part,
             texture=texture.name,

@@ -11,7 +11,7 @@ import hashlib
 import io
 import zipfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Literal
@@ -24,6 +24,7 @@ from pipeline.catalogue import procedural, wheels
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
+from pipeline.files import replaced
 from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.types import Frame
 
@@ -31,7 +32,7 @@ Package = Literal["libero", "robosuite", "procedural", "metaworld", "gymnasium-r
 Source = Package | Folder
 
 FOLDER = Path("data/textures")
-"""Where the wheels are kept."""
+"""Where the wheels are kept, and what was drawn of a user's images: ``own/<SHA-256>``."""
 
 PROCEDURAL_PER_FAMILY = 60
 
@@ -72,11 +73,13 @@ class Texture:
     """One colour map.
 
     Attributes:
-        name: ``<source>:<file>`` or ``procedural:<family>/<index>``; enough to find it again.
+        name: ``<source>:<file>``, ``procedural:<family>/<index>`` or ``folder:<start of the hash>/<file>``; with the
+            hash enough to find it again, and no path of this machine.
         source: the part of the name before the colon, ``folder`` for a user's file.
         licence: as its source states it.
         sha256: of the image file; of the recipe (generator's version, family, index) of a procedural one, so that
             rounding on another processor does not make it another texture.
+        own: the file, where it is a user's.
     """
 
     name: str
@@ -84,6 +87,7 @@ class Texture:
     licence: str
     sha256: str
     _read: Callable[[], Frame] = field(repr=False, compare=False)
+    own: Path | None = field(default=None, repr=False, compare=False)
 
     def load(self) -> Frame:
         """(H, W, 3) RGB.
@@ -111,7 +115,9 @@ def offered(source: Source) -> Iterator[Texture]:
                     remedy="correct the folder in plan.axes.background.sources",
                 )
             for file in files:
-                yield from_file(f"folder:{file.as_posix()}", file, source.licence)
+                texture = from_file("folder:", file, source.licence)
+                name = f"folder:{texture.sha256[:8]}/{file.relative_to(source.folder).as_posix()}"
+                yield replace(texture, name=name, own=file)
         case "procedural":
             yield from _procedural()
         case "libero":
@@ -135,6 +141,31 @@ def from_file(name: str, file: Path, licence: str) -> Texture:
     except OSError as error:
         raise PipelineError(f"cannot read the texture ({error})", where=file, remedy="put it back") from error
     return Texture(name, name.partition(":")[0], licence, sha256, lambda: _decode(file.read_bytes(), file))
+
+
+def keep(texture: Texture) -> None:
+    """Copy a user's image to where ``kept`` finds it, whatever becomes of the folder."""
+    copy = FOLDER / "own" / texture.sha256
+    if texture.own is not None and not copy.exists():
+        with replaced(copy) as temporary:
+            temporary.write_bytes(texture.own.read_bytes())
+
+
+def kept(name: str, sha256: str) -> Texture:
+    """A user's image that was drawn.
+
+    Raises:
+        PipelineError: when it is not here, or damaged.
+    """
+    file = FOLDER / "own" / sha256
+    texture = from_file(name, file, "the folder's") if file.is_file() else None
+    if texture is None or texture.sha256 != sha256:
+        raise PipelineError(
+            f"the texture {name} is {'missing' if texture is None else 'damaged: delete its file'}",
+            where=file,
+            remedy=f"copy {FOLDER} from where the plan was made, or run the plan stage again",
+        )
+    return texture
 
 
 @cache

@@ -5,11 +5,10 @@ from __future__ import annotations
 import hashlib
 import re
 from functools import cache, lru_cache
-from pathlib import Path
 from typing import get_args
 
 from pipeline.catalogue.sources import Folder
-from pipeline.catalogue.texture_sources import Package, Source, Texture, from_file, libero_images, offered
+from pipeline.catalogue.texture_sources import Package, Source, Texture, kept, libero_images, offered
 from pipeline.errors import PipelineError
 from pipeline.types import Frame
 
@@ -101,7 +100,7 @@ def find(name: str, sha256: str) -> Texture:
     """
     texture: Texture | None = None
     if name.startswith("folder:"):
-        texture = from_file(name, Path(name.removeprefix("folder:")), "the folder's")
+        texture = kept(name, sha256)
     for package in get_args(Package):
         if name.startswith(f"{package}:"):
             texture = catalogue((package,)).get(name)
@@ -127,7 +126,7 @@ def _may_be_drawn(texture: Texture, source: Source) -> bool:
         if reason is not None:
             raise PipelineError(
                 f"this image cannot be used: {reason}",
-                where=texture.name.removeprefix("folder:"),
+                where=texture.own,
                 remedy="move it out of the folder",
             )
         texture.load()  # a file that is not an image is reported now, not when it is rendered
