@@ -222,7 +222,16 @@ def _versions(rows: Rows) -> dict[str, str]:
     return {**manifest.made_with(rows[0]), "rendered by": "; ".join(devices), "seed": ", ".join(seeds)}
 
 
+class _Settings(yaml.SafeDumper):
+    """Writes of an absolute path the last name alone, as the page is for everybody."""
+
+
+_Settings.add_multi_representer(
+    Path, lambda dumper, path: dumper.represent_str(path.name if path.is_absolute() else path.as_posix())
+)
+
+
 def _settings(config: Config) -> str:
     # Where it is computed changes nothing, and would make the page differ.
-    chosen = config.model_dump(mode="json", exclude_defaults=True, exclude={"compute"})
-    return yaml.safe_dump(chosen, sort_keys=False)
+    chosen = config.model_dump(exclude_defaults=True, exclude={"compute"})
+    return yaml.dump(chosen, Dumper=_Settings, sort_keys=False)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from pydantic import BaseModel
@@ -22,9 +22,16 @@ HASHED_BYTES = 16_000_000
 
 
 def listing(config: Config) -> dict[str, list[str | int]]:
-    """Path of each file that the configuration's paths lead to, and what shows whether it has changed."""
-    files = sorted({file for path in _paths(dict(config)) for file in _files(path)})
-    return {str(file): _state(file) for file in files}
+    """Each file that the configuration's paths lead to, and what shows whether it has changed.
+
+    A file is named by the field of the configuration and its path in the folder that stands there, such as
+    ``demos.root/libero_goal/turn_on_the_stove_demo.hdf5``: where that folder lies changes nothing.
+    """
+    return {
+        (PurePosixPath(field) / file.relative_to(path)).as_posix(): _state(file)
+        for field, path in _paths(dict(config))
+        for file in sorted(_files(path))
+    }
 
 
 def write(listed: Mapping[str, list[str | int]], path: Path) -> None:
@@ -32,18 +39,18 @@ def write(listed: Mapping[str, list[str | int]], path: Path) -> None:
         temporary.write_text(json.dumps(listed, indent=0) + "\n")
 
 
-def _paths(value: Any) -> Iterator[Path]:
-    """Every path in a configuration, however deep."""
+def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:
+    """Every path in a configuration, however deep, and its field, such as ``plan.axes.layout.sources.1.folder``."""
     if isinstance(value, Path):
-        yield value
+        yield field.removeprefix("."), value
     elif isinstance(value, BaseModel):
-        yield from _paths(dict(value))
+        yield from _paths(dict(value), field)
     elif isinstance(value, Mapping):
-        for member in value.values():
-            yield from _paths(member)
+        for name, member in value.items():
+            yield from _paths(member, f"{field}.{name}")
     elif isinstance(value, list | tuple):
-        for member in value:
-            yield from _paths(member)
+        for number, member in enumerate(value):
+            yield from _paths(member, f"{field}.{number}")
 
 
 def _files(path: Path) -> Iterator[Path]:
