@@ -6,11 +6,14 @@ import json
 from pathlib import Path
 
 import h5py
+import mujoco
 import numpy as np
 import pytest
 from conftest import STOVE, link_testset, starter_demo
+from machine_paths import told
 
 from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.libero.assets import libero_assets
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
 from pipeline.physics.expand import APART_RAD, Expansion, expand
@@ -66,3 +69,23 @@ def test_the_file_says_what_was_changed(expanded: tuple[Path, Expansion]) -> Non
     assert attributes["expanded_from"] == starter_demo(STOVE).demo_id
     assert [change["axis"] for change in json.loads(attributes["perturbations"])] == ["robot"]
     assert attributes["replay_mode"] in ("open_loop", "tracked")
+
+
+def test_the_file_tells_nobody_s_folders_and_liberos_own_reader_finds_its_assets(
+    expanded: tuple[Path, Expansion], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from libero.libero.envs.utils import postprocess_model_xml
+
+    (file,) = expanded[1].files
+    assert told(file) == set()
+    with h5py.File(file) as opened:
+        model_file = opened["data/demo_0"].attrs["model_file"]
+    # LIBERO's looks for its assets in the folder ``libero`` of the working directory, as in a checkout.
+    (tmp_path / "libero").mkdir()
+    (tmp_path / "libero" / "assets").symlink_to(libero_assets())
+    monkeypatch.chdir(tmp_path)
+    theirs = mujoco.MjModel.from_xml_string(postprocess_model_xml(model_file, {}, demo_generation=True))
+    demo = HDF5Source(expanded[0]).load(f"{STOVE.suite}/{STOVE.name}/demo_0")
+    ours = mujoco.MjModel.from_xml_string(str(demo.model_xml))
+    for name in ("mesh_vert", "tex_data", "body_mass"):
+        assert np.array_equal(getattr(theirs, name), getattr(ours, name)), name

@@ -1,4 +1,8 @@
-"""Recorded scenes hold paths of their author's machine: replace them with this machine's assets, and no other file."""
+"""Recorded scenes hold paths of their author's machine: replace them with this machine's assets, and no other file.
+
+What is stored or published here names an asset by package and path instead, as ``robosuite/models/assets/...`` and, as
+LIBERO's own repository has it, ``libero/libero/assets/...``.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,8 @@ from pipeline.errors import PipelineError
 _REFUSED = {"include", "model", "attach", "plugin", "extension"}
 # Attributes that make MuJoCo look in another folder than the one that a file attribute names.
 _REDIRECTS = ("assetdir", "meshdir", "texturedir", "strippath")
+
+_ROBOSUITE, _LIBERO = "/robosuite/models/assets/", "/libero/libero/assets/"
 
 
 def package_folder(package: str) -> Path:
@@ -83,7 +89,7 @@ def relocate(xml: str, where: str) -> str:
             # Besides file, a cube texture has fileright, fileleft and so on.
             if name.lower().startswith("file"):
                 try:
-                    element.set(name, _installed(value))
+                    element.set(name, installed(value))
                 except (OSError, ValueError) as error:
                     described = f'<{element.tag} name="{element.get("name", "")}"> {name}="{value}"'
                     raise refuse(f"{described}: {error}", "check that LIBERO's assets are complete") from error
@@ -112,7 +118,7 @@ def _roots() -> dict[str, Path]:
     """What precedes an asset's own path in a recording, and the folder of this machine that stands for it."""
     libero = libero_assets()
     return {
-        "/robosuite/models/assets/": package_folder("robosuite") / "models" / "assets",
+        _ROBOSUITE: package_folder("robosuite") / "models" / "assets",
         # LIBERO was called chiliocosm when its demonstrations were recorded.
         "/chiliocosm/assets/": libero,
         "/libero/assets/": libero,
@@ -122,8 +128,18 @@ def _roots() -> dict[str, Path]:
 
 
 @cache
-def _installed(recorded: str) -> str:
-    """The installed asset that a recorded path means.
+def name_of(path: str) -> str | None:
+    """The name of an installed asset, which ``installed`` finds on every machine; None when it is none."""
+    for marker, root in _roots().items():
+        _, matched, rest = f"/{posixpath.normpath(path)}".rpartition(marker)
+        if matched and (root / rest).is_file() and (root / rest).samefile(path):
+            return f"{_ROBOSUITE if marker == _ROBOSUITE else _LIBERO}{rest}".removeprefix("/")
+    return None
+
+
+@cache
+def installed(recorded: str) -> str:
+    """The installed asset that a recorded path, or a name, means.
 
     Raises:
         ValueError: when there is none.

@@ -18,6 +18,7 @@ import numpy as np
 from pipeline.axes import Axes
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
+from pipeline.catalogue.scene_files import portable
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import hdf5
 from pipeline.physics.reference import Reference
@@ -157,7 +158,7 @@ def _motion(store: TrajectoryStore, trajectory_id: str) -> _Motion:
 
 
 def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
-    """A replay as LIBERO records demonstrations, without images, and with its origin.
+    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin.
 
     As in LIBERO's files, states are those before each action and observations those after it.
     """
@@ -177,7 +178,7 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
         actions=trajectory.actions,
         states=trajectory.states[:-1],
         robot_states=np.array(robot, np.float64),
-        model_file=trajectory.model_xml,
+        model_file=portable(trajectory.model_xml),
         obs={
             "ee_pos": seen[:, :3],
             "ee_ori": seen[:, 3:6],

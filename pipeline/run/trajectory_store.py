@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from pipeline.catalogue.scene_files import located, portable
 from pipeline.identity import fingerprint
 from pipeline.run.sealed_file import SealedFile
 from pipeline.run.store import Store
@@ -28,6 +29,8 @@ class TrajectoryStore(Store):
 
     The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (how the actions came about), ``steps``
     (how many were executed) and ``resolved`` (JSON of what physics perturbations did in the scene).
+
+    A file holds no path of the machine, so that it is the same, and can be read, wherever the packages are installed.
     """
 
     def __init__(self, root: Path):
@@ -41,7 +44,7 @@ class TrajectoryStore(Store):
             "resolved": trajectory.resolved,
         }
         with self.created(trajectory.trajectory_id, attributes) as file:
-            file["model_xml"] = np.frombuffer(trajectory.model_xml.encode(), np.uint8)
+            file["model_xml"] = np.frombuffer(portable(trajectory.model_xml).encode(), np.uint8)
             file["states"] = trajectory.states
             file["actions"] = trajectory.actions
             file["kept_mask"] = trajectory.kept_mask
@@ -51,13 +54,13 @@ class TrajectoryStore(Store):
         """Read a trajectory back.
 
         Raises:
-            PipelineError: when its file is missing, damaged or not current.
+            PipelineError: when its file is missing, damaged or not current, or what its scene is made of is not here.
         """
         with self.opened(trajectory_id) as file:
             return Trajectory(
                 trajectory_id=trajectory_id,
                 mode=file.attributes["mode"],
-                model_xml=file.array("model_xml").tobytes().decode(),
+                model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
                 states=file.array("states"),
                 actions=file.array("actions"),
                 kept_mask=file.array("kept_mask"),
