@@ -45,7 +45,9 @@ def read_table(path: Path, columns: Collection[str], remedy: str) -> pa.Table:
         table = pq.read_table(path, page_checksum_verification=True, use_threads=False)
         if (table.schema.metadata or {}).get(SEAL) != _digest(table):
             raise ValueError("it does not hold what was written")
-    except (OSError, ValueError, TypeError, LookupError, RuntimeError, MemoryError, pa.ArrowException) as error:
+    except MemoryError:
+        raise
+    except (OSError, ValueError, TypeError, LookupError, RuntimeError, pa.ArrowException) as error:
         raise PipelineError(f"damaged ({error})", where=path, remedy=f"delete it, and {remedy}") from error
     if lacking := sorted(set(columns) - set(table.column_names)):
         raise PipelineError(

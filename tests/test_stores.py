@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
+import resource
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from conftest import BOWL, read_with_flipped_bits, tiny_config
 
@@ -31,6 +37,7 @@ from pipeline.run.store import TABLE
 from pipeline.run.streams import Stream, streams_of
 from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.seeding import rng
+from pipeline.tables import read_table
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
 
@@ -114,6 +121,58 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     replay_plan(rows, config.demos, config.replay, trajectories, loop)
     assert file.read_bytes() == before
     assert outcome.replayed(rows, trajectories)
+
+
+@contextmanager
+def limited(what: int, most: int) -> Iterator[None]:
+    """Have the system refuse this process more."""
+    before = resource.getrlimit(what)
+    resource.setrlimit(what, (most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(what, before)
+
+
+@pytest.mark.parametrize("error", [MemoryError("mine"), KeyError("mine"), ValueError("mine"), OSError("mine")])
+def test_an_error_of_who_reads_a_file_is_not_called_damage(replayed: Path, error: Exception) -> None:
+    store = TrajectoryStore(replayed)
+    (name,) = store.names()
+    with pytest.raises(type(error)) as caught, store.opened(name):
+        raise error
+    assert caught.value is error
+
+
+def test_a_file_that_does_not_fit_into_memory_is_not_called_damaged(tmp_path: Path) -> None:
+    store = TrajectoryStore(tmp_path)
+    with store.created("large", {"mode": "open_loop"}) as file:
+        file["states"] = np.zeros(2**23)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    with pytest.raises(MemoryError), limited(resource.RLIMIT_AS, used + 2**25), store.opened("large") as read:
+        read.array("states")
+
+
+def test_a_table_that_does_not_fit_into_memory_is_not_called_damaged(
+    replayed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def short_of_memory(*_: object, **__: object) -> None:
+        raise pa.ArrowMemoryError("malloc of size 64 failed")
+
+    # In place of a limit, under which PyArrow may wait for ever for a thread that it cannot start.
+    monkeypatch.setattr(pq, "read_table", short_of_memory)
+    with pytest.raises(MemoryError):
+        read_table(replayed / TABLE, [], "")
+
+
+def test_files_that_the_system_does_not_open_are_not_called_missing(trajectories: Path) -> None:
+    """Or a stage would make them again, and delete them."""
+    store = TrajectoryStore(trajectories)
+    (name,) = store.names()
+    free = os.open(os.devnull, os.O_RDONLY)
+    os.close(free)
+    with limited(resource.RLIMIT_NOFILE, free), pytest.raises(OSError, match="Too many open files") as caught:
+        store.row(name)
+    assert caught.value.errno == errno.EMFILE
 
 
 @pytest.mark.parametrize(("name", "place"), [("states", (3, 1)), ("actions", (2, 0)), ("kept_mask", 0)])

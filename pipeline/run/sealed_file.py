@@ -9,6 +9,7 @@ the library crashes, so all texts are in one array.
 
 from __future__ import annotations
 
+import errno
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -30,8 +31,26 @@ ATTRIBUTES = "attributes"
 """The array that holds a file's attributes, as JSON."""
 
 
-class BrokenSealError(OSError):
-    """What was read is not what was written."""
+_WRONG_BYTES = (OSError, LookupError, ValueError, TypeError, RuntimeError, ArithmeticError)
+"""What h5py and JSON raise where they read wrong bytes."""
+
+_REFUSED = {errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE, errno.ENOMEM}
+"""What the system refuses whatever the file holds."""
+
+
+class BrokenSealError(Exception):
+    """What was read is not what was written, or cannot be read."""
+
+
+@contextmanager
+def _reading() -> Iterator[None]:
+    """Have wrong bytes be one error, whichever way they are noticed. Memory that is short is no fault of the file."""
+    try:
+        yield
+    except _WRONG_BYTES as error:
+        if isinstance(error, OSError) and error.errno in _REFUSED:
+            raise
+        raise BrokenSealError(str(error)) from error
 
 
 class SealedFile:
@@ -46,10 +65,11 @@ class SealedFile:
 
     def __init__(self, file: h5py.File):
         self._file = file
-        self._arrays = _arrays(file)
-        if _seal_of(file) != _outline(self._arrays):
-            raise BrokenSealError("the list of its arrays is not what was written")
-        self.attributes: Mapping[str, Any] = json.loads(self.array(ATTRIBUTES).tobytes())
+        with _reading():
+            self._arrays = _arrays(file)
+            if _seal_of(file) != _outline(self._arrays):
+                raise BrokenSealError("the list of its arrays is not what was written")
+            self.attributes: Mapping[str, Any] = json.loads(self.array(ATTRIBUTES).tobytes())
 
     def __contains__(self, name: str) -> bool:
         return name in self._arrays
@@ -61,9 +81,11 @@ class SealedFile:
             KeyError: when there is none of this name.
             BrokenSealError: when it is not what was written.
         """
-        values: NDArray[Any] = self._arrays[name][()]
-        if _seal_of(self._arrays[name]) != _digest(values):
-            raise BrokenSealError(f"{name} is not what was written")
+        stored = self._arrays[name]
+        with _reading():
+            values: NDArray[Any] = stored[()]
+            if _seal_of(stored) != _digest(values):
+                raise BrokenSealError(f"{name} is not what was written")
         return values
 
     def length(self, name: str) -> int:
@@ -71,8 +93,13 @@ class SealedFile:
         return len(self._arrays[name])
 
     def groups(self, name: str) -> list[str]:
-        """Names of the groups in a group."""
-        return sorted(self._file[name])
+        """Names of the groups in a group.
+
+        Raises:
+            BrokenSealError: when they cannot be read.
+        """
+        with _reading():
+            return sorted(self._file[name])
 
     def check_all(self) -> None:
         """Read and check every array.
@@ -82,6 +109,20 @@ class SealedFile:
         """
         for name in self._arrays:
             self.array(name)
+
+
+@contextmanager
+def unsealed(path: Path) -> Iterator[SealedFile]:
+    """A file that ``sealed`` made, open for reading.
+
+    Raises:
+        BrokenSealError: when it cannot be read, or its attributes or arrays' list are not what was written.
+        OSError: when the system does not open it.
+    """
+    with _reading():
+        file = h5py.File(path, "r")
+    with file:
+        yield SealedFile(file)
 
 
 @contextmanager

@@ -20,13 +20,10 @@ import pyarrow as pa
 
 from pipeline.errors import PipelineError
 from pipeline.files import keep_below, replaced
-from pipeline.run.sealed_file import SealedFile, sealed
+from pipeline.run.sealed_file import BrokenSealError, SealedFile, sealed, unsealed
 from pipeline.tables import read_table, write_table
 
 TABLE = "index.parquet"
-
-_UNREADABLE = (OSError, LookupError, ValueError, TypeError, RuntimeError, ArithmeticError, MemoryError)
-"""What h5py raises for a file that is missing or has wrong bytes in it, and what a reader does with these."""
 
 
 class Store:
@@ -88,15 +85,14 @@ class Store:
             PipelineError: when it is missing, damaged, or not current.
         """
         path, remedy = self.path(name), f"run the {self._stage} stage again"
+        if not path.exists():
+            raise PipelineError("missing", where=path, remedy=remedy)
         try:
-            with h5py.File(path, "r") as opened:
-                file = SealedFile(opened)
-                if file.attributes["made_by"] != self.made_by:
+            with unsealed(path) as file:
+                if file.attributes.get("made_by") != self.made_by:
                     raise PipelineError("made by another version or with other settings", where=path, remedy=remedy)
                 yield file
-        except _UNREADABLE as error:
-            if not path.exists():
-                raise PipelineError("missing", where=path, remedy=remedy) from error
+        except BrokenSealError as error:
             # The stage believes its table, and does not read every file again.
             raise PipelineError(f"damaged ({error})", where=path, remedy=f"delete the file and {remedy}") from error
 
