@@ -151,7 +151,8 @@ def _push(arguments: argparse.Namespace) -> int:
 
 def _schema(arguments: argparse.Namespace) -> int:
     file = SCHEMAS / "config.schema.json"
-    file.write_text(json.dumps(config_schema(), indent=2) + "\n")
+    with replaced(file) as temporary:
+        temporary.write_text(json.dumps(config_schema(), indent=2) + "\n")
     print(f"wrote {file}")
     return 0
 

@@ -69,6 +69,12 @@ def read_json(file: Path, remedy: str = "dvc repro") -> dict[str, Any]:
     return content
 
 
+def write_json(file: Path, content: object) -> None:
+    """Write what ``read_json`` reads; the file is whole or not there."""
+    with replaced(file) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n")
+
+
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it is synced to disk and takes the place of ``path``.

@@ -1,8 +1,7 @@
 """Stage manifest: one row for every planned episode, the statistics for OpenVLA-OFT, and the counts."""
 
-import json
-
 from pipeline.config import Config
+from pipeline.files import write_json
 from pipeline.formats import registry
 from pipeline.formats.rlds_layout import by_suite
 from pipeline.run import manifest, motion_statistics, outcome
@@ -30,8 +29,8 @@ def run(config: Config) -> None:
         name: motion_statistics.openvla([motions[rows[episode].trajectory_id] for episode in members])
         for name, members in sets.items()
     }
-    (data / "dataset_statistics.json").write_text(json.dumps(figures, indent=1) + "\n")
-    (data / "counts.json").write_text(json.dumps(manifest.counts(table.to_pylist()), indent=1) + "\n")
+    write_json(data / "dataset_statistics.json", figures)
+    write_json(data / "counts.json", manifest.counts(table.to_pylist()))
 
 
 if __name__ == "__main__":

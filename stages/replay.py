@@ -1,8 +1,7 @@
 """Stage replay: run the physics of every planned trajectory and judge it; needs no GL. Resumes where it was stopped."""
 
-import json
-
 from pipeline.config import Config
+from pipeline.files import write_json
 from pipeline.physics.replay import replay_plan
 from pipeline.run import plan
 from pipeline.run.compute import runner
@@ -20,7 +19,7 @@ def run(config: Config) -> None:
     # Of the reserves, those too that the stage render replayed because frames were refused.
     TrajectoryStore(folder).keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
-    (config.data / "replay.json").write_text(json.dumps({"replayed": len(verdicts), "kept": kept}) + "\n")
+    write_json(config.data / "replay.json", {"replayed": len(verdicts), "kept": kept})
     print(f"replayed {len(verdicts)} trajectories, {kept} reach their goal")
 
 

@@ -1,10 +1,9 @@
 """Stage validate: reopen the datasets and the manifest, and stop where anything is off."""
 
-import json
-
 from pipeline import gl
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.files import write_json
 from pipeline.run.compute import runner
 from pipeline.run.stage import main
 from pipeline.validation.validate import validate
@@ -14,7 +13,7 @@ def run(config: Config) -> None:
     with runner(config.compute, config.data, gl.Shared) as workers:
         report = validate(config, workers)
     file = config.data / "validation.json"
-    file.write_text(json.dumps(report, indent=1) + "\n")
+    write_json(file, report)
     off = {check: found["findings"] for check, found in report.items() if found["findings"]}
     if off:
         first = next(iter(off.values()))[0]

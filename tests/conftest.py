@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -205,6 +206,17 @@ def served(server: ThreadingHTTPServer) -> Iterator[None]:
     server.shutdown()
     server.server_close()
     thread.join()
+
+
+@contextmanager
+def limited(what: int, most: int) -> Iterator[None]:
+    """Have the system refuse this process more."""
+    before = resource.getrlimit(what)
+    resource.setrlimit(what, (most, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(what, before)
 
 
 def link_testset(folder: Path) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -15,12 +17,12 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 import yaml
-from conftest import STOVE, dvc, run_stages, tiny_config
+from conftest import REPOSITORY, STOVE, dvc, run_stages, tiny_config
 from PIL import Image
 from synthetic import records
 
 from pipeline.axes import from_json
-from pipeline.config import RenderConfig
+from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.jpeg import decode
 from pipeline.rendering.renderer import Renderer
@@ -197,6 +199,28 @@ def test_damaged_shards_are_made_again(finished: Path, short_demos: Path, tmp_pa
     run_stages(tmp_path, tiny_config(short_demos), ["replay"])
     assert shard.read_bytes() == whole
     assert not (data / "trajectories" / "stale.h5").exists()
+
+
+@pytest.mark.parametrize("stage", ["replay", "manifest", "validate"])
+def test_a_full_disk_leaves_what_a_stage_wrote_before(
+    stage: str, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clone = Path(shutil.copytree(finished.parent.parent, tmp_path / "clone", symlinks=True))
+    report, write = json.loads((finished / "validation.json").read_text()), Path.write_text
+
+    def half(file: Path, text: str) -> None:
+        write(file, text[: len(text) // 2])
+        raise OSError(errno.ENOSPC, "No space left on device", str(file))
+
+    monkeypatch.chdir(clone)
+    monkeypatch.setattr(Path, "write_text", half)
+    # How long it takes is no subject here.
+    monkeypatch.setattr("pipeline.validation.validate.validate", lambda *_: report)
+    run = runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"))["run"]
+    with pytest.raises(OSError, match="No space left"):
+        run(load(Path("configs/tiny.yaml")))
+    for file in finished.glob("*.json"):
+        assert (clone / "data" / "tiny" / file.name).read_bytes() == file.read_bytes(), file.name
 
 
 def stages_to_run(clone: Path) -> set[str]:

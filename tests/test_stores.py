@@ -7,8 +7,7 @@ import json
 import os
 import resource
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conftest import BOWL, read_with_flipped_bits, tiny_config
+from conftest import BOWL, limited, read_with_flipped_bits, tiny_config
 
 from pipeline import gl, identity
 from pipeline.axes import to_json
@@ -121,17 +120,6 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     replay_plan(rows, config.demos, config.replay, trajectories, loop)
     assert file.read_bytes() == before
     assert outcome.replayed(rows, trajectories)
-
-
-@contextmanager
-def limited(what: int, most: int) -> Iterator[None]:
-    """Have the system refuse this process more."""
-    before = resource.getrlimit(what)
-    resource.setrlimit(what, (most, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(what, before)
 
 
 @pytest.mark.parametrize("error", [MemoryError("mine"), KeyError("mine"), ValueError("mine"), OSError("mine")])

@@ -7,13 +7,13 @@ import fcntl
 import json
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import exit_status
-from pipeline.files import remove_leftovers
+from pipeline.files import remove_leftovers, write_json
 
 OWNER = "configuration.json"
 """File of a run's folder that says which configuration file the folder belongs to."""
@@ -49,9 +49,11 @@ def claimed(file: Path) -> Config:
     """
     config = load(file)
     config.data.mkdir(parents=True, exist_ok=True)
-    # "x" fails where the file exists: of two stages that start at the same time, only one writes it.
-    with suppress(FileExistsError), (config.data / OWNER).open("x") as mark:
-        mark.write(json.dumps({"configuration": _named(file), "name": config.name}, indent=1) + "\n")
+    mark = config.data / OWNER
+    if not mark.exists():
+        with locked(config.data):
+            if not mark.exists():  # Of two stages that start at the same time, the second finds it.
+                write_json(mark, {"configuration": _named(file), "name": config.name})
     _refuse_foreign(config, file)
     _refuse_links(config.data)
     return config
