@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -79,16 +80,17 @@ def write_json(file: Path, content: object) -> None:
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it is synced to disk and takes the place of ``path``.
 
-    Works for a file and for a folder. When the block raises, what was at ``path`` before is untouched.
+    Works for a file and for a folder. When the block raises, what was at ``path`` before is untouched. The temporary
+    name is drawn anew each time: two hosts that share a file system have processes with the same number, and one may
+    do the work of the other again while that still writes.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    remove(temporary)
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         yield temporary
         put_in_place(temporary, path)
     finally:
-        # After a failure other workers may still be writing into a folder: what they leave is removed next time.
+        # After a failure other workers may still be writing into a folder: see remove_leftovers.
         if temporary.is_dir():
             shutil.rmtree(temporary, ignore_errors=True)
         else:
@@ -156,11 +158,17 @@ def keep_below(folder: Path, files: set[Path]) -> None:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Delete what ``replaced`` left beside a folder's files where its process was killed."""
+    """Delete what ``replaced`` left beside a folder's files where its process was killed.
+
+    Only for who holds a lock that keeps all others, on every host, from writing there: a name does not say whether its
+    process still lives on another host.
+    """
     for temporary in folder.glob(".*.tmp"):
-        process = Path("/proc", temporary.name.split(".")[-2])
-        if not process.exists():
-            remove(temporary)
+        if temporary.is_dir():
+            # A worker of the killed process may still be writing into it: the rest goes next time.
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
 
 
 def remove_if_empty(folder: Path) -> None:

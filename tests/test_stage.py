@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -11,11 +12,11 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import REPOSITORY, STOVE, tiny_config
+from conftest import REPOSITORY, STOVE, limited, tiny_config
 
 from pipeline import __main__ as command_line
 from pipeline.errors import PipelineError
-from pipeline.run.stage import OWNER, claimed, locked, owned
+from pipeline.run.stage import LOCK, OWNER, claimed, locked, owned
 
 
 @pytest.fixture
@@ -94,19 +95,33 @@ def test_one_stage_of_a_run_works_at_a_time(tmp_path: Path) -> None:
         pass
 
 
+WRITING = """
+import os, signal, sys
+from pathlib import Path
+from pipeline.files import replaced
+with replaced(Path(sys.argv[1])) as temporary:
+    (temporary / "libero_goal").mkdir(parents=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
 def test_what_a_killed_stage_left_goes_with_the_next_one(tmp_path: Path) -> None:
     """A stage that found nothing to do would leave it for ever."""
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
-    left, whole = tmp_path / f".previews.{dead.pid}.tmp", tmp_path / "previews"
-    for folder in (left, whole):
-        (folder / "libero_goal").mkdir(parents=True)
-    being_written = tmp_path / f".report.html.{os.getpid()}.tmp"
-    being_written.touch()
+    whole = tmp_path / "previews"
+    (whole / "libero_goal").mkdir(parents=True)
+    subprocess.run([sys.executable, "-c", WRITING, str(whole)], cwd=REPOSITORY, check=False)
+    assert len(list(tmp_path.iterdir())) == 2
+    # As another host's process may have left it, whose number a process has here too.
+    (tmp_path / f".report.html.{os.getpid()}.tmp").touch()
     with locked(tmp_path):
-        assert not left.exists()
-        assert whole.exists()
-        assert being_written.exists()
+        assert {entry.name for entry in tmp_path.iterdir()} == {"previews", LOCK}
+
+
+def test_a_full_disk_leaves_no_half_of_the_mark(clone: Path) -> None:
+    with pytest.raises(OSError, match="File too large"), limited(resource.RLIMIT_FSIZE, 10):
+        claimed(Path("configs/tiny.yaml"))
+    claimed(Path("configs/tiny.yaml"))
+    assert json.loads((clone / "data" / "tiny" / OWNER).read_text())["configuration"] == "configs/tiny.yaml"
 
 
 def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:

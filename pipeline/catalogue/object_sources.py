@@ -30,7 +30,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.sweethome3d import Piece
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import remove_leftovers, replaced
 from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.seeding import digest
 
@@ -229,4 +229,5 @@ def _locked() -> Iterator[None]:
     FOLDER.mkdir(parents=True, exist_ok=True)
     with (FOLDER / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
+        remove_leftovers(FOLDER)
         yield

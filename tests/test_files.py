@@ -1,0 +1,31 @@
+"""A file is whole or not there, also where two hosts share a file system and number their processes alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.files import replaced
+
+
+def test_two_that_write_the_same_file_do_not_disturb_each_other(tmp_path: Path) -> None:
+    """A job that a cluster gives out again, while its first worker still writes; both may have the same number."""
+    path = tmp_path / "0123.h5"
+    with replaced(path) as first:
+        first.write_text("first")
+        with replaced(path) as second:
+            second.write_text("second")
+        assert path.read_text() == "second"
+    assert path.read_text() == "first"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_fails_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "counts.json"
+    path.write_text("whole")
+    with pytest.raises(OSError, match="full"), replaced(path) as temporary:
+        temporary.write_text("ha")
+        raise OSError("full")
+    assert path.read_text() == "whole"
+    assert list(tmp_path.iterdir()) == [path]
