@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import pytest
+from conftest import limited
 
 from pipeline.files import replaced
 
@@ -24,8 +26,7 @@ def test_two_that_write_the_same_file_do_not_disturb_each_other(tmp_path: Path) 
 def test_what_fails_leaves_what_was_there(tmp_path: Path) -> None:
     path = tmp_path / "counts.json"
     path.write_text("whole")
-    with pytest.raises(OSError, match="full"), replaced(path) as temporary:
-        temporary.write_text("ha")
-        raise OSError("full")
+    with pytest.raises(OSError, match="too large"), limited(resource.RLIMIT_FSIZE, 2), replaced(path) as temporary:
+        temporary.write_text("half")
     assert path.read_text() == "whole"
     assert list(tmp_path.iterdir()) == [path]
