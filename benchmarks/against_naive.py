@@ -35,6 +35,7 @@ from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_l
 from pipeline.config import Config, load  # noqa: E402
 from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.libero.tasks import find_task, select_tasks  # noqa: E402
+from pipeline.physics.environment import DUMMY_ACTION  # noqa: E402
 from pipeline.physics.replay import replay_plan  # noqa: E402
 from pipeline.rendering.jpeg import encode, to_policy  # noqa: E402
 from pipeline.rendering.render import render_plan  # noqa: E402
@@ -119,11 +120,19 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
     for spec in SCHEMA.views.values():
         env.env.modify_observable(f"{spec.camera}_image", "enabled", False)
     # What a replay restores beside the state, see pipeline/physics/environment.py.
-    robot = env.env.robots[0]
-    robot.gripper.current_action = np.zeros(robot.gripper.dof)
+    robot, scene = env.env.robots[0], trajectory.scene
+    robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
     env.sim.reset()
-    env.set_init_state(trajectory.states[0])
+    env.set_init_state(scene.state)
+    if scene.posture_rad is not None:
+        env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
+        env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
+        env.sim.forward()
     robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
+    if scene.posture_rad is not None:
+        env.set_init_state(scene.state)
+    for _ in range(config.replay.settle_steps):
+        env.step(DUMMY_ACTION)
     frames: dict[str, list[bytes]] = {view: [] for view in SCHEMA.views}
     for step, action in enumerate(trajectory.actions):
         for view, spec in SCHEMA.views.items():

@@ -30,7 +30,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.jpeg import encode
 from pipeline.run.frame_store import Rendered
 from pipeline.run.streams import Stream
-from pipeline.types import Demo, Frame, Geometry, Task, Trajectory, Verdict
+from pipeline.types import Demo, Frame, Geometry, Scene, Task, Trajectory, Verdict
 
 STEPS = 8
 """The fewest that OpenVLA-OFT can read: one of its chunks."""
@@ -57,12 +57,11 @@ def replay(
     return Trajectory(
         trajectory_id=trajectory_id,
         mode="open_loop",
-        model_xml=model_xml,
+        scene=Scene(model_xml, demo.init_state),
         states=states,
         actions=actions,
         kept_mask=np.ones(STEPS, bool),
         site_alpha=np.zeros((STEPS + 1, model_xml.count("<site ")), np.float32),
-        resolved="{}",
         verdict=Verdict(kept, "" if kept else "goal_not_reached"),
     )
 

@@ -1,6 +1,6 @@
 """How many replays reach their goal, open-loop and in ``auto``, by suite, axis and level; and how smooth they are.
 
-    nice -n 10 python benchmarks/replay_yield.py [--draws 1] [--axes robot pose scene layout] [--levels 1 3 5]
+    nice -n 10 python benchmarks/replay_yield.py [--draws 1] [--axes initial_joints scene layout] [--levels 1 3 5]
 
 Draws come from the planner, over the starter demonstrations; ``--folder`` keeps the trajectories, so that a run that
 was stopped goes on where it was. The last line is the result as JSON.
@@ -37,8 +37,9 @@ from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 
 AXES: dict[str, tuple[str, dict[str, Any]]] = {
-    "robot": ("robot", {}),
-    "pose": ("pose", {}),
+    "controller_posture": ("robot", {"components": ["controller_posture"]}),
+    "initial_joints": ("robot", {"components": ["initial_joints"]}),
+    "target": ("pose", {"components": ["target"]}),
     "scene": ("pose", {"components": ["scene"]}),
     "layout": ("layout", {}),
 }

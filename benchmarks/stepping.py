@@ -19,6 +19,7 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 import numpy as np
 
 from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import Environment
 from pipeline.types import Demo, Floats
@@ -66,14 +67,14 @@ def main() -> None:
 def compare(demo: Demo) -> dict[str, float]:
     """Replay a demonstration both ways: ms a control step, s a restore, and whether every number was the same."""
     ours, liberos = Environment(demo.task), Environment(demo.task)
-    model_xml = demo.model_xml or ours.place_fixtures(0)
+    scene = recorded_start(demo, demo.model_xml or ours.place_fixtures(0))
     begun = time.process_time()
-    liberos._env.reset_from_xml_string(model_xml)
+    liberos._env.reset_from_xml_string(scene.model_xml)
     restores = [time.process_time() - begun]
-    liberos.restore(model_xml, demo.init_state)
+    liberos.restore(scene)
     for _ in range(2):
         begun = time.process_time()
-        ours.restore(model_xml, demo.init_state)
+        ours.restore(scene)
         restores.append(time.process_time() - begun)
     spent, identical = np.zeros(2), True
     for first in range(0, len(demo.actions), TURN):

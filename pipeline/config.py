@@ -104,12 +104,15 @@ class ReplayConfig(Frozen):
             hand did in a successful replay by feedback; ``auto`` does so only where open-loop fails.
         noops: ``drop`` skips every no-op (OpenVLA's rule), ``trim_ends`` only those before the first and after the
             last real action, ``keep`` none.
+        settle_steps: control steps of doing nothing with the gripper open before the first frame and action, as in
+            every evaluation and in OpenVLA's own regeneration of LIBERO's demonstrations.
         fixture_seed: seeds LIBERO's reset where the source did not record the scene. Under the default all 40 starter
             demonstrations of the four suites reach their goal.
     """
 
     mode: Literal["open_loop", "tracked", "auto"] = "open_loop"
     noops: Literal["drop", "trim_ends", "keep"] = "drop"
+    settle_steps: int = Field(default=10, ge=0, le=200)
     fixture_seed: int = Field(default=0, ge=0, lt=2**32)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,11 +75,18 @@ class Scene:
         model_xml: MJCF with asset paths of this machine.
         state: (S,) flattened MuJoCo state: time, qpos, qvel.
         resolved: axis to what its perturbation came to in this scene, JSON-serialisable, such as where objects ended.
+        gripper: where the gripper's command stands: -1 open, 1 closed, 0 as after LIBERO's reset. The next action is
+            added to it, so it takes four control steps from 0 to -1.
+        posture_rad: (7,) joint angles of the reset that came before the state was put in. To these the controller's
+            null space draws the arm, and it keeps their orientation of the hand until an action turns that. None where
+            it holds the arm as the state has it.
     """
 
     model_xml: str
     state: Floats
     resolved: Mapping[str, Any] = field(default_factory=dict)
+    gripper: float = 0.0
+    posture_rad: tuple[float, ...] | None = None
 
 
 RollOut = Callable[[Scene, Demo], Floats]
@@ -101,25 +109,31 @@ class Trajectory:
     Attributes:
         trajectory_id: hash of everything that determines it.
         mode: how its actions came about, ``open_loop`` or ``tracked``.
-        model_xml: MJCF of the scene it happened in, asset paths of this machine.
-        states: (K+1, S) flattened states: before each executed action, and after the last.
+        scene: where it started, before the arm and the objects settled; asset paths of this machine.
+        states: (K+1, S) flattened states: before each executed action, and after the last. The first is the first look.
         actions: (K, 7) executed actions.
         kept_mask: (T,) which of the demonstration's actions were executed.
         site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
-        resolved: JSON of what physics perturbations came to in this scene, by axis; or under ``fault`` why the
-            demonstration could not be simulated.
         verdict: the judge's word after the last action.
     """
 
     trajectory_id: str
     mode: str
-    model_xml: str
+    scene: Scene
     states: Floats
     actions: Floats
     kept_mask: NDArray[np.bool_]
     site_alpha: NDArray[np.float32]
-    resolved: str
     verdict: Verdict
+
+    @property
+    def model_xml(self) -> str:
+        return self.scene.model_xml
+
+    @property
+    def resolved(self) -> str:
+        """JSON of what physics perturbations came to, by axis; or under ``fault`` why it could not be simulated."""
+        return json.dumps(self.scene.resolved, sort_keys=True)
 
 
 @dataclass(frozen=True)

@@ -45,12 +45,13 @@ from pipeline.formats.tfrecord import records
 from pipeline.libero import bddl, hdf5
 from pipeline.libero.assets import relocate
 from pipeline.libero.demonstrations import HDF5Source
+from pipeline.libero.starts import recorded_start
 from pipeline.run import manifest, plan
 from pipeline.run.frame_store import FrameStore, Rendered
 from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.tables import write_table
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Trajectory, Verdict
+from pipeline.types import Scene, Trajectory, Verdict
 
 LIMIT_S = 20
 """What takes longer counts as a hang."""
@@ -192,7 +193,14 @@ def _trajectory() -> bytes:
         store = TrajectoryStore(folder)
         store.save(
             Trajectory(
-                "trajectory", "open_loop", "<mujoco/>", states, actions[:20], mask, alpha, "{}", Verdict(True, "kept")
+                "trajectory",
+                "open_loop",
+                Scene("<mujoco/>", states[0]),
+                states,
+                actions[:20],
+                mask,
+                alpha,
+                Verdict(True, "kept"),
             )
         )
         return store.path("trajectory")
@@ -279,7 +287,7 @@ def _read_model(file: Path) -> object:
     except UnicodeDecodeError as error:
         raise PipelineError("not UTF-8", where=file) from error
     environment = shared(STOVE)
-    environment.restore(relocate(text, str(file)), starter_demo(STOVE).init_state)
+    environment.restore(recorded_start(starter_demo(STOVE), relocate(text, str(file))))
     try:
         environment.step(np.zeros(7))
     except RefusedError as error:

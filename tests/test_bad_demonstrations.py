@@ -17,13 +17,14 @@ from pipeline.axes import Axes
 from pipeline.axes.layout import LayoutAxis
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import hdf5
+from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError
 from pipeline.physics.replay import replay_plan
 from pipeline.run import plan
 from pipeline.run.compute import loop
 from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Verdict
+from pipeline.types import Scene, Verdict
 
 STEPS = 10
 REPLAY = ReplayConfig(mode="auto")
@@ -80,7 +81,7 @@ BAD: dict[str, tuple[Callable[[hdf5.Recording], hdf5.Recording], str, str]] = {
 def good_recording() -> hdf5.Recording:
     environment, demo = Environment(STOVE), starter_demo(STOVE)
     model_xml = environment.place_fixtures(0)
-    environment.restore(model_xml, demo.init_state)
+    environment.restore(recorded_start(demo, model_xml))
     states = []
     for action in demo.actions[:STEPS]:
         states.append(environment.state)
@@ -143,11 +144,11 @@ def test_a_bad_scene_leaves_no_trace_in_its_worker() -> None:
     environment = Environment(STOVE)
     reached = []
     for _ in range(2):
-        environment.restore(good.model_file, good.states[0])
+        environment.restore(Scene(good.model_file, good.states[0]))
         for action in good.actions:
             environment.step(action)
         reached.append(environment.state)
         with pytest.raises(UnusableSceneError):
-            environment.restore(renamed("plate_1_main")(good).model_file, good.states[0])
+            environment.restore(Scene(renamed("plate_1_main")(good).model_file, good.states[0]))
     assert np.array_equal(reached[0], reached[1])
     assert environment.place_fixtures(1) == Environment(STOVE).place_fixtures(1)

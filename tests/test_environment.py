@@ -10,7 +10,7 @@ from conftest import STOVE
 
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
-from pipeline.types import Task, Trajectory
+from pipeline.types import Scene, Task, Trajectory
 
 OPEN_DRAWER = find_task(
     "libero_10", "KITCHEN_SCENE4_put_the_black_bowl_in_the_bottom_drawer_of_the_cabinet_and_close_it"
@@ -30,7 +30,8 @@ def test_same_scene_again_is_not_compiled_again_and_steps_the_same(
     trajectory = whole[STOVE]
     compiled = []
     for _ in range(2):
-        stove.restore(trajectory.model_xml, trajectory.states[0])
+        stove.restore(trajectory.scene)
+        stove.settle(10)
         assert np.array_equal(stove.site_alpha, trajectory.site_alpha[0]), "the burner lit before is dark again"
         compiled.append(stove.sim)
         for step, action in enumerate(trajectory.actions, start=1):
@@ -46,7 +47,7 @@ def test_another_scene_between_leaves_no_trace(stove: Environment, whole: dict[T
     touching = len(recorded.actions) - 10
     reached = []
     for model_xml in (recorded.model_xml, stove.place_fixtures(1), recorded.model_xml):
-        stove.restore(model_xml, recorded.states[touching])
+        stove.restore(Scene(model_xml, recorded.states[touching]))
         for action in recorded.actions[touching:]:
             stove.step(action)
         reached.append(stove.state)
@@ -77,7 +78,7 @@ def test_fixtures_stand_the_same_whatever_was_placed_before() -> None:
 
 
 def test_only_pictures_are_left_out_of_the_model(stove: Environment, whole: dict[Task, Trajectory]) -> None:
-    stove.restore(whole[STOVE].model_xml, whole[STOVE].states[0])
+    stove.restore(whole[STOVE].scene)
     ours, recorded = stove.sim.model._model, mujoco.MjModel.from_xml_string(whole[STOVE].model_xml)
     assert ours.ntexdata < recorded.ntexdata / 5
     # Opacity is what LIBERO's reset hides sites by.

@@ -285,16 +285,16 @@ def test_the_goal_moves_with_what_names_it(plate_environment: Environment, scene
     """The front of the stove goes where the stove goes, and LIBERO's own check looks for the plate there."""
     after = together(flat_stove_1=(0.03, -0.08)).apply(scenes(PLATE), starter_demo(PLATE), roll_out)
     region = "main_table_stove_front_region"
-    plate_environment.restore(scenes(PLATE).model_xml, scenes(PLATE).state)
+    plate_environment.restore(scenes(PLATE))
     was = plate_environment.pose(region)
-    plate_environment.restore(after.model_xml, after.state)
+    plate_environment.restore(after)
     now = plate_environment.pose(region)
     assert now - was == pytest.approx([0.03, -0.08, 0, 0, 0, 0, 0], abs=1e-7)
     address = 1 + CompiledScene(after).model.joint("plate_1_joint0").qposadr[0]
     for at, there in ((now, True), (was, False)):
         state = after.state.copy()
         state[address : address + 2] = at[:2]
-        plate_environment.restore(after.model_xml, state)
+        plate_environment.restore(replace(after, state=state))
         assert plate_environment.succeeded() is there
 
 

@@ -193,16 +193,16 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
 
 def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
     environment = Environment(STOVE)
-    environment.restore(stage.scene.model_xml, stage.scene.state)
+    environment.restore(stage.scene)
+    environment.settle(10)
     begun = Trajectory(
         trajectory_id="begun",
         mode="open_loop",
-        model_xml=stage.scene.model_xml,
+        scene=stage.scene,
         states=np.stack([environment.state] * 2),
         actions=np.zeros((1, 7)),
         kept_mask=np.ones(1, bool),
         site_alpha=np.stack([environment.site_alpha] * 2),
-        resolved="{}",
         verdict=Verdict(True, "kept"),
     )
     environment.close()

@@ -148,8 +148,8 @@ def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path
     del short_demos
     source = whole[MILK]
     steps = 8
-    trajectory = Trajectory("t", "open_loop", source.model_xml, source.states[: steps + 1], source.actions[:steps],
-                            source.kept_mask, source.site_alpha[: steps + 1], "{}", source.verdict)  # fmt: skip
+    trajectory = Trajectory("t", "open_loop", source.scene, source.states[: steps + 1], source.actions[:steps],
+                            source.kept_mask, source.site_alpha[: steps + 1], source.verdict)  # fmt: skip
     noise = NoiseAxis().sample(rng("order"), MILK, 0)
     streams = [
         Stream("image", ()),

@@ -72,7 +72,7 @@ def test_policies_nest(drawn: list[tuple[float, float]]) -> None:
 
 def replayed(root: Path, task: Task, environment: Environment, key: str = "demo_0") -> Trajectory:
     demo = HDF5Source(root).load(f"{task.suite}/{task.name}/{key}")
-    return replay(environment, demo, "t", ReplayConfig())
+    return replay(environment, demo, "t", ReplayConfig(settle_steps=0))
 
 
 def hashed(trajectory: Trajectory) -> str:
@@ -156,8 +156,8 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
     # Two pauses: at the start, where the gripper stays as it is, and on the way.
     actions[[0, 1, 5, 6], :6], actions[[0, 1, 5, 6], 6] = 0.0, actions[4, 6]
     demo = replace(demo, actions=actions)
-    trajectory = replay(Environment(STOVE), demo, "t", ReplayConfig(noops=noops), (PathSeen(level=1),))
-    assert len(trajectory.actions) == {"drop": 6, "trim_ends": 8, "keep": 10}[noops]
+    trajectory = replay(Environment(STOVE), demo, "t", ReplayConfig(noops=noops, settle_steps=0), (PathSeen(level=1),))
+    assert len(trajectory.actions) == {"drop": 8, "trim_ends": 10, "keep": 12}[noops]
     assert np.array_equal(json.loads(trajectory.resolved)["path"], trajectory.states)
 
 
@@ -175,7 +175,7 @@ def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> 
 
 def test_state_of_another_scene_is_refused(short_demos: Path, whole: dict[Task, Trajectory]) -> None:
     with pytest.raises(PipelineError, match="the recorded state has 79 numbers, the scene's has 110"):
-        Environment(MILK).restore(whole[MILK].model_xml, whole[BOWL].states[0])
+        Environment(MILK).restore(Scene(whole[MILK].model_xml, whole[BOWL].states[0]))
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import MILK, PLATE, starter_demo
+from scipy.spatial.transform import Rotation
 
-from pipeline.axes.robot import HOME_RAD, RobotAxis, RobotPerturbation, benchmark_offsets_rad
+from pipeline.axes.robot import RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
 from pipeline.errors import RefusedError
-from pipeline.physics.environment import Environment
+from pipeline.evaluation.initial_states import libero_states
+from pipeline.libero.assets import relocate
+from pipeline.libero.starts import HOME_RAD, recorded_start
+from pipeline.physics.environment import Environment, seeded
 from pipeline.physics.replay import replay
 from pipeline.physics.roll_out import roll_out
 from pipeline.scenes.compiled import CompiledScene
@@ -30,7 +34,7 @@ PUBLISHED_RAD = {
 
 
 def turned(*offsets: float) -> RobotPerturbation:
-    return RobotPerturbation.model_validate({"level": 1, "joint_offsets_rad": offsets})
+    return RobotPerturbation.model_validate({"component": "initial_joints", "level": 1, "joint_offsets_rad": offsets})
 
 
 def draws(axis: RobotAxis, count: int) -> list[RobotPerturbation]:
@@ -78,7 +82,7 @@ def test_every_test_offset_is_found_and_draws_are_clear() -> None:
 
 
 def test_only_the_arm_changes(scene: Scene) -> None:
-    drawn = RobotAxis(levels=(3,)).sample(rng("some"), PLATE, 0)
+    drawn = RobotAxis(levels=(3,), components=("initial_joints",)).sample(rng("some"), PLATE, 0)
     moved = drawn.apply(scene, starter_demo(PLATE), roll_out)
     assert moved.model_xml == scene.model_xml
     compiled = CompiledScene(scene)
@@ -108,12 +112,60 @@ def test_what_cannot_be_is_refused(scene: Scene) -> None:
             turned(*offsets).apply(scene, demo, roll_out)
 
 
+def drawn_away(libero: Environment, posture_rad: Floats) -> tuple[Floats, Floats, Floats]:
+    """What LIBERO's own environment does where its reset has another posture, an initial state is put in and settles.
+
+    Returns:
+        The posture (7,) that the reset came to with its noise, and states (S,) before and after settling.
+    """
+    env = libero._env
+    env.env.robot_configs[0]["initial_qpos"] = posture_rad
+    with seeded(3):
+        env.reset()
+    reached = env.sim.data.qpos[env.env.robots[0]._ref_joint_pos_indexes].copy()
+    env.set_init_state(libero_states(PLATE)[0])
+    before = libero.state
+    for _ in range(10):
+        env.step([0.0] * 6 + [-1.0])
+    return reached, before, libero.state
+
+
+def test_a_controllers_posture_draws_the_arm_as_in_the_benchmark() -> None:
+    """The benchmark's robot tasks change the posture of LIBERO's reset, and put an initial state in after it."""
+    libero = Environment(PLATE)
+    offset = np.array([0.2, -0.1, 0.15, 0.2, -0.25, 0.1, 0.2])
+    posture_rad, before, expected = drawn_away(libero, HOME_RAD + offset)
+    model_xml = libero.sim.model.get_xml()
+    start_rad = before[1:8]
+    assert np.linalg.norm(start_rad - HOME_RAD) < 0.15, "the state puts the arm back"
+    ours = Environment(PLATE)
+    change = RobotPerturbation(
+        component="controller_posture", level=5, joint_offsets_rad=tuple((posture_rad - HOME_RAD).tolist())
+    )
+    start = recorded_start(replace(starter_demo(PLATE), init_state=before), relocate(model_xml, "LIBERO"))
+    scene = change.apply(replace(start, gripper=0.0), starter_demo(PLATE), roll_out)
+    assert np.array_equal(scene.state, before)
+    ours.restore(scene)
+    ours.settle(10)
+    assert np.abs(expected[1:8] - start_rad).max() > 0.1, "the arm is drawn away"
+    assert np.allclose(ours.state, expected, rtol=0, atol=1e-5)
+    goal = ours._env.env.robots[0].controller.goal_ori
+    assert np.allclose(goal, libero._env.env.robots[0].controller.goal_ori, rtol=0, atol=1e-6)
+    w, *xyz = scene.resolved["robot"]["goal_wxyz"]
+    assert np.allclose(goal, Rotation.from_quat([*xyz, w]).as_matrix(), rtol=0, atol=1e-8)
+    assert np.allclose(scene.resolved["robot"]["posture_rad"], posture_rad, rtol=0, atol=1e-9)
+    libero.close()
+    ours.close()
+
+
 def test_the_replay_starts_there(environment: Environment) -> None:
-    """The benchmark's own offsets are lost when it restores a state; these must not be."""
+    """Unlike the benchmark's own offsets, which the state that is put in undoes."""
     demo = starter_demo(PLATE)
     short = replace(demo, actions=demo.actions[:3])
-    drawn = RobotAxis(levels=(5,)).sample(rng("another"), PLATE, 0)
+    drawn = RobotAxis(levels=(5,), components=("initial_joints",)).sample(rng("another"), PLATE, 0)
     clean, moved = (replay(environment, short, "t", ReplayConfig(), changes) for changes in ((), (drawn,)))
-    starts = [recorded_rad(Scene(t.model_xml, t.states[0])) for t in (clean, moved)]
+    starts = [recorded_rad(t.scene) for t in (clean, moved)]
     assert np.allclose(starts[1] - starts[0], drawn.joint_offsets_rad, rtol=0, atol=1e-9)
+    looks = [recorded_rad(Scene(t.model_xml, t.states[0])) for t in (clean, moved)]
+    assert np.linalg.norm(looks[1] - starts[1]) < 0.02, "it stays there while the scene settles"
     assert len(moved.states) == len(clean.states)

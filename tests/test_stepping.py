@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from conftest import BOWL, MILK, STOVE, starter_demo
 
+from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
-from pipeline.physics.environment import Environment
+from pipeline.physics.environment import DUMMY_ACTION, Environment
 from pipeline.types import Floats, Task, Trajectory
 
 DRAWER = find_task(
@@ -32,9 +33,11 @@ def steps(environment: Environment, actions: Floats, liberos: bool) -> tuple[Flo
 def test_whole_demonstrations_are_liberos_bit_for_bit(task: Task, whole: dict[Task, Trajectory]) -> None:
     ours = whole[task]
     environment = Environment(task)
-    environment.restore(ours.model_xml, ours.states[0])
+    environment.restore(ours.scene)
+    settled, _, _ = steps(environment, np.tile(DUMMY_ACTION, (10, 1)), liberos=True)
     states, alphas, succeeded = steps(environment, ours.actions, liberos=True)
     environment.close()
+    assert np.array_equal(ours.states[0], settled[-1])
     assert np.array_equal(ours.states[1:], states)
     assert np.array_equal(ours.site_alpha[1:], alphas)
     assert ours.verdict.kept == succeeded[-1]
@@ -51,7 +54,7 @@ def test_actions_beyond_their_limits_are_liberos_bit_for_bit(task: Task) -> None
     assert (np.abs(actions[:, :6]) > 1).any(axis=1).mean() > 0.5
     results = []
     for liberos in (False, True):
-        environment.restore(model_xml, demo.init_state)
+        environment.restore(recorded_start(demo, model_xml))
         results.append(steps(environment, actions, liberos))
     environment.close()
     assert np.array_equal(results[0][0], results[1][0])

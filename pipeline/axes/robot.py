@@ -1,4 +1,4 @@
-"""Robot: the joint angles that the arm starts from. Physics layer."""
+"""Robot: the posture that the arm starts in or is drawn to. Physics layer."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
+from scipy.spatial.transform import Rotation
 
 from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation
 from pipeline.errors import RefusedError
+from pipeline.libero.starts import HOME_RAD
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 if TYPE_CHECKING:
@@ -19,25 +21,31 @@ if TYPE_CHECKING:
 Joints = tuple[float, float, float, float, float, float, float]
 Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
 
-HOME_RAD = np.array([0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4])
-"""(7,) where LIBERO's reset puts the arm, before noise; LIBERO-Plus adds its test offsets to it."""
-
 LIMIT_MARGIN_RAD = 0.05
 """How far from its limits every joint must start."""
 
 
-class RobotPerturbation(PhysicsPerturbation):
-    """Arm joints turned away from where the demonstration starts.
+Component = Literal["initial_joints", "controller_posture"]
 
-    The offset is added to the recorded start, not to the home posture: LIBERO's reset scatters recorded starts by 0.02
-    to 0.10 rad about home, and only so is the change as large as its level says, and no offset the clean twin.
+
+class RobotPerturbation(PhysicsPerturbation):
+    """A posture away from where the demonstration starts.
+
+    ``initial_joints`` puts the arm there, and the controller holds it there. ``controller_posture`` does what
+    LIBERO-Plus's robot tasks do: there the reset has another posture, and then the recorded state is put in. So the arm
+    starts where it was recorded, and the controller draws it, while the scene settles and all through the episode, to
+    the posture by its null space, and to the posture's hand orientation until an action turns the hand.
+
+    The offset is added to the same of the clean twin: ``initial_joints`` to the recorded start, which LIBERO's reset
+    scattered by 0.02 to 0.10 rad about home, ``controller_posture`` to the posture of the reset. Only so is the change
+    as large as its level says, and no offset the clean twin.
 
     Attributes:
         joint_offsets_rad: base to wrist.
     """
 
     axis: Literal["robot"] = "robot"
-    component: Literal["initial_joints"] = "initial_joints"
+    component: Component
     joint_offsets_rad: Joints
 
     # A fifth of the weakest offset, and less than half of the 0.05 rad by which LIBERO's own reset scatters the start.
@@ -45,12 +53,12 @@ class RobotPerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "rad: the norm of the difference between the joint offsets"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene with the arm turned and at rest; the gripper and everything else stay as they are.
+        """The scene with the arm turned and at rest, or with the controller's posture; all else stays as it is.
 
         Raises:
             RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot
-                touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add up
-                to a posture of the test set.
+                is put where it touches what it did not touch before, ``test_posture`` when recorded start and offset
+                happen to add up to a posture of the test set.
         """
         from pipeline.scenes.compiled import CompiledScene
 
@@ -60,7 +68,8 @@ class RobotPerturbation(PhysicsPerturbation):
         before = compiled.touching(robot).keys()
         joints = [model.joint(f"robot0_joint{n}") for n in range(1, 8)]
         arm = [joint.qposadr[0] for joint in joints]
-        posture = data.qpos[arm] + self.joint_offsets_rad
+        drawn = self.component == "controller_posture" and scene.posture_rad is not None
+        posture = (scene.posture_rad if drawn else data.qpos[arm]) + np.array(self.joint_offsets_rad)
         low, high = np.array([joint.range for joint in joints]).T
         if (posture < low + LIMIT_MARGIN_RAD).any() or (posture > high - LIMIT_MARGIN_RAD).any():
             raise RefusedError("joint_limit")
@@ -70,9 +79,14 @@ class RobotPerturbation(PhysicsPerturbation):
         data.qvel[[joint.dofadr[0] for joint in joints]] = 0.0
         state = compiled.state
         compiled.restore(state)
+        if self.component == "controller_posture":
+            hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
+            drawn_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
+            return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": drawn_to})
         if compiled.touching(robot).keys() - before:
             raise RefusedError("robot_in_collision")
-        return replace(scene, state=state, resolved={**scene.resolved, "robot": {"joints_rad": posture.tolist()}})
+        resolved = {**scene.resolved, "robot": {"joints_rad": posture.tolist()}}
+        return replace(scene, state=state, posture_rad=None, resolved=resolved)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """To the offsets of all robot tasks; the arm is the same in all, so ``task`` does not matter."""
@@ -106,9 +120,11 @@ class RobotAxis(Axis):
     """Offsets in all directions with equal chance.
 
     Attributes:
+        components: what to draw, each as often as the others.
         norm_rad: the norm of the offset at each level; the defaults are the benchmark's.
     """
 
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("controller_posture", "initial_joints")
     norm_rad: tuple[Norm, Norm, Norm, Norm, Norm] = (
         0.1,
         0.2,
@@ -119,6 +135,9 @@ class RobotAxis(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
         level = self.draw_level(rng)
+        component = self.components[rng.integers(len(self.components))]
         direction = rng.standard_normal(7)
         offsets = direction * (self.norm_rad[level - 1] / np.linalg.norm(direction))
-        return RobotPerturbation.model_validate({"level": level, "joint_offsets_rad": offsets.round(6).tolist()})
+        return RobotPerturbation.model_validate(
+            {"component": component, "level": level, "joint_offsets_rad": offsets.round(6).tolist()}
+        )

@@ -25,6 +25,7 @@ from pipeline.evaluation.settings import VIEWS, Settings, Wanted
 from pipeline.evaluation.simulator import Observed, Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import SceneFiles
@@ -240,18 +241,19 @@ class EpisodeEnvironment:
         self._start(demo, seed, scene)
 
     def _nominal(self, seed: int, demo: Demo) -> Scene:
-        return Scene(self._opened.place_fixtures(seed), demo.init_state)
+        scene = recorded_start(demo, self._opened.place_fixtures(seed))
+        # A recording had the gripper open; LIBERO's reset, after which its own states are put in, leaves it without a
+        # command.
+        return scene if self.settings.initial_states == "demonstration" else replace(scene, gripper=0.0)
 
     def _start(self, demo: Demo, seed: int, scene: Scene | None) -> None:
         """Start from a demonstration's initial state, in LIBERO's scene or a changed one."""
-        settle = self.settings.initial_states == "libero"
-        if scene is None and settle:
+        if scene is None and self.settings.initial_states == "libero":
             self._opened.start(seed, demo.init_state)
             self._picture.show(self._opened.model)
             return
-        # A demonstration was recorded from its first state on, by an arm that holds the posture it starts in.
         scene = scene or self._nominal(seed, demo)
-        self._opened.start_scene(scene, settle)
+        self._opened.start_scene(scene)
         self._picture.show(scene.model_xml)
 
     @property

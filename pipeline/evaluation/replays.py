@@ -12,14 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.evaluation.policies import Look
 from pipeline.evaluation.settings import Wanted
-from pipeline.evaluation.simulator import DUMMY_ACTION, Simulator
+from pipeline.evaluation.simulator import Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
+from pipeline.physics.environment import DUMMY_ACTION
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Hand, Route, follow
 from pipeline.scenes.noops import kept_actions
-from pipeline.types import Floats, Scene
+from pipeline.types import Floats
 
 
 class Replay:
@@ -85,8 +87,8 @@ def _reference(suite: str, base: str) -> Reference:
     demo = StarterSource().of(find_task(suite, base))
     actions = demo.actions[kept_actions(demo.actions, "drop")]
     with closing(Simulator(demo.task)) as simulator:
-        scene = Scene(simulator.place_fixtures(0), demo.init_state)
-        simulator.start_scene(scene, settle=False)
+        scene = recorded_start(demo, simulator.place_fixtures(0))
+        simulator.start_scene(scene)
         states, observed = [simulator.state], [simulator.observed.state]
         for action in actions:
             simulator.step(action)

@@ -20,10 +20,6 @@ from pipeline.types import Floats, Scene, Task
 SETTLING_STEPS = 10
 """Control steps before the policy's first look, while objects fall into place (OpenVLA's and LIBERO-Plus's rule)."""
 
-DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
-"""(7,) what is done in them: nothing, with the gripper open."""
-
-
 _PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -127,13 +123,15 @@ class Simulator(Environment):
         env.sim.set_state_from_flattened(state)
         env.sim.forward()
         env._post_process()
-        self._settle(SETTLING_STEPS)
+        self._observe_from_here()
+        self.settle(SETTLING_STEPS)
 
-    def start_scene(self, scene: Scene, settle: bool) -> None:
-        """Restore a scene that does not come from LIBERO's reset, such as a perturbed one."""
+    def start_scene(self, scene: Scene) -> None:
+        """Restore a scene that does not come from LIBERO's reset, such as a perturbed one, and settle."""
         self._rewind = None
-        self.restore(scene.model_xml, scene.state)
-        self._settle(SETTLING_STEPS if settle else 0)
+        self.restore(scene)
+        self._observe_from_here()
+        self.settle(SETTLING_STEPS)
 
     def place_fixtures(self, seed: int) -> str:
         """See ``Environment``; what ``start`` kept of its reset goes."""
@@ -162,13 +160,11 @@ class Simulator(Environment):
             _copied(vars(env.robots[0].controller)),
         )
 
-    def _settle(self, steps: int) -> None:
+    def _observe_from_here(self) -> None:
         env = self._env.env
         self._control_step = ControlStep(env)
         self._clock = ObservationClock(env.model_timestep, 1 / env.control_freq)
         self.observed = self._observe(env.sim.data.qpos.copy())
-        for _ in range(steps):
-            self.step(DUMMY_ACTION)
 
     def step(self, action: Floats) -> None:
         """Run one control step (50 ms), and keep what LIBERO observes of it in ``observed``.

@@ -24,7 +24,10 @@ from pipeline.libero.assets import as_evaluated
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import fixed_pose, physics_of, put_images, take_images
 from pipeline.scenes.swept_path import SURFACES
-from pipeline.types import Floats, Task
+from pipeline.types import Floats, Scene, Task
+
+DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
+"""(7,) what is done while a scene settles: nothing, with the gripper open (OpenVLA's and LIBERO-Plus's rule)."""
 
 PLACEMENT_TRIES = 50
 """Resets, of which each draws 5,000 places for an object that finds none."""
@@ -180,46 +183,59 @@ class Environment:
     def _reset_until_placed(self) -> None:
         _until_placed(self._env.env.reset, self.task)
 
-    def restore(self, model_xml: str, state: Floats) -> None:
-        """Put the environment into a recorded scene and state; nothing from before has an effect on what follows.
+    def restore(self, scene: Scene) -> None:
+        """Put the environment where a scene starts; nothing from before has an effect on what follows.
 
         A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms.
-
-        Args:
-            model_xml: MJCF of the scene.
-            state: (S,) flattened MuJoCo state: time, qpos, qvel.
 
         Raises:
             UnusableSceneError: when MuJoCo or LIBERO refuses the scene, or the state is not of its model.
         """
         env = self._env.env
-        if model_xml != self._scene:
+        if scene.model_xml != self._scene:
             self._scene = None
             try:
-                self._open(model_xml)
+                self._open(scene.model_xml)
             except (ValueError, KeyError, mujoco.FatalError) as error:
                 # What MuJoCo raises when it compiles, and robosuite when a name that it looks up is not in the model.
                 raise UnusableSceneError(
                     "scene_refused", f"the scene is refused ({error!s:.300})", self.task
                 ) from error
             self._check_names()
-            self._scene, self._site_rgba = model_xml, env.sim.model.site_rgba.copy()
+            self._scene, self._site_rgba = scene.model_xml, env.sim.model.site_rgba.copy()
         else:
             # The part of the model that LIBERO changes while it steps: the site that shows a lit burner.
             env.sim.model.site_rgba[:] = self._site_rgba
             self._reset_in_place()
-        # The gripper model survives the reset with its last command, which the next command is added to.
-        env.robots[0].gripper.current_action = np.zeros(env.robots[0].gripper.dof)
-        env.sim.reset()
-        self._check_state(state)
-        env.sim.set_state_from_flattened(state)
-        env.sim.forward()
-        # As after a reset in an evaluation: the controller knows where the arm is, and its null space holds the arm to
-        # the posture that it starts in, not to robosuite's home posture.
         robot = env.robots[0]
+        # Of both fingers; robosuite's gripper survives the reset with its last command.
+        robot.gripper.current_action = scene.gripper * np.array([-1.0, 1.0])
+        env.sim.reset()
+        self._check_state(scene.state)
+        env.sim.set_state_from_flattened(scene.state)
+        if scene.posture_rad is not None:
+            env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
+            env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
+        env.sim.forward()
+        # As after a reset in an evaluation: the controller knows where the arm is, and its null space draws the arm to
+        # the posture that it is in, not to robosuite's home posture.
         robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
+        if scene.posture_rad is not None:
+            # As where LIBERO-Plus puts an initial state in after a reset with another posture: until the end of its
+            # first substep, the controller takes the arm to be there still.
+            env.sim.set_state_from_flattened(scene.state)
+            env.sim.forward()
         env._post_process()
         self._control_step = ControlStep(env)
+
+    def settle(self, steps: int) -> None:
+        """Do nothing for some control steps, with the gripper open, while the arm and objects come to rest.
+
+        Raises:
+            RefusedError: see ``step``.
+        """
+        for _ in range(steps):
+            self.step(DUMMY_ACTION)
 
     def _open(self, model_xml: str) -> None:
         """As robosuite's ``reset_from_xml_string``, but a scene that was compiled lately is not compiled again."""

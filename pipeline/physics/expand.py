@@ -104,7 +104,7 @@ def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSe
 def _rows(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
     """The candidates: arm and target moved where a task moves something, the arm alone where it only opens or turns."""
     entries = demos.index().entries
-    axes = Axes(pose=PoseAxis(), robot=RobotAxis())
+    axes = Axes(pose=PoseAxis(components=("target",)), robot=RobotAxis(components=("initial_joints",)))
     rows: list[plan.Row] = []
     for moves in (True, False):
         group = [entry for entry in entries if PoseAxis().applies(entry.task) == moves]

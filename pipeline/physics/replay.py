@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from pipeline.axes import PhysicsPerturbation, from_json, of_layer
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import Edition, edition
+from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError, shared
 from pipeline.physics.reference import Reference
 from pipeline.physics.roll_out import roll_out
@@ -36,7 +36,7 @@ def replay(
     perturbations: Sequence[PhysicsPerturbation] = (),
     reference: Callable[[], Reference | None] = lambda: None,
 ) -> Trajectory:
-    """Replay a demonstration from its exact first state, or a perturbed one, in the configured mode.
+    """Replay a demonstration from its first state, or a perturbed one, once that has settled, in the configured mode.
 
     A demonstration whose scene or state cannot be simulated makes a trajectory that is dropped, not an error.
 
@@ -57,10 +57,11 @@ def replay(
         return _not_simulated(demo, trajectory_id, error, mask)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
-        environment.restore(scene.model_xml, scene.state)
-        states, alphas, actions, succeeded = [environment.state], [environment.site_alpha], [], []
-        refusal = refused
+        environment.restore(scene)
+        refusal, states, alphas, actions, succeeded = refused, [], [], [], []
         try:
+            environment.settle(0 if refused else config.settle_steps)
+            states, alphas = [environment.state], [environment.site_alpha]
             for action in policy() if not refused else ():
                 environment.step(action)
                 actions.append(action)
@@ -72,12 +73,11 @@ def replay(
         return Trajectory(
             trajectory_id=trajectory_id,
             mode=mode,
-            model_xml=scene.model_xml,
+            scene=scene,
             states=np.stack(states),
             actions=np.array(actions).reshape(-1, 7),
             kept_mask=mask,
             site_alpha=np.stack(alphas),
-            resolved=json.dumps(scene.resolved, sort_keys=True),
             verdict=refusal or verdict(np.stack(states), np.array(succeeded, bool)),
         )
 
@@ -106,12 +106,13 @@ def _perturbed(
     Raises:
         UnusableSceneError: when the demonstration cannot be simulated at all.
     """
-    scene = Scene(demo.model_xml or environment.place_fixtures(config.fixture_seed), demo.init_state)
+    model_xml = demo.model_xml or environment.place_fixtures(config.fixture_seed)
+    scene = recorded_start(demo, model_xml, settles=config.settle_steps > 0)
     # Before perturbations compile it themselves, which would fail in ways of their own.
-    environment.restore(scene.model_xml, scene.state)
+    environment.restore(scene)
     try:
         for perturbation in perturbations:
-            scene = perturbation.apply(scene, demo, partial(roll_out, noops=config.noops))
+            scene = perturbation.apply(scene, demo, partial(roll_out, config=config))
     except RefusedError as error:
         return scene, Verdict(False, error.reason)
     return scene, None
@@ -121,12 +122,11 @@ def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError, ma
     return Trajectory(
         trajectory_id=trajectory_id,
         mode="open_loop",
-        model_xml=demo.model_xml or "",
+        scene=Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)}),
         states=demo.init_state[None],
         actions=np.empty((0, 7)),
         kept_mask=mask,
         site_alpha=np.empty((1, 0), np.float32),
-        resolved=json.dumps({"fault": str(error)}),
         verdict=Verdict(False, error.reason),
     )
 
@@ -194,12 +194,11 @@ class ReplayJob:
         trajectory = Trajectory(
             trajectory_id=self.trajectory_id,
             mode="open_loop",
-            model_xml="",
+            scene=Scene("", np.zeros(1), {"fault": "workers ended in it, or it took too long"}),
             states=np.zeros((1, 1)),
             actions=np.empty((0, 7)),
             kept_mask=np.empty(0, bool),
             site_alpha=np.empty((1, 0), np.float32),
-            resolved=json.dumps({"fault": "workers ended in it, or it took too long"}),
             verdict=Verdict(False, LOST),
         )
         TrajectoryStore(self.folder).save(trajectory)

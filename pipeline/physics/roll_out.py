@@ -1,4 +1,4 @@
-"""Where a demonstration's actions lead from a scene, for perturbations that must keep out of their way."""
+"""Where a scene and a demonstration's actions in it lead, for whoever looks before the replay."""
 
 from __future__ import annotations
 
@@ -6,30 +6,51 @@ from functools import lru_cache
 
 import numpy as np
 
+from pipeline.config import ReplayConfig
 from pipeline.physics.environment import shared
 from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Task
 
 
-def roll_out(scene: Scene, demo: Demo, noops: str = "drop") -> Floats:
-    """(K+1, S) states that the demonstration's actions lead through from ``scene``.
+def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
+    """(K+1, S) states that the demonstration's actions lead through from ``scene``, once that has settled.
 
     Args:
-        noops: which actions are left out, as in the replay that follows; see ``kept_actions``.
+        config: how the replay that follows settles, and which actions it leaves out.
 
     Raises:
         RefusedError: ``simulation_unstable``.
     """
-    return _states(demo.task, scene.model_xml, scene.state.tobytes(), demo.actions.tobytes(), noops)
+    actions = demo.actions[kept_actions(demo.actions, config.noops)]
+    return _states(demo.task, _start(scene), actions.tobytes(), config.settle_steps)
+
+
+def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
+    """(S,) what the first frame of a replay shows: the state in which ``scene`` has settled.
+
+    Raises:
+        RefusedError: ``simulation_unstable``.
+    """
+    state: Floats = _states(task, _start(scene), b"", config.settle_steps)[0]
+    return state
+
+
+_Start = tuple[str, bytes, float, tuple[float, ...] | None]
+
+
+def _start(scene: Scene) -> _Start:
+    """What a replay in the scene depends on; unlike the scene, it can be a key."""
+    return scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad
 
 
 @lru_cache(maxsize=4)
-def _states(task: Task, model_xml: str, state: bytes, actions: bytes, noops: str) -> Floats:
+def _states(task: Task, start: _Start, actions: bytes, settle_steps: int) -> Floats:
+    model_xml, state, gripper, posture_rad = start
     environment = shared(task)
-    environment.restore(model_xml, np.frombuffer(state))
-    recorded = np.frombuffer(actions).reshape(-1, 7)
+    environment.restore(Scene(model_xml, np.frombuffer(state), gripper=gripper, posture_rad=posture_rad))
+    environment.settle(settle_steps)
     states = [environment.state]
-    for action in recorded[kept_actions(recorded, noops)]:
+    for action in np.frombuffer(actions).reshape(-1, 7):
         environment.step(action)
         states.append(environment.state)
     return np.stack(states)

@@ -7,7 +7,7 @@ demonstration.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -25,14 +25,15 @@ from pipeline.axes import (
     RenderPerturbation,
     of_layer,
 )
-from pipeline.config import Config
+from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import replaced
 from pipeline.libero.demonstrations import Problem
+from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.roll_out import first_look, roll_out
 from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
 from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.last_scene import LastScene, scene_of_process
@@ -60,13 +61,13 @@ class Stage:
         demo: one of its demonstrations.
         scene: the demonstration's first state.
         opened: where scenes are rendered.
-        noops: how a run treats the demonstration's no-ops; see ``kept_actions``.
+        replay: how a run settles, and treats the demonstration's no-ops.
     """
 
     demo: Demo
     scene: Scene
     opened: LastScene
-    noops: str = "drop"
+    replay: ReplayConfig = field(default_factory=ReplayConfig)
 
     def frames(self, views: Sequence[str], perturbation: AnyPerturbation | None = None) -> list[Frame]:
         """What the views show, (H, W, 3) each, as a policy sees them.
@@ -77,11 +78,11 @@ class Stage:
         changes = () if perturbation is None else (perturbation,)
         scene = self.scene
         for physics in of_layer(changes, PhysicsPerturbation):
-            scene = physics.apply(scene, self.demo, partial(roll_out, noops=self.noops))
+            scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
         shown = []
         with renderer.perturbed(of_layer(changes, RenderPerturbation)):
-            renderer.restore(scene.state, renderer.model.site_rgba[:, 3].copy())
+            renderer.restore(first_look(scene, self.demo.task, self.replay), renderer.model.site_rgba[:, 3].copy())
             for view in views:
                 frame = renderer.frame(SCHEMA.views[view].camera)
                 for noise in of_layer(changes, PixelPerturbation):
@@ -115,7 +116,9 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
     model_xml = demo.model_xml
     if model_xml is None:
         model_xml = shared(demo.task).place_fixtures(config.replay.fixture_seed)
-    return Stage(demo, Scene(model_xml, demo.init_state), scene_of_process(), config.replay.noops)
+    return Stage(
+        demo, recorded_start(demo, model_xml, settles=config.replay.settle_steps > 0), scene_of_process(), config.replay
+    )
 
 
 def configured(name: str, config: Config) -> AnyAxis:

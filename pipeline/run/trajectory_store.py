@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from pipeline.catalogue.scene_files import located, portable
 from pipeline.identity import fingerprint
 from pipeline.run.sealed_file import SealedFile
 from pipeline.run.store import Store
-from pipeline.types import Trajectory, Verdict
+from pipeline.types import Scene, Trajectory, Verdict
 
 _COLUMNS = {
     "kept": pa.bool_(),
@@ -42,9 +43,12 @@ class TrajectoryStore(Store):
             "kept": bool(trajectory.verdict.kept),
             "reason": trajectory.verdict.reason,
             "resolved": trajectory.resolved,
+            "gripper": trajectory.scene.gripper,
+            "posture_rad": trajectory.scene.posture_rad,
         }
         with self.created(trajectory.trajectory_id, attributes) as file:
             file["model_xml"] = np.frombuffer(portable(trajectory.model_xml).encode(), np.uint8)
+            file["start"] = trajectory.scene.state
             file["states"] = trajectory.states
             file["actions"] = trajectory.actions
             file["kept_mask"] = trajectory.kept_mask
@@ -57,15 +61,22 @@ class TrajectoryStore(Store):
             PipelineError: when its file is missing, damaged or not current, or what its scene is made of is not here.
         """
         with self.opened(trajectory_id) as file:
+            posture_rad = file.attributes["posture_rad"]
+            scene = Scene(
+                model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
+                state=file.array("start"),
+                resolved=json.loads(file.attributes["resolved"]),
+                gripper=file.attributes["gripper"],
+                posture_rad=None if posture_rad is None else tuple(posture_rad),
+            )
             return Trajectory(
                 trajectory_id=trajectory_id,
                 mode=file.attributes["mode"],
-                model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
+                scene=scene,
                 states=file.array("states"),
                 actions=file.array("actions"),
                 kept_mask=file.array("kept_mask"),
                 site_alpha=file.array("site_alpha"),
-                resolved=file.attributes["resolved"],
                 verdict=Verdict(file.attributes["kept"], file.attributes["reason"]),
             )
 
