@@ -21,7 +21,9 @@ from pipeline.scenes.compiled import CompiledScene
 from pipeline.types import Demo, Floats, Scene
 
 MOVED = PosePerturbation(component="target", level=2, moved="plate_1", dx_m=0.01, dy_m=-0.02, dyaw_deg=5)
-TURNED = RobotPerturbation(level=1, joint_offsets_rad=(0.05, 0.03, 0.04, 0.05, 0.02, 0.03, 0.05))
+TURNED = RobotPerturbation(
+    component="initial_joints", level=1, joint_offsets_rad=(0.05, 0.03, 0.04, 0.05, 0.02, 0.03, 0.05)
+)
 
 
 @pytest.fixture(scope="module")

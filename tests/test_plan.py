@@ -261,7 +261,7 @@ def test_rewrites_stay_unambiguous_among_added_objects() -> None:
 
 def test_an_axis_is_spread_over_the_tasks_that_it_applies_to() -> None:
     demos = [DemoEntry(task, "demo_0", "test", "human", task.name, steps=100) for task in tasks("libero_goal")]
-    pose = config(axes=Axes(pose=PoseAxis()), episodes={"pose": 16}, reserve=0)
+    pose = config(axes=Axes(pose=PoseAxis(components=("target",))), episodes={"pose": 16}, reserve=0)
     wanted = Counter(row.task for row in plan.make(demos, pose, REPLAY, NO_TESTS) if row.axis == "pose")
     assert wanted.keys() == {task.name for task in tasks("libero_goal")} - STILL
     assert set(wanted.values()) == {2}

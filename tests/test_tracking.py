@@ -233,7 +233,7 @@ def test_tracking_reaches_what_open_loop_misses(task: Task, whole: dict[Task, Tr
     assert (kept.mode, kept.verdict.reason) == ("tracked", "kept")
     assert np.array_equal(kept.states[0], missed.states[0])
     assert len(kept.actions) < 1.3 * len(whole[task].actions)
-    executed = Demo(task, "k", "s", "expanded", "0", kept.actions, kept.states[0], None, kept.model_xml)
+    executed = Demo(task, "k", "s", "expanded", "0", kept.actions, kept.scene.state, None, kept.model_xml)
     again = replay(environment, executed, "t", ReplayConfig(noops="keep"))
     assert np.array_equal(again.states, kept.states)
     assert again.verdict == kept.verdict

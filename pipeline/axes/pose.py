@@ -162,20 +162,20 @@ def _settle(compiled: CompiledScene, moved: str) -> _Settled:
 
 
 class PoseAxis(Axis):
-    """Displacements in all directions with equal chance, and turns to both sides.
+    """Displacements in all directions with equal chance.
 
-    At level k the displacement is k - 1 to k times ``step_m``, uniform over the ring, and the turn k - 1 to k times
-    ``step_deg``. Where there are several objects to choose from, one is drawn.
-
-    The component ``scene`` moves everything at once, by LIBERO-Plus's distances instead: see ``draw_scene``.
+    The component ``scene`` moves everything at once, as LIBERO-Plus does: see ``draw_scene``. The others move and turn
+    one object; where there are several to choose from, one is drawn.
 
     Attributes:
         components: what to move.
+        step_m: at level k one object is moved by k - 1 to k times this, uniform over the ring.
+        turn_deg: one object is turned by up to so much to either side, uniform, whatever the level.
     """
 
-    components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("target",)
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("scene",)
     step_m: float = Field(default=0.016, ge=0.0001, le=0.2)
-    step_deg: float = Field(default=4.0, ge=0.01, le=36.0)
+    turn_deg: float = Field(default=20.0, ge=0.0, le=180.0)
 
     def applies(self, task: Task) -> bool:
         """Whether there is something to move: some tasks only open, close or turn what stays where it is."""
@@ -210,12 +210,12 @@ class PoseAxis(Axis):
             return draw_scene(rng, level, task)
         reach_m = self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2))
         bearing_rad = rng.uniform(-math.pi, math.pi)
-        dyaw_deg = self.step_deg * rng.uniform(level - 1, level) * rng.choice([-1, 1])
+        dyaw_deg = rng.uniform(-self.turn_deg, self.turn_deg)
         return PosePerturbation(
             level=level,
             component=component,
             moved=moved,
             dx_m=round(reach_m * math.cos(bearing_rad), 4),
             dy_m=round(reach_m * math.sin(bearing_rad), 4),
-            dyaw_deg=round(float(dyaw_deg), 2),
+            dyaw_deg=round(dyaw_deg, 2),
         )

@@ -39,8 +39,9 @@ ROUGH = {"steps": 1.5, "path_m": 1.5, "jerk": 2.0}
 APART_RAD, APART_M = 0.05, 0.005
 """Two demonstrations of a task are the same when their arms start closer than this, and every object of theirs does."""
 
-REPLAY = ReplayConfig(mode="auto", noops="keep")
-"""No-ops are kept, as in LIBERO's files: whoever reads them drops what they do not want."""
+REPLAY = ReplayConfig(mode="auto", noops="keep", settle_steps=0)
+"""No-ops are kept and nothing settles first, as in LIBERO's files: whoever reads them drops what they do not want, and
+settles as they want."""
 
 
 @dataclass
@@ -104,10 +105,11 @@ def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSe
 def _rows(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
     """The candidates: arm and target moved where a task moves something, the arm alone where it only opens or turns."""
     entries = demos.index().entries
-    axes = Axes(pose=PoseAxis(components=("target",)), robot=RobotAxis(components=("initial_joints",)))
+    target = PoseAxis(components=("target",))
+    axes = Axes(pose=target, robot=RobotAxis(components=("initial_joints",)))
     rows: list[plan.Row] = []
     for moves in (True, False):
-        group = [entry for entry in entries if PoseAxis().applies(entry.task) == moves]
+        group = [entry for entry in entries if target.applies(entry.task) == moves]
         if group:
             name = "pose+robot" if moves else "robot"
             drawn_from = axes if moves else Axes(robot=axes.robot)
