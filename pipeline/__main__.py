@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from rich.console import Console
 
 from pipeline.arguments import positive
 from pipeline.axes import Axes
@@ -108,6 +109,16 @@ def _check_oft(arguments: argparse.Namespace) -> int:
     found = oft_check.check_run(arguments.data)
     print(json.dumps(found))
     return int(any(dataset["violations"] for dataset in found.values()))
+
+
+def _coverage(arguments: argparse.Namespace) -> int:
+    # The simulator takes seconds to import, which the other commands can do without.
+    from pipeline.publish import seen
+
+    measures = seen.measure(owned(arguments.config or _chosen()), benchmark.load())
+    Console().print(seen.table(measures))
+    print(json.dumps({f"{one.axis}: {one.what}": {"tests": one.tested, "run": one.ours} for one in measures}))
+    return 0
 
 
 def _verify(arguments: argparse.Namespace) -> int:
@@ -288,6 +299,22 @@ def parser() -> argparse.ArgumentParser:
     )
     command.add_argument("data", type=Path, metavar="DIR", help="the run's data folder, such as data/starter")
     command.set_defaults(run=_check_oft)
+
+    command = commands.add_parser(
+        "coverage",
+        help="set what a policy sees in a finished run beside what it sees in the benchmark's test tasks",
+        description="First looks, how far the hand and the targets are moved, where objects are added, how much of a "
+        "view changes, grey levels and words, axis by axis. The last line is JSON: number, tenth, fiftieth and "
+        "ninetieth percentile of each.",
+    )
+    command.add_argument(
+        "config",
+        type=Path,
+        nargs="?",
+        metavar="CONFIG",
+        help="of the run, such as configs/starter.yaml (default: the one that params.yaml names)",
+    )
+    command.set_defaults(run=_coverage)
 
     command = commands.add_parser(
         "verify",

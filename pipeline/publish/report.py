@@ -17,7 +17,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.libero.tasks import find_task
-from pipeline.publish import clips, coverage, figures, pages, yields
+from pipeline.publish import clips, coverage, figures, pages, seen, yields
 from pipeline.publish.clips import Clip
 from pipeline.publish.coverage import AxisPlots, Draw
 from pipeline.publish.figures import Panel
@@ -70,6 +70,7 @@ def page(config: Config, test: TestSet) -> str:
         overall=_overall(kept, actions),
         by_axis=_own_motion(kept, actions),
         lengths=_lengths(rows, kept),
+        seen=seen.measure(config, test),
         coverage=_coverage(asked, test),
         rewrites=_rewrites(kept),
         leakage=leakage,

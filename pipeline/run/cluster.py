@@ -29,7 +29,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 PACKAGE = "pipeline"
-SOURCES = (".py", ".yaml", ".j2")
+SOURCES = (".py", ".yaml", ".json", ".j2")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,277 @@
+"""What a policy sees: a run's kept episodes beside the benchmark's test tasks, axis by axis.
+
+Other measures compare parameters. Here it is centimetres of the hand, shares of a view, grey levels and words. What
+test tasks show is in ``pipeline/testset/seen.json``, which ``benchmarks/test_tasks_seen.py`` makes by running them, and
+in what the benchmark's files say of them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.table import Table
+from scipy.spatial.transform import Rotation
+
+from pipeline.axes import from_json
+from pipeline.axes.background import BackgroundPerturbation
+from pipeline.axes.language import LanguagePerturbation
+from pipeline.axes.layout import LayoutPerturbation
+from pipeline.axes.noise import NoisePerturbation
+from pipeline.axes.robot import RobotPerturbation
+from pipeline.axes.scene import ScenePerturbation, displacements
+from pipeline.config import Config
+from pipeline.episode_schema import SCHEMA
+from pipeline.libero import bddl
+from pipeline.libero.bddl import Arena
+from pipeline.libero.tasks import find_task
+from pipeline.rendering.jpeg import decode
+from pipeline.run import outcome
+from pipeline.run.frame_store import FrameStore
+from pipeline.run.plan import Row
+from pipeline.run.streams import streams_of
+from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.scenes.compiled import physics_to_read
+from pipeline.scenes.swept_path import SURFACES
+from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.types import Floats
+
+FILE = Path(__file__).parents[1] / "testset" / "seen.json"
+
+CAMERA_SIDE_M = 0.19
+"""From where on, along x in the frame of the working surface, an object stands on the side of the agent camera."""
+
+CAMERA_M: dict[Arena, tuple[float, float]] = {
+    "tabletop": (0.66, 0.71),
+    "kitchen": (0.66, 0.71),
+    "study": (0.66, 0.74),
+    "floor": (0.90, 0.65),
+    "living_room": (0.61, 0.55),
+}
+"""Where LIBERO's agent camera is, by arena: along x in the frame of the working surface, and above it."""
+
+SAMPLE = 200
+"""Kept episodes of each axis that are looked at, at most: a new scene takes a third of a second."""
+
+CHANGED_LEVELS = 8
+"""A pixel has changed where a channel differs by so many grey levels."""
+
+NOT_HERE = "-"
+
+
+class Spread(NamedTuple):
+    """Of ``number`` values: the tenth, fiftieth and ninetieth percentile."""
+
+    number: int
+    low: float
+    middle: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.middle:.3g} ({self.low:.3g} to {self.high:.3g})"
+
+
+def spread(values: ArrayLike) -> Spread:
+    """Of one value at least."""
+    measured = np.asarray(values, float)
+    return Spread(measured.size, *(round(float(q), 4) for q in np.percentile(measured, [10, 50, 90])))
+
+
+class Measure(NamedTuple):
+    """One thing that is seen; None where there is nothing to measure."""
+
+    axis: str
+    what: str
+    tested: Spread | None
+    ours: Spread | None
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is at rest or not in one state.
+
+    Attributes:
+        position_m, rotation: of the hand, in the world's frame.
+        gripper_mm: between the fingers.
+        hand_cm_s, object_cm_s: speed of the hand, and of the fastest movable object.
+    """
+
+    position_m: Floats
+    rotation: Rotation
+    gripper_mm: float
+    hand_cm_s: float
+    object_cm_s: float
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, state: Floats) -> Look:
+        """Args: state: (S,) flattened MuJoCo state of the model."""
+        data, moving = mujoco.MjData(model), np.empty(6)
+        data.qpos[:], data.qvel[:] = state[1 : 1 + model.nq], state[1 + model.nq :]
+        mujoco.mj_forward(model, data)
+        hand = data.site("gripper0_grip_site")
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, hand.id, moving, 0)
+        left, right = (data.joint(f"gripper0_finger_joint{n}").qpos[0] for n in (1, 2))
+        free = model.jnt_dofadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+        speeds = [float(np.linalg.norm(data.qvel[first : first + 3])) for first in free]
+        return cls(
+            hand.xpos.copy(),
+            Rotation.from_matrix(hand.xmat.reshape(3, 3)),
+            1000 * float(left - right),
+            100 * float(np.linalg.norm(moving[3:])),
+            100 * max(speeds, default=0.0),
+        )
+
+    def measures(self) -> dict[str, float]:
+        """What is the same for every episode that changes nothing."""
+        return {
+            "clean: gripper at the first look (mm)": self.gripper_mm,
+            "clean: hand's speed at the first look (cm/s)": self.hand_cm_s,
+            "clean: fastest object at the first look (cm/s)": self.object_cm_s,
+        }
+
+    def away_from(self, other: Look, component: str, level: int) -> dict[str, float]:
+        """How far the hand is from where it is without a change of the robot."""
+        moved_cm = 100 * float(np.linalg.norm(self.position_m - other.position_m))
+        turned_deg = float(np.degrees((self.rotation * other.rotation.inv()).magnitude()))
+        return {
+            f"robot: hand moved by {component}, level {level} (cm)": moved_cm,
+            f"robot: hand turned by {component}, level {level} (degrees)": turned_deg,
+        }
+
+
+@cache
+def _run_tests() -> dict[str, Spread]:
+    """What was measured by running test tasks."""
+    return {name: Spread(*values) for name, values in json.loads(FILE.read_text()).items()}
+
+
+def measure(config: Config, test: TestSet) -> list[Measure]:
+    """Every measure of a finished run and of the test tasks, axis by axis.
+
+    Raises:
+        PipelineError: when the run lacks a trajectory or frames.
+    """
+    run = outcome.read(config)
+    rows = {row.episode_id: row for row in run.rows}
+    # In the order in which they are written: shuffled, so that the first of each axis are of many tasks.
+    kept = [rows[episode_id] for episode_id in run.kept]
+    seen = _Run(config, kept)
+    ours = _spreads(
+        pair
+        for axis in dict.fromkeys(row.axis for row in kept)
+        for row in [row for row in kept if row.axis == axis][:SAMPLE]
+        for pair in seen.of(row)
+    )
+    tested = _run_tests() | _spreads(pair for task in test.tasks for pair in _of_test(task))
+    named = ((name.partition(": "), name) for name in sorted({*tested, *ours}))
+    return [Measure(axis, what, tested.get(name), ours.get(name)) for (axis, _, what), name in named]
+
+
+def table(measures: Sequence[Measure]) -> Table:
+    """The measures for people."""
+    shown = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
+    for one in measures:
+        shown.add_row(one.axis, one.what, *(NOT_HERE if of is None else str(of) for of in (one.tested, one.ours)))
+    return shown
+
+
+def _spreads(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread]:
+    values: dict[str, list[float]] = defaultdict(list)
+    for name, value in pairs:
+        values[name].append(value)
+    return {name: spread(measured) for name, measured in values.items()}
+
+
+class _Run:
+    """What a run has of its kept episodes; each first look is read once."""
+
+    def __init__(self, config: Config, kept: Sequence[Row]):
+        self._store = TrajectoryStore(config.data / "trajectories")
+        self._frames = FrameStore(config.data / "frames", config.render)
+        self._twins = {row.episode_id: row for row in kept if row.role == "twin"}
+        self._looks: dict[str, Look] = {}
+
+    def of(self, row: Row) -> Iterator[tuple[str, float]]:
+        """What an episode shows that changes nothing, or one axis."""
+        twin = self._twins.get(row.twin_id)
+        match from_json(row.perturbations):
+            case ():
+                yield from self._look(row).measures().items()
+            case (RobotPerturbation() as change,) if twin:
+                yield from self._look(row).away_from(self._look(twin), change.component, change.level).items()
+            case (ScenePerturbation() as change,):
+                moves = {one.name: (one.dx_m, one.dy_m) for one in change.moves}
+                yield from _targets_moved(row.suite, row.task, moves, change.level)
+            case (LayoutPerturbation() as change,):
+                trajectory = self._store.load(row.trajectory_id)
+                model, placed = physics_to_read(trajectory.model_xml), trajectory.scene.resolved["layout"]["objects"]
+                surface_m = model.body(next(name for name in SURFACES if _has_body(model, name))).pos
+                xy_m = np.array([thing["position_m"][:2] for thing in placed]) - surface_m[:2]
+                arena = bddl.read(find_task(row.suite, row.task).bddl_file).arena
+                yield from _added([added.name for added in change.objects], xy_m, arena)
+            case (BackgroundPerturbation() as change,) if twin:
+                for view, changed in self._changed(row, twin).items():
+                    share = float((changed.max(axis=2) >= CHANGED_LEVELS).mean())
+                    yield f"background: share of {view} that {change.component} changes", share
+            case (NoisePerturbation() as change,) if twin:
+                yield f"noise: {change.component} (mean grey levels)", float(self._changed(row, twin)["image"].mean())
+            case (LanguagePerturbation(),):
+                yield "language: words", len(row.instruction.split())
+
+    def _look(self, row: Row) -> Look:
+        if row.trajectory_id not in self._looks:
+            trajectory = self._store.load(row.trajectory_id)
+            self._looks[row.trajectory_id] = Look.of(physics_to_read(trajectory.model_xml), trajectory.states[0])
+        return self._looks[row.trajectory_id]
+
+    def _changed(self, row: Row, twin: Row) -> dict[str, Floats]:
+        """View to the (H, W, 3) differences of the first frame from the twin's."""
+        first = []
+        for one in (row, twin):
+            streams = streams_of(one.perturbations)
+            rendered = self._frames.load(one.trajectory_id, [stream.stream_id for stream in streams.values()])
+            first.append({view: decode(rendered.streams[s.stream_id][0]).astype(float) for view, s in streams.items()})
+        return {view: np.abs(first[0][view] - first[1][view]) for view in SCHEMA.views}
+
+
+def _of_test(tested: TestTask) -> Iterator[tuple[str, float]]:
+    """What the benchmark's files say that a test task shows."""
+    known = tested.parameters
+    match tested.axis:
+        case "pose":
+            yield from _targets_moved(tested.suite, tested.base, displacements(known), int(known["level"]))
+        case "layout":
+            xy_m = np.array([pair.split(",") for pair in str(known["positions"]).split(";")], float)
+            yield from _added(str(known["category"]).split(","), xy_m, cast(Arena, known["arena"]))
+        case "language":
+            yield "language: words", len(str(known["text"]).split())
+
+
+def _targets_moved(
+    suite: str, task: str, moves: Mapping[str, tuple[float, float]], level: int
+) -> Iterator[tuple[str, float]]:
+    for target in bddl.read(find_task(suite, task).bddl_file).targets:
+        if target in moves:
+            yield f"pose: target of {suite} moved, level {level} (cm)", 100 * float(np.hypot(*moves[target]))
+
+
+def _added(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:
+    """Of one scene with objects added: their models, and where they stand (N, 2) in the frame of the surface."""
+    yield "layout: objects added", len(models)
+    yield "layout: a model comes twice (share of scenes)", float(max(Counter(models).values()) > 1)
+    x_m, z_m = CAMERA_M[arena]
+    yield "layout: objects on the camera's side (share)", float((xy_m[:, 0] > CAMERA_SIDE_M).mean())
+    for place in xy_m:
+        yield "layout: object to camera (m)", float(np.hypot(np.linalg.norm(place - [x_m, 0.0]), z_m))
+
+
+def _has_body(model: mujoco.MjModel, name: str) -> bool:
+    return bool(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0)

@@ -1,0 +1,95 @@
+"""What a policy sees in a run beside the benchmark's test tasks: no kind of test is missing, and the figures are so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+
+from pipeline.axes import AnyAxis, AnyPerturbation, Axes
+from pipeline.axes.background import BackgroundAxis
+from pipeline.axes.camera import CameraAxis
+from pipeline.axes.layout import LayoutAxis
+from pipeline.axes.noise import NoiseAxis
+from pipeline.axes.pose import PoseAxis
+from pipeline.axes.robot import RobotAxis
+from pipeline.config import load
+from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.publish import seen
+from pipeline.run import manifest
+from pipeline.run.frame_store import FrameStore
+from pipeline.seeding import rng
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet
+
+KINDS = {("robot", "initial_joints"): "controller_posture", ("pose", "pose"): "scene"}
+"""What this project calls what the benchmark's test tasks do, where the names differ."""
+AXES: Sequence[tuple[str, AnyAxis]] = (
+    ("camera", CameraAxis()),
+    ("background", BackgroundAxis()),
+    ("noise", NoiseAxis()),
+    ("layout", LayoutAxis()),
+    ("pose", PoseAxis()),
+    ("robot", RobotAxis()),
+)
+
+
+@pytest.fixture(scope="module")
+def test() -> TestSet:
+    return benchmark.load(REPOSITORY / benchmark.FOLDER)
+
+
+def draws(name: str, axis: AnyAxis) -> list[AnyPerturbation]:
+    """Six of each task of the four suites, by the axis's defaults."""
+    tasks = select_tasks([f"{suite}/*" for suite in SUITES[:4]])
+    return [axis.sample(rng("kinds", name, task.name, n), task, n) for task in tasks for n in range(6)]
+
+
+@pytest.mark.parametrize(("name", "axis"), AXES, ids=[name for name, _ in AXES])
+def test_the_defaults_draw_every_kind_of_test_at_every_level(name: str, axis: AnyAxis, test: TestSet) -> None:
+    drawn = draws(name, axis)
+    tested = {KINDS.get((name, component), component) for of, component in benchmark.COUNTS if of == name}
+    assert tested <= {one.component for one in drawn}
+    for component in tested:
+        assert {one.level for one in drawn if one.component == component} == {1, 2, 3, 4, 5}, component
+    assert {task.component for task in test.of(name)} == {of for axis, of in benchmark.COUNTS if axis == name}
+
+
+def test_light_and_language_are_drawn_too() -> None:
+    assert set(Axes.model_fields) - {name for name, _ in AXES} == {"light", "language"}
+
+
+def test_a_spread_is_its_percentiles() -> None:
+    assert seen.spread(np.arange(101.0)) == (101, 10.0, 50.0, 90.0)
+    assert str(seen.spread([2.0])) == "2 (2 to 2)"
+
+
+def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(finished.parents[1])
+    config = load(Path("configs/tiny.yaml"))
+    measures = {(one.axis, one.what): one for one in seen.measure(config, test)}
+    rows = [row for row in manifest.read(finished / "manifest.parquet") if row["kept"]]
+    frames = FrameStore(finished / "frames", config.render)
+    # The same by another way: what the datasets say of the fingers before the first action.
+    widths_mm = [
+        1000 * float(np.subtract(*frames.motion(row["trajectory_id"])[1][0, 6:]))
+        for row in rows
+        if row["role"] == "twin"
+    ]
+    gripper = measures["clean", "gripper at the first look (mm)"]
+    assert gripper.ours is not None
+    assert gripper.ours.middle == pytest.approx(float(np.median(widths_mm)), abs=0.01)
+    assert gripper.tested is not None
+    assert gripper.tested.number == 40
+    assert 77 < gripper.tested.middle < 78
+    noisy = {row["component"] for row in rows if row["axis"] == "noise"}
+    assert {what.split()[0] for (axis, what), one in measures.items() if axis == "noise" and one.ours} == noisy
+    words = measures["language", "words"]
+    assert words.ours is not None
+    assert words.ours.number == sum(row["axis"] == "language" for row in rows)
+    assert words.tested is not None
+    assert words.tested.number == 1537
+    assert measures["layout", "objects on the camera's side (share)"].ours is None
