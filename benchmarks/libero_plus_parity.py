@@ -28,11 +28,12 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline import gl, identity
+from pipeline import gl
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.evaluation.episode import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import RUNNABLE, by_name
 from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, select
+from pipeline.machine_code import machine_code
 from pipeline.rendering.jpeg import to_policy
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import SUITES
@@ -98,7 +99,7 @@ def main() -> None:
     arguments = parser.parse_args()
     chosen = some_tasks(arguments.axis, arguments.per_suite, arguments.assets)
     choice = gl.choose()
-    print(f"{choice}; {identity.machine_code()}; {len(chosen)} tasks", flush=True)
+    print(f"{choice}; {machine_code()}; {len(chosen)} tasks", flush=True)
     benchmarks(arguments.python, chosen, arguments.reference)
     environment = EpisodeEnvironment(archive=arguments.assets)
     rows = [compare(environment, task, arguments.reference) for task in chosen]

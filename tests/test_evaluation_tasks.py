@@ -15,12 +15,13 @@ import pytest
 from conftest import STOVE
 
 from pipeline import seeding
-from pipeline.axes.robot import HOME_RAD, benchmark_offsets_rad
+from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.initial_states import libero_states, moved_state, pickled_array
 from pipeline.evaluation.results import summary, wilson
 from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, draw, select
+from pipeline.libero.starts import HOME_RAD
 
 
 def test_libero_has_an_episode_for_each_task_and_initial_state() -> None:

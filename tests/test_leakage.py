@@ -24,9 +24,10 @@ from pipeline.axes import AnyPerturbation, Axes, from_json, to_json
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
-from pipeline.axes.robot import HOME_RAD, benchmark_offsets_rad
+from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.axes.scene import displacements
 from pipeline.errors import PipelineError
+from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.run import leakage, plan
 from pipeline.run.plan import Row, draws_of

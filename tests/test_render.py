@@ -188,7 +188,9 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     # LIBERO's head light keeps frames from being black, so put it out as no draw can.
     dark = '<visual><headlight diffuse="0 0 0" ambient="0 0 0" specular="0 0 0"/></visual>'
     unlit = trajectory.model_xml.replace("<worldbody>", f"{dark}<worldbody>", 1)
-    rendered = render(replace(trajectory, model_xml=unlit), MILK, streams, RenderConfig(), opened)
+    rendered = render(
+        replace(trajectory, scene=replace(source.scene, model_xml=unlit)), MILK, streams, RenderConfig(), opened
+    )
     assert rendered.rejected == {streams[1].stream_id: "too_dark"}
     assert set(rendered.streams) == {streams[0].stream_id, streams[2].stream_id}
     store = FrameStore(tmp_path, RenderConfig())

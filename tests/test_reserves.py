@@ -33,7 +33,7 @@ def reserved(demos: Path, compute: dict[str, object]) -> dict[str, object]:
             "seed": SEED,
             "axes": {
                 "layout": {"levels": [1]},
-                "pose": {"components": ["receptacle"], "step_m": 0.0005, "step_deg": 0.1},
+                "pose": {"components": ["receptacle"], "step_m": 0.0005, "turn_deg": 0.5},
                 "robot": {"norm_rad": [0.002] * 5},
                 "camera": {"levels": [5], "distance": None, "spherical": None},
             },
