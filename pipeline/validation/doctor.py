@@ -1,7 +1,4 @@
-"""What a run needs of its machine, checked in seconds and before any work.
-
-Nothing is changed, but that a run's folder gets the record of what it is begun with (``pipeline.run.machine``).
-"""
+"""What a run needs of its machine, checked in seconds and before any work. Nothing is written."""
 
 from __future__ import annotations
 
@@ -12,6 +9,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, PackagePath, distribution, requires, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,7 +26,7 @@ from pipeline.config import ComputeConfig, Config, DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import find_task, select_tasks
-from pipeline.run.machine import same_machine
+from pipeline.run.machine import refuse_another_machine
 from pipeline.testset import benchmark
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
@@ -118,12 +116,13 @@ def run(config: Config) -> int:
 def _same(data: Path) -> Diagnosis:
     """Whether a run that was begun elsewhere, or with other packages or drivers, would go on here with the same."""
     try:
-        same_machine(data, trial())
+        refuse_another_machine(data, trial())
     except PipelineError as error:
         return Diagnosis("same machine", "fail", error.what, error.remedy or "")
-    return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or the first of the run")
+    return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or nothing was made yet")
 
 
+@cache
 def trial() -> dict[str, str]:
     """Digests of ten control steps and of a frame of their end, and the device that rendered it."""
     from pipeline.physics.environment import Environment
