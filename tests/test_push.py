@@ -7,7 +7,6 @@ import hashlib
 import json
 import os
 import re
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from conftest import REPOSITORY as REPOSITORY_FOLDER
-from conftest import rot, served
+from conftest import dvc, rot, served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from synthetic import SET, write_lerobot, write_rlds
 
@@ -272,12 +271,17 @@ def test_dry_run_says_what_would_go(made: Path) -> None:
     assert f"tag: {CODEBASE_VERSION}" in prepare(made, "lerobot").summary()
 
 
-@pytest.mark.slow
-def test_a_set_with_images_has_no_videos(data: Path) -> None:
+def with_images(data: Path) -> Upload:
+    """The same episodes exported anew, with images in place of videos."""
     write_lerobot(data, name=NAME, frames="images")
     for later in (data / "validation.json", data / "card" / "lerobot" / "README.md"):
         later.write_bytes(later.read_bytes())
-    folders = {path.partition("/")[0] for path in prepare(data, "lerobot").files if path.count("/") > 1}
+    return prepare(data, "lerobot")
+
+
+@pytest.mark.slow
+def test_a_set_with_images_has_no_videos(data: Path) -> None:
+    folders = {path.partition("/")[0] for path in with_images(data).files if path.count("/") > 1}
     assert folders == {"data", "meta"}
 
 
@@ -345,6 +349,19 @@ def test_what_the_dataset_no_longer_has_goes(hub: Hub, made: Path) -> None:
     upload = prepare(made, "lerobot")
     send(upload, REPOSITORY, endpoint=hub.endpoint)
     assert hub.files == {".gitattributes": b"", "mine/notes.md": b"", **expected(upload)}
+
+
+@pytest.mark.slow
+def test_videos_go_with_the_commit_that_brings_images(hub: Hub, data: Path) -> None:
+    """A whole folder that the dataset no longer has; other folders are somebody's own."""
+    mine = {".gitattributes": b"", "mine/notes.md": b"", "demo.mp4": b""}
+    hub.files |= mine
+    send(prepare(data, "lerobot"), REPOSITORY, endpoint=hub.endpoint)
+    assert any(path.startswith("videos/") for path in hub.files)
+    upload = with_images(data)
+    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    assert hub.files == {**mine, **expected(upload)}
+    assert hub.commits == 2
 
 
 def unvalidated(data: Path) -> None:
@@ -429,8 +446,7 @@ def test_passes_by_the_statistics_that_openvla_oft_leaves_in_rlds(data: Path) ->
     (data / "rlds" / statistics).write_text("{}")
     assert prepare(data, "rlds").files == files
     # Nor does DVC see a changed output.
-    command = ["dvc", "check-ignore", f"data/starter/rlds/{statistics}"]
-    assert subprocess.run(command, cwd=REPOSITORY_FOLDER, check=False, capture_output=True).returncode == 0
+    assert dvc(REPOSITORY_FOLDER, "check-ignore", f"data/starter/rlds/{statistics}").returncode == 0
 
 
 def test_refuses_what_else_training_left_in_rlds(data: Path) -> None:

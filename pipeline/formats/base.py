@@ -161,6 +161,10 @@ class Format(ABC, Generic[Options]):
         """Path in a repository of a file of ``record().files``."""
         return f"{self.name}/{file}"
 
+    def repository_folders(self) -> set[str]:
+        """The top folders of a repository that are the dataset's alone, whatever options it was written with."""
+        return {self.name}
+
     def tag(self) -> str | None:
         """What the commit of an upload is tagged, where clients want that."""
         return None

@@ -78,6 +78,9 @@ class LeRobot(Format[LeRobotConfig]):
         # lerobot looks at the root of the repository.
         return file.removeprefix(f"{self.options.name}/")
 
+    def repository_folders(self) -> set[str]:
+        return {"data", "meta", "videos"}
+
     def tag(self) -> str:
         """What lerobot's loader looks for."""
         return str(json.loads((self.root / "meta" / "info.json").read_text())["codebase_version"])

@@ -8,7 +8,7 @@ leaves notes among the files, shows half a dataset meanwhile, and tries for ever
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -36,10 +36,12 @@ class Upload:
 
     Attributes:
         files: path in the repository to file here.
+        folders: top folders of the repository in which nothing else may lie.
         tag: what the commit is tagged, where a client's loader wants that.
     """
 
     files: Mapping[str, Path]
+    folders: Set[str]
     tag: str | None
 
     def summary(self) -> str:
@@ -71,7 +73,9 @@ def prepare(target: Format[Any]) -> Upload:
     files |= {name: data / name for name in ("manifest.parquet", *REPORTS)}
     scripts = (file for file in (data / "finetune").rglob("*") if file.suffix in SCRIPTS)
     files |= {file.relative_to(data).as_posix(): file for file in scripts}
-    return Upload(dict(sorted(files.items())), target.tag())
+    # Its own folders too where it has nothing in them now, such as videos.
+    folders = target.repository_folders() | {path.partition("/")[0] for path in files if "/" in path}
+    return Upload(dict(sorted(files.items())), folders, target.tag())
 
 
 def send(upload: Upload, repository: str, *, private: bool = False, endpoint: str | None = None) -> str:
@@ -100,8 +104,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
         # With the owner in front, where it was left out.
         repository = api.create_repo(repository, repo_type="dataset", private=private, exist_ok=True).repo_id
         there = api.list_repo_files(repository, repo_type="dataset")
-        ours = {path.partition("/")[0] for path in upload.files if "/" in path}
-        stale = [path for path in there if path.partition("/")[0] in ours and path not in upload.files]
+        stale = [path for path in there if path.partition("/")[0] in upload.folders and path not in upload.files]
         operations: list[CommitOperationAdd | CommitOperationDelete] = [
             *(CommitOperationAdd(path, _content(path, file, repository)) for path, file in upload.files.items()),
             *(CommitOperationDelete(path, is_folder=False) for path in stale),
