@@ -38,4 +38,4 @@ def test_a_texture_on_two_parts_of_a_scene_is_one_episode() -> None:
 
 
 def test_what_is_installed_holds_what_the_documentation_says() -> None:
-    assert attribution.counts(Axes()) == {"surfaces": 444, "procedural": 420, "models": 58, "categories": 26}
+    assert attribution.counts(Axes()) == {"surfaces": 804, "procedural": 780, "models": 58, "categories": 26}

@@ -57,7 +57,7 @@ def everything() -> Iterator[dict[str, Texture]]:
 
 def test_the_wheels_add_images_with_their_licences(everything: dict[str, Texture]) -> None:
     images = {"libero": 3, "robosuite": 21, "metaworld": 29, "gymnasium-robotics": 5}
-    assert Counter(texture.source for texture in everything.values()) == {"procedural": 420, **images}
+    assert Counter(texture.source for texture in everything.values()) == {"procedural": 780, **images}
     granite = everything["metaworld:granite.png"]
     assert granite.licence == "MIT (metaworld)"
     assert np.array_equal(pixels(granite.name, granite.sha256), granite.load())
@@ -66,7 +66,7 @@ def test_the_wheels_add_images_with_their_licences(everything: dict[str, Texture
 def test_none_looks_like_a_test_image_or_like_another(everything: dict[str, Texture]) -> None:
     # Two encodings of one image differ by up to 2.3 grey levels: light_grey_plaster and light-gray-plaster.
     images = [texture for texture in everything.values() if texture.source != "procedural"]
-    made = [OFFLINE[f"procedural:{family}/{index:03d}"] for family in procedural.FAMILIES for index in range(0, 60, 5)]
+    made = [OFFLINE[f"procedural:{family}/{index:03d}"] for family in procedural.FAMILIES for index in range(0, 60, 6)]
     shown = [thumbnail(from_file("x", file, "").load()) for file in LIBERO.iterdir()
              if file.stem in textures.IN_TEST_SET]  # fmt: skip
     assert len(shown) == len(textures.IN_TEST_SET) == 25
@@ -89,6 +89,21 @@ def test_procedural_textures_are_reproducible_and_seamless(family: str) -> None:
             seam = np.abs(np.take(image, 0, axis).astype(int) - np.take(image, -1, axis)).mean()
             assert seam <= 1.2 * steps.max()
     assert not np.array_equal(procedural.texture(family, 0), procedural.texture(family, 1))
+
+
+def test_data_maps_look_like_what_they_are_named_after() -> None:
+    """By the figures of their kind, over all of them: blue above red and green, grey, nearly white, or one colour."""
+    for index in range(0, 60, 15):
+        normal = procedural.texture("normal", index).astype(float) / 127.5 - 1
+        assert np.allclose(normal.mean(axis=(0, 1))[:2], 0, atol=0.03)
+        assert normal[..., 2].mean() > 0.55
+        length = np.linalg.norm(normal, axis=-1)[np.abs(normal).max(axis=-1) < 0.87]  # not cut off
+        assert np.allclose(length, 1, atol=0.03)
+        for family in ("height", "gloss", "occlusion"):
+            image = procedural.texture(family, index)
+            assert (image == image[..., :1]).all()
+        assert np.median(procedural.texture("occlusion", index)) > 200
+        assert cv2.resize(procedural.texture("reflection", index), (32, 32), interpolation=cv2.INTER_AREA).std() < 30
 
 
 def test_test_images_are_refused_by_content_and_name_and_data_maps_by_name() -> None:

@@ -70,7 +70,7 @@ _IMAGES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class Texture:
-    """One colour map.
+    """One image of a surface.
 
     Attributes:
         name: ``<source>:<file>``, ``procedural:<family>/<index>`` or ``folder:<start of the hash>/<file>``; with the
@@ -88,6 +88,11 @@ class Texture:
     sha256: str
     _read: Callable[[], Frame] = field(repr=False, compare=False)
     own: Path | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def family(self) -> str | None:
+        """Of :data:`pipeline.catalogue.procedural.FAMILIES`; None for an image."""
+        return self.name.partition(":")[2].partition("/")[0] if self.source == "procedural" else None
 
     def load(self) -> Frame:
         """(H, W, 3) RGB.

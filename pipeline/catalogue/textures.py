@@ -1,4 +1,5 @@
-"""The surfaces that may be drawn: colour maps with name, licence and hash, and none that the benchmark shows."""
+"""The surfaces that may be drawn, with name, licence and hash: images that are colour maps and whatever is procedural,
+and none that the benchmark shows."""
 
 from __future__ import annotations
 
