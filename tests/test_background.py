@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from statistics import mean
+from itertools import product
+from statistics import mean, mode
 
 import mujoco
 import numpy as np
@@ -12,8 +13,10 @@ from arenas import TASKS, change, changed, checksums, frames, renderer
 from conftest import MILK, REPOSITORY
 
 from pipeline.axes import RenderPerturbation
-from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering, skin_of
+from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbation, Component, Covering
 from pipeline.axes.base import Level
+from pipeline.catalogue import procedural
+from pipeline.catalogue.data_maps import DATA_MAPS
 from pipeline.catalogue.textures import IN_TEST_SET, catalogue
 from pipeline.errors import PipelineError
 from pipeline.libero.assets import package_folder
@@ -34,21 +37,44 @@ def texture_bytes(shown: Renderer) -> list[bytes]:
     return [model.tex_data[at : at + size].tobytes() for at, size in zip(model.tex_adr, sizes, strict=True)]
 
 
+def worked_on(shown: Renderer) -> str:
+    """The texture that most of MuJoCo's rays meet that come from above the middle of the scene."""
+    model, groups, geom = shown.model, np.array([0, 1, 0, 0, 0, 0], np.uint8), np.array([-1], np.int32)
+    met: list[str] = []
+    for x_m, y_m in product(np.linspace(-0.25, 0.25, 7), repeat=2):
+        mujoco.mj_ray(model, shown.data, np.array([x_m, y_m, 1.8]), np.array([0.0, 0, -1]), groups, 1, -1, geom)
+        if (material := model.geom_matid[geom[0]]) >= 0 and (texture := model.mat_texid[material].max()) >= 0:
+            met.append(str(model.texture(texture).name))
+    return mode(met)
+
+
+THEMES = {
+    "tabletop": {"tex-wall", "texplane", "tex-table"},
+    "floor": {"tex-wall", "texplane"},
+    "kitchen": {"tex-wall", "texplane", "tex-kitchen_background", "tex-table"},
+    "living_room": {"tex-wall", "texplane", "tex-living_room_table"},
+    "study": {"tex-wall", "texplane", "tex-desk"},
+}
+"""As LIBERO's `scenes/*_base_style.xml` name them."""
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arena", TASKS)
 def test_only_the_named_surfaces_change_and_all_comes_back(arena: str) -> None:
     shown = renderer(arena)
     try:
         before, clean, textures = checksums(shown), frames(shown), texture_bytes(shown)
-        for component, parts in PARTS.items():
+        for component in PARTS:
             with shown.perturbed([drawn(component, 5, arena)]):
                 assert changed(before, checksums(shown)) == {"tex_data"}
-                replaced = {i for i, now in enumerate(texture_bytes(shown)) if now != textures[i]}
-                assert replaced == {skin.texture for part in parts if (skin := skin_of(shown.model, part))}
+                replaced = {
+                    shown.model.texture(i).name for i, now in enumerate(texture_bytes(shown)) if now != textures[i]
+                }
+                assert replaced == (THEMES[arena] if component == "theme" else {worked_on(shown)})
+                assert worked_on(shown) in replaced
                 after = frames(shown)
             assert change(clean["agentview"], after["agentview"]) > 1
-            if component == "surface":
-                assert change(clean["robot0_eye_in_hand"], after["robot0_eye_in_hand"]) > 3
+            assert change(clean["robot0_eye_in_hand"], after["robot0_eye_in_hand"]) > 3
         assert changed(before, checksums(shown)) == set()
         restored = frames(shown)
         assert all(np.array_equal(clean[view], restored[view]) for view in clean), "the GL context kept a texture"
@@ -91,16 +117,62 @@ def test_levels_move_the_average_colour_away() -> None:
 
 
 def test_draws_are_keyed_recorded_and_from_all_sources() -> None:
-    draws = [BackgroundAxis().sample(rng("draw", key), MILK, 0) for key in range(200)]
-    assert draws == [BackgroundAxis().sample(rng("draw", key), MILK, 3) for key in range(200)]
+    draws = [BackgroundAxis().sample(rng("draw", key), MILK, 0) for key in range(400)]
+    assert draws == [BackgroundAxis().sample(rng("draw", key), MILK, 3) for key in range(400)]
     for one in draws:
         assert BackgroundPerturbation.model_validate_json(one.model_dump_json()) == one
         assert [covering.part for covering in one.coverings] == list(PARTS[one.component])
-        assert one.colour_scale == BackgroundAxis().colour_scale[one.level - 1]
-    names = [covering.texture for one in draws for covering in one.coverings]
+    names = [c.texture for one in draws for c in one.coverings if family(c) not in DATA_MAPS]
     assert {name.partition(":")[0] for name in names} == {"libero", "robosuite", "procedural"}
     assert 0.2 < mean(not name.startswith("procedural:") for name in names) < 0.4
     assert {one.level for one in draws} == {1, 2, 3, 4, 5}
+
+
+def family(covering: Covering) -> str:
+    return covering.texture.partition(":")[2].partition("/")[0]
+
+
+def test_half_of_the_draws_have_their_own_colours_and_show_every_kind_of_map() -> None:
+    """Levels below 5, which by itself is all in own colours."""
+    weak = BackgroundAxis(levels=(1, 2, 3, 4))
+    draws = [weak.sample(rng("own", key), MILK, 0) for key in range(600)]
+    own = [one for one in draws if one.colour_scale == 1]
+    assert 0.45 < len(own) / len(draws) < 0.55
+    assert all(one.colour_scale in {1.0, weak.colour_scale[one.level - 1]} for one in draws)
+    worked_on = [family(one.coverings[-1]) for one in own]
+    assert 0.63 < mean(name in DATA_MAPS for name in worked_on) < 0.77
+    elsewhere = [c for one in draws for c in one.coverings if c.part != "surface" or one not in own]
+    assert not any(family(covering) in DATA_MAPS for covering in elsewhere), "a map in another image's colours"
+    for component in PARTS:
+        shown = {family(one.coverings[-1]) for one in own if one.component == component}
+        assert shown >= {"normal", "height", "gloss", "reflection", "occlusion", "flat"}
+
+
+def test_what_is_in_its_own_colours_is_the_image_as_it_is() -> None:
+    """A normal map in MuJoCo's texture, beside the same image that OpenCV makes as large."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset><texture name="t" type="2d" builtin="flat" rgb1="0.9 0.1 0.1" width="512" height="512"/>
+        <material name="table_texture" texture="t"/></asset>
+        <worldbody><geom type="plane" size="1 1 1" material="table_texture"/></worldbody></mujoco>"""
+    )
+    axis = BackgroundAxis(components=("surface",), levels=(1,), own_colours=1, map_share=1)
+    for key in range(20):
+        one = axis.sample(rng("as it is", key), MILK, 0)
+        (covering,) = one.coverings
+        image = np.rot90(procedural.texture(family(covering), int(covering.texture[-3:])), covering.quarter_turns)
+        one.apply(model)
+        if 40 <= image.mean() <= 205:
+            assert np.array_equal(model.tex_data.reshape(image.shape), image)
+        else:
+            assert 39 < model.tex_data.mean() < 206
+            assert np.corrcoef(model.tex_data, image.ravel())[0, 1] > 0.99
+
+
+def test_only_what_procedural_offers_is_a_data_map() -> None:
+    axis = BackgroundAxis(sources=("libero", "robosuite"), own_colours=1, map_share=1)
+    for key in range(20):
+        sampled = axis.sample(rng("no maps", key), MILK, 0)
+        assert {covering.texture.partition(":")[0] for covering in sampled.coverings} <= {"libero", "robosuite"}
 
 
 def test_nearest_knows_test_images_by_name_and_by_content() -> None:

@@ -1,8 +1,9 @@
 """Background: what the room and the working surface are made of. Render layer; both views change.
 
 The new surface is written into the texture that is there, resampled to its size, so that geometry, reflections and
-the way it is laid over a table or a wall stay LIBERO's. Level 1 keeps the average colour of what it replaces and
-changes the pattern; level 5 shows the new surface in colours of its own.
+the way it is laid over a table or a wall stay LIBERO's. Half of the draws show the new surfaces in colours of their
+own, as LIBERO-Plus's tests do. The other half goes by level: 1 keeps the average colour of what is replaced and changes
+the pattern, 5 shows the new one's own.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from pydantic import Field
 
 from pipeline.axes.base import Axis, Frozen, RenderPerturbation, Share
 from pipeline.catalogue import textures
+from pipeline.catalogue.data_maps import DATA_MAPS
+from pipeline.catalogue.procedural import COLOUR_MAPS
 from pipeline.catalogue.texture_sources import Source, Texture, keep
 from pipeline.errors import PipelineError
 from pipeline.types import Floats, Frame, Task
@@ -40,7 +43,8 @@ MATERIALS: dict[Part, dict[str, int]] = {
 With each, how often a texture is repeated across the material's own, as the top of a modelled table is but a small
 piece of its unfolded skin."""
 
-PARTS: dict[Component, tuple[Part, ...]] = {"theme": ("wall", "floor", "cupboard"), "surface": ("surface",)}
+PARTS: dict[Component, tuple[Part, ...]] = {"theme": ("wall", "floor", "cupboard", "surface"), "surface": ("surface",)}
+"""What a draw names a texture for. Every theme test of LIBERO-Plus names one for a wall and one to work on."""
 
 _DARKEST, _BRIGHTEST = 40.0, 205.0
 """Grey levels that the average of a surface is kept within, so that no light makes it a black or a white area."""
@@ -50,7 +54,7 @@ class Covering(Frozen):
     """A texture on one part of the scene.
 
     Attributes:
-        part: where; a part that the scene does not have is left out.
+        part: where; a part that the scene does not have is left out. Where the floor is worked on, it is the surface.
         texture: name in the sources of :mod:`pipeline.catalogue.textures`.
         licence: as the texture's source states it.
         sha256: of the texture.
@@ -65,7 +69,7 @@ class Covering(Frozen):
 
 
 class BackgroundPerturbation(RenderPerturbation):
-    """New walls and floor, or a new working surface.
+    """New walls, floor and working surface, or a new working surface alone.
 
     Attributes:
         coverings: which texture goes where.
@@ -89,9 +93,12 @@ class BackgroundPerturbation(RenderPerturbation):
         Raises:
             PipelineError: when a texture is not there any more, or nothing in the scene is known by its material.
         """
-        shown = [
-            (covering, found) for covering in self.coverings if (found := skin_of(model, covering.part)) is not None
-        ]
+        # By texture, as two parts may be one: the last then stands for both.
+        shown = {
+            skin.texture: (covering, skin)
+            for covering in self.coverings
+            if (skin := skin_of(model, covering.part)) is not None
+        }
         if not shown:
             raise PipelineError(
                 f"the scene shows no {' or '.join(c.part for c in self.coverings)}",
@@ -99,7 +106,7 @@ class BackgroundPerturbation(RenderPerturbation):
                 expected=f"one of the materials {sorted({name for names in MATERIALS.values() for name in names})}",
                 remedy="use a scene of LIBERO's arenas",
             )
-        for covering, skin in shown:
+        for covering, skin in shown.values():
             image = np.rot90(textures.pixels(covering.texture, covering.sha256), covering.quarter_turns)
             _cover(model, skin, image, self.colour_scale)
 
@@ -120,28 +127,39 @@ class BackgroundAxis(Axis):
         components: which of them, each as often as the other.
         sources: where textures come from. ``metaworld`` and ``gymnasium-robotics`` are wheels that pip downloads
             (63 MB) when a plan first draws from them; the others are there.
-        image_share: how often an image is drawn rather than a procedural texture, of which there are many more.
-        colour_scale: for each level, how much of the new texture's own average colour shows.
+        own_colours: how often a draw shows all its textures in their own colours, whatever its level.
+        map_share: how often such a draw has a data map on the working surface, as 751 of LIBERO-Plus's 1,076
+            background tests do, where ``sources`` name ``procedural``.
+        image_share: how often an image is drawn rather than a procedural colour map, of which there are many more.
+        colour_scale: for each level, how much of the new texture's own average colour shows in the other draws.
     """
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("theme", "surface")
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")
+    own_colours: Share = 0.5
+    map_share: Share = 0.7
     image_share: Share = 0.3
     colour_scale: tuple[Share, Share, Share, Share, Share] = (0.2, 0.4, 0.6, 0.8, 1.0)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
         component = self.components[rng.integers(len(self.components))]
         level = self.draw_level(rng)
+        own_colours = rng.random() < self.own_colours
         return BackgroundPerturbation(
             component=component,
             level=level,
-            coverings=tuple(self._draw_covering(rng, part) for part in PARTS[component]),
-            colour_scale=self.colour_scale[level - 1],
+            coverings=tuple(self._draw_covering(rng, part, own_colours) for part in PARTS[component]),
+            colour_scale=1.0 if own_colours else self.colour_scale[level - 1],
         )
 
-    def _draw_covering(self, rng: np.random.Generator, part: Part) -> Covering:
-        procedural, images = _offered(self.sources)
-        choices = images if images and (rng.random() < self.image_share or not procedural) else procedural
+    def _draw_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
+        kinds = _offered(self.sources)
+        if part == "surface" and own_colours and kinds.data_maps and rng.random() < self.map_share:
+            choices = kinds.data_maps
+        elif kinds.images and (rng.random() < self.image_share or not kinds.colour_maps):
+            choices = kinds.images
+        else:
+            choices = kinds.colour_maps
         texture = choices[rng.integers(len(choices))]
         keep(texture)
         return Covering(
@@ -153,12 +171,22 @@ class BackgroundAxis(Axis):
         )
 
 
+class Kinds(NamedTuple):
+    """Textures by what is drawn from together: procedural ones of two kinds, and images."""
+
+    colour_maps: list[Texture]
+    data_maps: list[Texture]
+    images: list[Texture]
+
+
 @cache
-def _offered(sources: tuple[Source, ...]) -> tuple[list[Texture], list[Texture]]:
-    """The textures of some sources: procedural ones, and images."""
+def _offered(sources: tuple[Source, ...]) -> Kinds:
     offered = textures.catalogue(sources).values()
-    procedural = [texture for texture in offered if texture.source == "procedural"]
-    return procedural, [texture for texture in offered if texture.source != "procedural"]
+    return Kinds(
+        colour_maps=[texture for texture in offered if texture.family in COLOUR_MAPS],
+        data_maps=[texture for texture in offered if texture.family in DATA_MAPS],
+        images=[texture for texture in offered if texture.family is None],
+    )
 
 
 @cache
