@@ -1,0 +1,89 @@
+"""How much of each view new backgrounds cover, in one scene of each of LIBERO's arenas.
+
+    python benchmarks/background_coverage.py
+
+The textures that a component replaces are made black, then white: the pixels that differ are those that show them.
+Prints JSON: for each arena and component the share of both views in per cent. `wall, floor` is a theme without its
+working surface.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from pipeline.axes import RenderPerturbation
+from pipeline.axes.background import PARTS, Part, skin_of
+from pipeline.episode_schema import SCHEMA
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
+from pipeline.physics.environment import Environment
+from pipeline.rendering.renderer import Renderer
+from pipeline.types import Floats, Frame
+
+if TYPE_CHECKING:
+    import mujoco
+
+TASKS = {
+    "tabletop": ("libero_goal", "turn_on_the_stove"),
+    "kitchen": ("libero_10", "KITCHEN_SCENE3_turn_on_the_stove_and_put_the_moka_pot_on_it"),
+    "floor": ("libero_object", "pick_up_the_milk_and_place_it_in_the_basket"),
+    "living room": (
+        "libero_10",
+        "LIVING_ROOM_SCENE2_put_both_the_alphabet_soup_and_the_tomato_sauce_in_the_basket",
+    ),
+    "study": ("libero_10", "STUDY_SCENE1_pick_up_the_book_and_place_it_in_the_back_compartment_of_the_caddy"),
+}
+COMPONENTS: dict[str, tuple[Part, ...]] = {
+    "wall, floor": ("wall", "floor", "cupboard"),
+    "theme": PARTS["theme"],
+    "surface": PARTS["surface"],
+}
+NOTICED = 8
+"""Grey levels in any channel; other things may mirror a surface faintly."""
+
+
+class Painted(RenderPerturbation):
+    """Parts of the scene in one grey level."""
+
+    fields: ClassVar[tuple[str, ...]] = ("tex_data",)
+    parts: tuple[Part, ...]
+    grey: int
+
+    def apply(self, model: mujoco.MjModel) -> None:
+        for skin in (skin for part in self.parts if (skin := skin_of(model, part))):
+            start, pixels = model.tex_adr[skin.texture], model.tex_height[skin.texture] * model.tex_width[skin.texture]
+            model.tex_data[start : start + pixels * model.tex_nchannel[skin.texture]] = self.grey
+
+
+def main() -> None:
+    figures = {}
+    for arena, (suite, name) in TASKS.items():
+        task = find_task(suite, name)
+        environment = Environment(task)
+        shown = Renderer(environment.place_fixtures(4))
+        environment.close()
+        state = StarterSource().of(task).init_state
+        figures[arena] = {component: shares(shown, state, parts) for component, parts in COMPONENTS.items()}
+        shown.close()
+    print(json.dumps(figures, indent=1))
+
+
+def shares(shown: Renderer, state: Floats, parts: tuple[Part, ...]) -> dict[str, float]:
+    """Per cent of each view that shows the parts."""
+    black, white = (frames(shown, state, parts, grey) for grey in (0, 255))
+    differ = {view: np.abs(black[view].astype(int) - white[view]).max(axis=2) > NOTICED for view in black}
+    return {view: round(100 * float(pixels.mean()), 1) for view, pixels in differ.items()}
+
+
+def frames(shown: Renderer, state: Floats, parts: tuple[Part, ...], grey: int) -> dict[str, Frame]:
+    """A frame of each view with the parts painted."""
+    with shown.perturbed([Painted(axis="painted", component="", level=1, parts=parts, grey=grey)]):
+        shown.restore(state, shown.model.site_rgba[:, 3].astype(np.float32))
+        return {name: shown.frame(view.camera) for name, view in SCHEMA.views.items()}
+
+
+if __name__ == "__main__":
+    main()
