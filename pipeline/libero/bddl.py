@@ -102,6 +102,13 @@ class Bddl:
         return tuple(name for name, kind in kinds.items() if not kind.endswith(("table", "floor")))
 
     @property
+    def things_of_interest(self) -> tuple[str, ...]:
+        """The ``things`` that the task is about. A region, such as a drawer of a cabinet or the burner of a stove,
+        stands for the thing that it belongs to."""
+        named = [f"{name}_" for name in self.of_interest]
+        return tuple(thing for thing in self.things if any(name.startswith(f"{thing}_") for name in named))
+
+    @property
     def receptacles(self) -> tuple[str, ...]:
         """The movable objects that the goal puts others on or in, none twice; basket_1 for basket_1_contain_region."""
         places = [fact[2] for fact in self.goal if fact[0] in ("on", "in")]

@@ -48,11 +48,12 @@ class Sight:
         bodies = model.geom_bodyid[seen[seen >= 0]]
         trees = np.bincount(model.body_rootid[bodies], minlength=model.nbody)
         camera = model.camera(CAMERA).id
+        things = bddl.read(task.bddl_file).things_of_interest
         # A camera looks along its -z axis.
         x, y, z = ((hand_m - data.cam_xpos[camera]) @ data.cam_xmat[camera].reshape(3, 3)).T
         reach = -z * np.tan(np.deg2rad(model.cam_fovy[camera]) / 2)
         return cls(
-            {thing: int(trees[model.body(f"{thing}_main").rootid[0]]) for thing in _things(task)},
+            {thing: int(trees[model.body(f"{thing}_main").rootid[0]]) for thing in things},
             float(np.mean((np.abs(x) > reach) | (np.abs(y) > reach))),
             tuple(int(trees[model.body(name).rootid[0]]) for name in added_objects(model)),
         )
@@ -72,12 +73,3 @@ class Sight:
             "added_objects_not_seen": bool(self.added_px) and not enough_seen(self.added_px),
         }
         return [name for name, holds in faults.items() if holds]
-
-
-def _things(task: Task) -> set[str]:
-    """The objects and fixtures that a task is about, without the table or the floor that they stand on.
-
-    A region, such as a drawer of a cabinet or the burner of a stove, stands for the thing that it belongs to.
-    """
-    known = bddl.read(task.bddl_file)
-    return {thing for name in known.of_interest for thing in known.things if f"{name}_".startswith(f"{thing}_")}

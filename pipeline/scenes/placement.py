@@ -9,40 +9,36 @@ from collections.abc import Sequence
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline import seeding
 from pipeline.catalogue.object_model import ObjectModel
-from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
+from pipeline.libero.bddl import Bddl
+from pipeline.scenes.agent_view import AgentView
 from pipeline.scenes.compiled import physics_to_read
+from pipeline.scenes.regions import regions
 from pipeline.scenes.swept_path import SweptPath
 from pipeline.types import Demo, Floats, RollOut, Scene
 
 _BODY = "layout"
-SCENES, DRAWS = 12, 80
-"""How often a whole scene is begun, and how often one object's place is drawn in it, before giving up."""
+SCENES, DRAWS = 12, 60
+"""How often a whole scene is begun, and how often one object's place is drawn in either region, before giving up."""
 DRAW_CLEARANCE_M, CLEARANCE_M = 0.02, 0.015
 """Least distance of the demonstration's path from an object: where it is drawn, and where it has come to rest."""
-REACH_M = (0.15, 0.95)
-"""How far in front of the robot's base objects are put, and to its sides as far as the agent view shows."""
-SIDE_M = 0.45
-FRAME = 0.8
-"""Share of the agent view's half width that an object's middle stays within."""
-HIDDEN = 0.05
-"""Largest share of the visible part of a task's objects that added objects may cover."""
+HIDDEN = 1 / 3
+"""Largest share of what the first frame shows of any one of the task's things that added objects may cover: what is
+left is twice what is lost, so each is still known by its colour and its outline."""
 SEEN_PX, PLACED_PX = 20, 30
 """Pixels of 256 x 256 on which an added object must show in the first frame of the agent view, and where it is placed:
 more, because it is placed by rays, which meet somewhat other pixels at outlines than are drawn."""
 _SETTLE_S, _REST_S = 1.0, 0.25
 _STILL_M, _TILT_DEG, _SLID_M = 2e-4, 15.0, 0.03
 _DISTURBED_M = 1e-3
-_VIEWED_STATES, _VIEWED_POINTS = 6, 60
 
 
 def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, roll_out: RollOut) -> Scene:
-    """Add objects to a scene: at rest on its working surface, in view, clear of the demonstration's path.
+    """Add objects to a scene: at rest on its working surface, seen, clear of the demonstration's path.
 
     Everything that was in the scene keeps its recorded state exactly. The objects' joints come last: the state is
     time, the old qpos, the new qpos (7 each), the old qvel, the new qvel (6 each).
@@ -56,9 +52,8 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
     """
     names = [f"{_BODY}{number}" for number in range(len(objects))]
     model_xml = _with(scene.model_xml, objects, names)
-    placement = _Placement(
-        model_xml, scene.state, roll_out(scene, demo), objects, names, bddl.read(demo.task.bddl_file).of_interest
-    )
+    known = bddl.read(demo.task.bddl_file)
+    placement = _Placement(model_xml, scene.state, roll_out(scene, demo), objects, names, known)
     rejected: Counter[str] = Counter()
     for attempt in range(SCENES):
         poses = placement.draw(seeding.rng(seed, "layout", attempt), rejected)
@@ -110,7 +105,7 @@ class _Placement:
         state: (S,) of the scene without them.
         states: (K+1, S) that the demonstration leads through.
         names: the objects' bodies.
-        targets: names of the objects that must stay in sight.
+        known: the task, which tells the arena and the things that must stay in sight.
     """
 
     def __init__(
@@ -120,7 +115,7 @@ class _Placement:
         states: Floats,
         objects: Sequence[ObjectModel],
         names: Sequence[str],
-        targets: Sequence[str],
+        known: Bddl,
     ):
         self._model = physics_to_read(model_xml)
         self._data = mujoco.MjData(self._model)
@@ -130,27 +125,18 @@ class _Placement:
         self._added = np.isin(self._model.geom_bodyid, [self._model.body(name).id for name in names])
         self._swept = SweptPath(self._model, self._added, states[:, 1 : 1 + self.old_nq])
         self._parked = np.array([[50.0 + 5 * number, 0.0, 50.0, 1.0, 0.0, 0.0, 0.0] for number in range(len(names))])
-        self._targets = np.array(
-            [
-                any(f"{self._model.body(body).name}_".startswith(f"{target}_") for target in targets)
-                for body in self._model.body_rootid
-            ]
-        )
-        self._base_m = self._model.body("robot0_base").pos.copy()
-        self._put(self._states[0], self._parked)
-        self._eye_m = self._data.cam("agentview").xpos.copy()
-        self._eye_axes = self._data.cam("agentview").xmat.reshape(3, 3).copy()
-        self._eye_slope = np.tan(np.deg2rad(self._model.camera("agentview").fovy[0]) / 2)
+        self._regions = regions(known.problem)
+        self._put(states[0], self._parked)
+        self._view = AgentView(self._model, self._data)
+        things = [int(self._model.body(f"{thing}_main").rootid[0]) for thing in known.things_of_interest]
+        self._things_px = [pixels for pixels in self._view.pixels_of(things) if len(pixels)]
 
     def draw(self, rng: np.random.Generator, rejected: Counter[str]) -> Floats | None:
         """(N, 7) a place for each object, the broadest first; None when one finds none."""
         poses = self._parked.copy()
         for number in sorted(range(len(poses)), key=lambda number: -self._objects[number].shape.footprint_m2):
-            model = self._objects[number]
-            for _ in range(DRAWS):
-                at_m = self._base_m[:2] + np.array([rng.uniform(*REACH_M), rng.uniform(-SIDE_M, SIDE_M)])
-                yaw = rng.uniform(-np.pi, np.pi)
-                fault = self._fault_at(poses, number, model, at_m, yaw)
+            for region in itertools.chain.from_iterable([region] * DRAWS for region in self._regions.order(rng)):
+                fault = self._fault_at(poses, number, region.draw(rng), rng.uniform(-np.pi, np.pi))
                 if fault is None:
                     break
                 rejected[fault] += 1
@@ -158,9 +144,9 @@ class _Placement:
                 return None
         return poses
 
-    def _fault_at(self, poses: Floats, number: int, model: ObjectModel, at_m: Floats, yaw: float) -> str | None:
+    def _fault_at(self, poses: Floats, number: int, at_m: Floats, yaw: float) -> str | None:
         """Put one object into ``poses`` and say what is wrong with that place."""
-        low, high, _ = model.shape
+        low, high, _ = self._objects[number].shape
         half = (np.array(high) - np.array(low)) / 2
         turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
         corners = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * half[:2] @ turn.T + at_m
@@ -168,10 +154,10 @@ class _Placement:
         if min(heights) == -np.inf or max(heights) - min(heights) > 1e-3:
             return "off_the_surface"
         poses[number] = [*at_m, heights[0] + 0.001, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
-        if not self._in_view(poses[number, :3] + [0, 0, half[2]]):
-            fault = "out_of_view"
-        elif not self._swept.clear(poses, DRAW_CLEARANCE_M):
+        if not self._swept.clear(poses, DRAW_CLEARANCE_M):
             fault = "in_the_way"
+        elif self.seen_px(poses)[number] < PLACED_PX:
+            fault = "not_seen"
         elif self._hidden(poses) > HIDDEN:
             fault = "hides_target"
         else:
@@ -203,44 +189,20 @@ class _Placement:
         return rest, None
 
     def seen_px(self, poses: Floats) -> list[int]:
-        """On how many pixels of the agent view's first frame each object shows: a ray through each pixel near it."""
-        self._put(self._state, poses)
-        half_px = SCHEMA.frame.shape[0] / 2
+        """On how many pixels of the agent view's first frame each object shows; 0 for one that is still parked."""
+        self._put(self._states[0], poses)
         counts = []
         for name, model, pose in zip(self._names, self._objects, poses, strict=True):
-            pixels = self._pixels_near(model, pose, half_px)
-            x, y = ((pixels + 0.5) / half_px - 1).T * self._eye_slope
-            rays = np.column_stack([x, -y, -np.ones(len(x))]) @ self._eye_axes.T
-            hit = self._first_hit(rays)[0]
-            body = self._model.body(name).id
-            counts.append(int((self._model.geom_bodyid[hit[hit >= 0]] == body).sum()))
+            low, high, _ = model.shape
+            # A body's origin is in the middle of its underside.
+            half = (np.array(high) - np.array(low)) / 2
+            corners = np.array(list(itertools.product((-1, 1), (-1, 1), (0, 2)))) * half
+            turn = np.empty(9)
+            mujoco.mju_quat2Mat(turn, pose[3:])
+            # The bounds are those of what collides; what is drawn may be somewhat larger.
+            pixels = self._view.pixels_near(corners @ turn.reshape(3, 3).T + pose[:3])
+            counts.append(int((self._view.shown(pixels) == self._model.body(name).id).sum()))
         return counts
-
-    def _pixels_near(self, model: ObjectModel, pose: Floats, half_px: float) -> NDArray[np.float64]:
-        """(P, 2) columns and rows of the pixels in a rectangle around an object."""
-        low, high, _ = model.shape
-        corners = np.array(list(itertools.product(*zip(low, high, strict=True))))
-        turn = np.empty(9)
-        mujoco.mju_quat2Mat(turn, pose[3:])
-        x, y, z = ((corners @ turn.reshape(3, 3).T + pose[:3] - self._eye_m) @ self._eye_axes).T
-        at_px = (np.column_stack([x, -y]) / (-z * self._eye_slope)[:, None] + 1) * half_px
-        # The bounds are those of what collides; what is drawn may be somewhat larger.
-        first = np.clip(at_px.min(axis=0) - 4, 0, 2 * half_px).astype(int)
-        last = np.clip(at_px.max(axis=0) + 5, 0, 2 * half_px).astype(int)
-        columns, rows = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
-        return np.column_stack([columns.ravel(), rows.ravel()]).astype(float)
-
-    def _first_hit(self, rays: Floats) -> tuple[NDArray[np.int32], Floats]:
-        """(R,) the geom that each ray (R, 3) from the agent camera meets first, -1 for none, and where, in its length.
-
-        Only what is drawn counts: collision geometry does not.
-        """
-        hit, distance = np.full(len(rays), -1, np.int32), np.zeros(len(rays))
-        drawn = np.array([0, 1, 0, 0, 0, 0], np.uint8)
-        mujoco.mj_multiRay(
-            self._model, self._data, self._eye_m, rays.ravel(), drawn, 1, -1, hit, distance, len(rays), 1e3
-        )
-        return hit, distance
 
     def _simulated(self, poses: Floats, held: bool) -> tuple[tuple[Floats, Floats], Floats]:
         """The objects' poses (N, 7) at the end and ``_REST_S`` before, and where all other bodies are (B, 3)."""
@@ -276,29 +238,9 @@ class _Placement:
         self._data.qvel[: self._old_nv] = state[1 + nq :]
         mujoco.mj_forward(self._model, self._data)
 
-    def _in_view(self, point_m: Floats) -> bool:
-        x, y, z = (point_m - self._eye_m) @ self._eye_axes
-        return bool(z < 0 and max(abs(x), abs(y)) < -z * self._eye_slope * FRAME)
-
     def _hidden(self, poses: Floats) -> float:
-        """Largest share of what the agent view shows of the targets that the objects cover, along the demonstration."""
-        worst = 0.0
-        for step in np.linspace(0, len(self._states) - 1, _VIEWED_STATES).round().astype(int):
-            self._put(self._states[step], poses)
-            hit, distance = self._first_hit(self._target_points() - self._eye_m)
-            visible = self._targets[self._model.geom_bodyid[hit]] & (hit >= 0)
-            # A distance of 1 is the point itself.
-            covered = self._added[hit] & (hit >= 0) & (distance < 1.0)
-            if covered.any():
-                worst = max(worst, float(covered.sum() / (covered.sum() + visible.sum())))
-        return worst
-
-    def _target_points(self) -> NDArray[np.float64]:
-        """(P, 3) points all over the meshes of the targets."""
-        model, points = self._model, [np.zeros((0, 3))]
-        for geom in np.flatnonzero(self._targets[model.geom_bodyid] & (model.geom_group == 1)):
-            if (mesh := model.geom_dataid[geom]) >= 0:
-                first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-                some = model.mesh_vert[first : first + count : max(1, count // _VIEWED_POINTS)]
-                points.append(some @ self._data.geom_xmat[geom].reshape(3, 3).T + self._data.geom_xpos[geom])
-        return np.concatenate(points)
+        """Largest share of what the first frame shows of one of the task's things that the objects cover."""
+        self._put(self._states[0], poses)
+        added = [self._model.body(name).id for name in self._names]
+        shares = [np.isin(self._view.shown(pixels), added).mean() for pixels in self._things_px]
+        return float(max(shares, default=0.0))

@@ -1,0 +1,55 @@
+"""What the agent view of a scene shows, by a ray through each pixel: nothing is rendered."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.types import Floats
+
+_HALF_PX = SCHEMA.frame.shape[0] / 2
+_DRAWN = np.array([0, 1, 0, 0, 0, 0], np.uint8)
+"""The groups of geoms that are drawn; collision geometry is not."""
+
+Pixels = NDArray[np.intp]
+"""(P, 2) columns and rows, from the upper left of a frame that stands upright."""
+
+
+class AgentView:
+    """The agent view in the state that the data is in, which must have been through ``mj_forward``."""
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData):
+        self._model, self._data = model, data
+        self._slope = np.tan(np.deg2rad(model.camera("agentview").fovy[0]) / 2)
+
+    def shown(self, pixels: Pixels) -> NDArray[np.intp]:
+        """(P,) the body at the root of what each pixel (P, 2) shows; -1 where there is nothing."""
+        camera, count = self._data.cam("agentview"), len(pixels)
+        x, y = ((pixels + 0.5) / _HALF_PX - 1).T * self._slope
+        rays = np.column_stack([x, -y, -np.ones(count)]) @ camera.xmat.reshape(3, 3).T
+        hit, length = np.full(count, -1, np.int32), np.zeros(count)
+        if count:
+            eye_m = camera.xpos.copy()
+            mujoco.mj_multiRay(self._model, self._data, eye_m, rays.ravel(), _DRAWN, 1, -1, hit, length, count, 1e3)
+        roots = self._model.body_rootid[self._model.geom_bodyid[hit]]
+        return np.where(hit >= 0, roots, -1).astype(np.intp)
+
+    def pixels_of(self, bodies: list[int]) -> list[Pixels]:
+        """For each of the bodies, the pixels that show it or what hangs from it."""
+        pixels = self._between(np.zeros(2), np.full(2, 2 * _HALF_PX))
+        shown = self.shown(pixels)
+        return [pixels[shown == body] for body in bodies]
+
+    def pixels_near(self, corners_m: Floats) -> Pixels:
+        """The pixels of a rectangle around points (N, 3) of the world, with a margin of 4."""
+        camera = self._data.cam("agentview")
+        x, y, z = ((corners_m - camera.xpos) @ camera.xmat.reshape(3, 3)).T
+        at_px = (np.column_stack([x, -y]) / (np.maximum(-z, 1e-3) * self._slope)[:, None] + 1) * _HALF_PX
+        return self._between(at_px.min(axis=0) - 4, at_px.max(axis=0) + 5)
+
+    def _between(self, low: Floats, high: Floats) -> Pixels:
+        first, last = (np.clip(bound, 0, 2 * _HALF_PX).astype(int) for bound in (low, high))
+        columns, rows = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
+        return np.column_stack([columns.ravel(), rows.ravel()])
