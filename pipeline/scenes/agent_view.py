@@ -44,10 +44,20 @@ class AgentView:
 
     def pixels_near(self, corners_m: Floats) -> Pixels:
         """The pixels of a rectangle around points (N, 3) of the world, with a margin of 4."""
-        camera = self._data.cam("agentview")
-        x, y, z = ((corners_m - camera.xpos) @ camera.xmat.reshape(3, 3)).T
-        at_px = (np.column_stack([x, -y]) / (np.maximum(-z, 1e-3) * self._slope)[:, None] + 1) * _HALF_PX
+        at_px = self._projected(corners_m)
         return self._between(at_px.min(axis=0) - 4, at_px.max(axis=0) + 5)
+
+    def holds(self, point_m: Floats) -> bool:
+        """Whether a point (3,) of the world lies within the frame, be it hidden or not."""
+        at_px = self._projected(point_m[None])
+        return bool((at_px >= 0).all() and (at_px < 2 * _HALF_PX).all())
+
+    def _projected(self, points_m: Floats) -> Floats:
+        """(N, 2) columns and rows of points (N, 3) of the world; far outside for those behind the camera."""
+        camera = self._data.cam("agentview")
+        x, y, z = ((points_m - camera.xpos) @ camera.xmat.reshape(3, 3)).T
+        at_px: Floats = (np.column_stack([x, -y]) / (np.maximum(-z, 1e-3) * self._slope)[:, None] + 1) * _HALF_PX
+        return at_px
 
     def _between(self, low: Floats, high: Floats) -> Pixels:
         first, last = (np.clip(bound, 0, 2 * _HALF_PX).astype(int) for bound in (low, high))

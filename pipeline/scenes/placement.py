@@ -154,7 +154,10 @@ class _Placement:
         if min(heights) == -np.inf or max(heights) - min(heights) > 1e-3:
             return "off_the_surface"
         poses[number] = [*at_m, heights[0] + 0.001, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
-        if not self._swept.clear(poses, DRAW_CLEARANCE_M):
+        if not self._view.holds(poses[number, :3] + [0, 0, half[2]]):
+            # Its middle: so the border of the frame cuts off about half of it at most.
+            fault = "out_of_view"
+        elif not self._swept.clear(poses, DRAW_CLEARANCE_M):
             fault = "in_the_way"
         elif self.seen_px(poses)[number] < PLACED_PX:
             fault = "not_seen"
