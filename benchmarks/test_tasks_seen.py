@@ -15,9 +15,10 @@ from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 
-import numpy as np
+from pipeline import gl  # before NumPy, whose machine code it fixes
 
-from pipeline import gl
+# isort: split
+import numpy as np
 
 gl.prepare()
 
@@ -76,7 +77,7 @@ def _frames(simulator: Simulator, arena: str) -> Iterator[tuple[str, float]]:
     renderer.restore(simulator.state, simulator.site_alpha)
     for view, spec in SCHEMA.views.items():
         geoms = renderer.geoms(spec.camera)
-        bodies = [model.body(model.geom_bodyid[geom]).name for geom in range(model.ngeom)]
+        bodies = [model.body(model.body_rootid[model.geom_bodyid[geom]]).name for geom in range(model.ngeom)]
         materials = [model.mat(mat).name if (mat := model.geom_matid[geom]) >= 0 else "" for geom in range(model.ngeom)]
         on_surface = np.isin(geoms, [geom for geom, body in enumerate(bodies) if body.endswith(surface)])
         around = np.isin(geoms, [geom for geom, material in enumerate(materials) if material in WALLS])
