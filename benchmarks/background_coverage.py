@@ -12,6 +12,9 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, ClassVar
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import numpy as np
 
 from pipeline.axes import RenderPerturbation

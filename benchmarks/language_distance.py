@@ -18,6 +18,9 @@ from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from pathlib import Path
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import numpy as np
 
 from pipeline.axes.language import LanguagePerturbation, deal

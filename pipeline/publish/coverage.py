@@ -229,16 +229,16 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
     alone = [p for p in draws if isinstance(p, PosePerturbation)]
     scenes = [p for p in draws if isinstance(p, ScenePerturbation)]
     panels = []
-    if alone or not scenes:
+    if alone:
         own = np.array([[p.dx_m, p.dy_m] for p in alone]).reshape(-1, 2)
         groups: Groups = {"benchmark": 100 * targets, "pose": 100 * own}
         panels += [
             scatter("where the moved object goes", groups, "dx (cm)", "dy (cm)", True),
             strips("how far it turns", {"yaw": {"pose": np.array([p.dyaw_deg for p in alone])}}, "degrees"),
         ]
-    if scenes:
+    if scenes or not alone:
         moved = [shift for p in tested for shift in displacements(p).values()]
-        shifts = np.array([[move.dx_m, move.dy_m] for p in scenes for move in p.moves])
+        shifts = np.array([[move.dx_m, move.dy_m] for p in scenes for move in p.moves]).reshape(-1, 2)
         groups = {"benchmark": 100 * np.array(moved).reshape(-1, 2), "pose": 100 * shifts}
         panels.append(scatter("where each thing of a scene goes", groups, "dx (cm)", "dy (cm)", True))
     return AxisPlots(
