@@ -16,13 +16,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 import yaml
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from synthetic import REPO, write_lerobot
+from synthetic import IDS, REPO, episode, write_lerobot
 
 from pipeline.errors import PipelineError
+from pipeline.formats import lerobot_read
 from pipeline.publish.recipe import build, check, write
 from pipeline.publish.templates.lerobot_v3 import LeRobotV3
 from pipeline.publish.templates.run_openvla_oft import read_schedule, set_optimiser
@@ -402,6 +404,42 @@ def test_openpi_serves_what_was_trained_by_the_command_of_the_recipe(data: Path,
         "asset_id": "openpi_assets",
         "dir": "checkpoints/pi05_tiny/tiny/29999",
     }
+
+
+@pytest.mark.parametrize("isolated", [False, True], ids=["other environment", "no packages at all"])
+@pytest.mark.parametrize(
+    ("script", "checkout", "words", "remedy"),
+    [
+        ("run_openvla_oft.py", "vla-scripts/finetune.py", [], "the environment of OpenVLA-OFT"),
+        ("run_openpi.py", "scripts/train.py", ["scripts/train.py", "pi05_tiny"], "uv run python"),
+    ],
+)
+def test_the_wrong_environment_is_said_in_one_line(
+    script: str, checkout: str, words: list[str], remedy: str, isolated: bool, data: Path, tmp_path: Path
+) -> None:
+    stand_in(tmp_path, {checkout: ""})
+    command = [sys.executable, *(["-S"] if isolated else []), str(data / "finetune" / script), *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    missing, tried = done.stderr.splitlines()
+    assert missing.startswith("error: ")
+    assert ("yaml" if isolated else script.split("_")[1].replace("openvla", "prismatic").removesuffix(".py")) in missing
+    assert remedy in tried
+
+
+def test_openpis_reader_reads_what_lerobot_0_6_edited(data: Path, tmp_path: Path) -> None:
+    """Its ``load_tasks`` names the index, and ``write_tasks`` writes it under that name."""
+    root = Path(shutil.copytree(data / "lerobot" / "tiny", tmp_path / "tiny"))
+    tasks = pd.read_parquet(root / "meta" / "tasks.parquet")
+    tasks.index.name = "task"
+    tasks.to_parquet(root / "meta" / "tasks.parquet")
+    before, after = LeRobotV3(data / "lerobot" / "tiny", 5), LeRobotV3(root, 5)
+    assert [after[step]["prompt"] for step in range(0, len(after), 9)] == [
+        before[step]["prompt"] for step in range(0, len(before), 9)
+    ]
+    copy = lerobot_read.read(root, tmp_path / "cache", IDS[3], ())
+    assert copy is not None
+    assert set(copy.instructions) == {episode(IDS[3]).instruction}
 
 
 def test_openpis_reader_returns_what_lerobots_does(data: Path) -> None:

@@ -26,6 +26,8 @@ from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, records
+from pipeline.publish import recipe
+from pipeline.publish.templates.lerobot_v3 import LeRobotV3
 
 DEMOS = {episode_id: f"libero_spatial/task/demo_{number // 2}" for number, episode_id in enumerate(IDS)}
 """Two episodes of each of three demonstrations."""
@@ -99,13 +101,37 @@ def episode_ids(dataset: LeRobotDataset) -> list[str]:
     return [ids[index] for index in sorted(ids)]
 
 
-@pytest.mark.slow
-def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, tmp_path: Path) -> None:
-    target = LeRobot(tmp_path, LeRobotConfig(name=NAME, parts=3, validation=0.34))
+@pytest.fixture(scope="module")
+def held_out(episodes: Episodes, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root of a LeRobot dataset with a validation split."""
+    target = LeRobot(tmp_path_factory.mktemp("held_out"), LeRobotConfig(name=NAME, parts=3, validation=0.34))
     export(target, episodes, loop)
-    assert json.loads((target.root / "meta" / "info.json").read_text())["splits"] == {"train": "0:4", "val": "4:6"}
+    return target.root
+
+
+@pytest.mark.slow
+def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, held_out: Path) -> None:
+    assert json.loads((held_out / "meta" / "info.json").read_text())["splits"] == {"train": "0:4", "val": "4:6"}
     splits = episodes.by_split(0.34)
-    assert episode_ids(LeRobotDataset(NAME, root=target.root)) == splits["train"] + splits["val"]
+    assert episode_ids(LeRobotDataset(NAME, root=held_out)) == splits["train"] + splits["val"]
+
+
+def test_openpi_neither_trains_nor_measures_on_what_is_held_out(
+    episodes: Episodes, held_out: Path, tmp_path: Path
+) -> None:
+    splits = episodes.by_split(0.34)
+    train, rest = ([episode(name) for name in splits[split]] for split in ("train", "val"))
+    recipe.write({}, held_out, tmp_path / "finetune")
+    found = json.loads((tmp_path / "finetune" / "openpi_assets" / "norm_stats.json").read_text())["norm_stats"]
+    for name, column in (("actions", "action"), ("state", "state")):
+        values = np.concatenate([getattr(one, column) for one in train]).astype(np.float64)
+        assert np.allclose(found[name]["mean"], values.mean(0), atol=1e-12)
+        assert np.allclose(found[name]["std"], values.std(0), atol=1e-12)
+        assert np.allclose(found[name]["q99"], np.quantile(values, 0.99, axis=0), atol=1e-12)
+    dataset = LeRobotV3(held_out, horizon=5)
+    assert len(dataset) == sum(len(one.action) for one in train)
+    assert len(rest) == 2
+    assert np.array_equal(dataset[len(dataset) - 1]["actions"], np.repeat(train[-1].action[-1:], 5, axis=0))
 
 
 @pytest.mark.slow

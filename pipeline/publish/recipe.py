@@ -16,8 +16,9 @@ import yaml
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import known_to_oft
-from pipeline.files import checksum, replaced, schema_file
+from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.rlds_layout import dataset_of
+from pipeline.publish.templates.lerobot_v3 import trained_on
 from pipeline.run import motion_statistics
 
 SCHEMA_FILE = schema_file("finetune.json")
@@ -119,11 +120,12 @@ def write(recipe: Mapping[str, Any], lerobot: Path, folder: Path) -> None:
 
     Args:
         recipe: what ``build`` returned.
-        lerobot: root of the LeRobot dataset, whose actions and states are measured.
+        lerobot: root of the LeRobot dataset, whose actions and states are measured, but for those held out.
         folder: where to write; the scripts look for ``rlds`` and ``lerobot`` beside it.
     """
     columns = [SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key]
-    table = pq.read_table(lerobot / "data", columns=columns)
+    rows = trained_on(read_json(lerobot / "meta" / "info.json"))
+    table = pq.read_table(lerobot / "data", columns=columns, filters=rows)
     actions, states = (np.stack(table[column].to_numpy()) for column in columns)
     with replaced(folder) as unfinished:
         (unfinished / "openpi_assets").mkdir(parents=True)

@@ -6,6 +6,7 @@ openpi pins a lerobot of early 2025, which cannot open version 3.0 (Physical-Int
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, SupportsIndex
@@ -19,8 +20,14 @@ VIEWS = {"image": "observation.images.image", "wrist_image": "observation.images
 VECTORS = {"state": "observation.state", "actions": "action"}
 
 
+def trained_on(info: Mapping[str, Any]) -> list[tuple[str, str, int]]:
+    """Which rows to train on, as PyArrow filters them: those of the split ``train`` of ``meta/info.json``."""
+    first, end = info["splits"]["train"].split(":")
+    return [("episode_index", ">=", int(first)), ("episode_index", "<", int(end))]
+
+
 class LeRobotV3:
-    """Random access to the steps of a dataset, with the actions that follow each.
+    """Random access to the steps that a dataset has to train on, with the actions that follow each.
 
     Args:
         root: the dataset's folder.
@@ -32,16 +39,17 @@ class LeRobotV3:
         if info["features"][VIEWS["image"]]["dtype"] != "video":
             raise ValueError(f"{root} has images; export it with export.lerobot.frames: video")
         columns = ["episode_index", "frame_index", "task_index", *VECTORS.values()]
-        table = pq.read_table(root / "data", columns=columns)
-        tasks = pq.read_table(root / "meta" / "tasks.parquet").to_pylist()
+        table = pq.read_table(root / "data", columns=columns, filters=trained_on(info))
+        tasks = pq.read_table(root / "meta" / "tasks.parquet")
+        # pandas writes an index without a name, as lerobot 0.4 has it, and one with a name, as 0.6 has it.
+        prompt = "task" if "task" in tasks.column_names else "__index_level_0__"
         episodes = pq.read_table(root / "meta" / "episodes").sort_by("episode_index")
         self._root, self._horizon, self._fps, self._video_path = root, horizon, info["fps"], info["video_path"]
-        self._prompts = {row["task_index"]: row["__index_level_0__"] for row in tasks}
+        self._prompts = {row["task_index"]: row[prompt] for row in tasks.to_pylist()}
         self._vectors = {
             name: np.stack(table[column].to_numpy()).astype(np.float32) for name, column in VECTORS.items()
         }
         self._episode, self._frame, self._task = (table[name].to_numpy() for name in columns[:3])
-        self._ends = episodes["dataset_to_index"].to_numpy()
         self._videos = {
             view: episodes.select(
                 [f"videos/{key}/{field}" for field in ("chunk_index", "file_index", "from_timestamp")]
@@ -56,7 +64,8 @@ class LeRobotV3:
         """``image`` and ``wrist_image`` (H, W, 3) uint8, ``state`` (8,), ``actions`` (horizon, 7), ``prompt``."""
         step = range(len(self))[index]
         episode = self._episode[step]
-        ahead = np.minimum(np.arange(step, step + self._horizon), self._ends[episode] - 1)
+        end = np.searchsorted(self._episode, episode, side="right")
+        ahead = np.minimum(np.arange(step, step + self._horizon), end - 1)
         return {
             **{view: self._pixels(view, episode, self._frame[step] / self._fps) for view in VIEWS},
             "state": self._vectors["state"][step],

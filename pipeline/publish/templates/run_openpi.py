@@ -23,9 +23,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import yaml
-from lerobot_v3 import LeRobotV3  # type: ignore[import-not-found]  # lies beside this file
-
 HERE = Path(__file__).resolve().parent
 BASE = "pi05_libero"
 
@@ -34,6 +31,7 @@ def register(name: str) -> None:
     """Add ``pi05_<name>`` to openpi's configurations, and have its data loader read the dataset."""
     config: Any = importlib.import_module("openpi.training.config")
     loader: Any = importlib.import_module("openpi.training.data_loader")
+    reader: Any = importlib.import_module("lerobot_v3")  # lies beside this file
     base = config.get_config(BASE)
     if base.data.extra_delta_transform:
         sys.exit(f"error: this openpi turns the actions of {BASE} into differences, which the statistics here are not")
@@ -45,7 +43,7 @@ def register(name: str) -> None:
     def create_torch_dataset(data_config: Any, action_horizon: int, model_config: Any) -> Any:
         if data_config.repo_id != name:
             return create(data_config, action_horizon, model_config)
-        return LeRobotV3(HERE.parent / "lerobot" / name, action_horizon)
+        return reader.LeRobotV3(HERE.parent / "lerobot" / name, action_horizon)
 
     loader.create_torch_dataset = create_torch_dataset
 
@@ -53,7 +51,14 @@ def register(name: str) -> None:
 def main() -> None:
     if len(sys.argv) < 2 or not Path(sys.argv[1]).is_file():
         sys.exit("error: name a script of openpi first\n  try: scripts/train.py, in a checkout of openpi")
-    register(yaml.safe_load((HERE / "finetune.yaml").read_text())["dataset"]["lerobot"]["value"])
+    try:
+        yaml: Any = importlib.import_module("yaml")
+        register(yaml.safe_load((HERE / "finetune.yaml").read_text())["dataset"]["lerobot"]["value"])
+    except ModuleNotFoundError as error:
+        sys.exit(
+            f"error: {sys.executable} has no module {error.name}\n"
+            "  try: uv run python in place of python, in a checkout of openpi, whose environment has it"
+        )
     del sys.argv[0]
     runpy.run_path(sys.argv[0], run_name="__main__")
 

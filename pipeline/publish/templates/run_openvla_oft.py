@@ -26,8 +26,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 HERE = Path(__file__).resolve().parent
 SCRIPT = "vla-scripts/finetune.py"
 DATASETS = "prismatic.vla.datasets.rlds"
@@ -116,7 +114,8 @@ def read_schedule(words: Sequence[str], steps: int, warmup_steps: int) -> Schedu
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--max_steps", type=int, default=steps)
     parser.add_argument("--lr_warmup_steps", type=int)
-    parser.add_argument("--resume", type=yaml.safe_load, default=False)  # as OFT reads its booleans
+    yaml: Any = importlib.import_module("yaml")  # as OFT reads its booleans
+    parser.add_argument("--resume", type=yaml.safe_load, default=False)
     parser.add_argument("--resume_step", type=int, default=0)
     given, _ = parser.parse_known_args(words)
     warmup = given.max_steps * warmup_steps // steps if given.lr_warmup_steps is None else given.lr_warmup_steps
@@ -162,9 +161,9 @@ def arguments(recipe: Mapping[str, Any]) -> list[str]:
     return [word for name, value in flags.items() for word in (f"--{name}", str(value))]
 
 
-def main() -> None:
-    if not Path(SCRIPT).is_file():
-        sys.exit(f"error: no {SCRIPT} in {Path.cwd()}\n  try: call this in a checkout of OpenVLA-OFT")
+def prepare() -> None:
+    """Give OFT the recipe: its arguments, and all that it has no flag for."""
+    yaml: Any = importlib.import_module("yaml")
     recipe = yaml.safe_load((HERE / "finetune.yaml").read_text())
     dataset, training = recipe["dataset"], recipe["training"]
     given = sys.argv[1:]
@@ -178,6 +177,18 @@ def main() -> None:
         training["weight_decay"]["value"],
         read_schedule(given, training["steps"]["value"], training["warmup_steps"]["value"]),
     )
+
+
+def main() -> None:
+    if not Path(SCRIPT).is_file():
+        sys.exit(f"error: no {SCRIPT} in {Path.cwd()}\n  try: call this in a checkout of OpenVLA-OFT")
+    try:
+        prepare()
+    except ModuleNotFoundError as error:
+        sys.exit(
+            f"error: {sys.executable} has no module {error.name}\n"
+            "  try: activate the environment of OpenVLA-OFT (its SETUP.md), and call torchrun there"
+        )
     runpy.run_path(SCRIPT, run_name="__main__")
 
 
