@@ -242,7 +242,7 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path, 
         # The report quotes the whole configuration, but for where it ran.
         (("export", "rlds", "shards"), 3, {"export_rlds", "report"}),
         (("export", "lerobot", "parts"), 3, {"doctor", "export_lerobot", "report"}),
-        (("render", "jpeg_quality"), 90, {"render", "report"}),
+        (("render", "jpeg_quality"), 90, {"doctor", "render", "report"}),
         (("compute", "workers"), 5, set()),
         (("plan", "seed"), 8, {"doctor", "plan", "summary", "report"}),
     ]

@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
@@ -171,13 +171,15 @@ class HDF5Source:
         with self._data(task) as data:
             return self._read(task, key, data)
 
-    def count(self, task: Task) -> int:
-        """How many demonstrations the file of a task holds; 0 where it is missing or cannot be read."""
-        try:
-            with self._data(task) as data:
-                return len(hdf5.names(data, str(self._path(task))))
-        except PipelineError:
-            return 0
+    def lengths(self, task: Task) -> list[int]:
+        """Actions of each demonstration that the file of a task holds; none where it is missing or cannot be read."""
+        found = []
+        with suppress(PipelineError), self._data(task) as data:
+            for key in hdf5.names(data, str(self._path(task))):
+                where = f"{self._path(task)} data/{key}"
+                with suppress(PipelineError):
+                    found.append(len(hdf5.array(hdf5.member(data, key, h5py.Group, where), "actions", where)))
+        return found
 
     def _path(self, task: Task) -> Path:
         return self.root / task.suite / f"{task.name}_demo.hdf5"

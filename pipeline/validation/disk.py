@@ -1,0 +1,100 @@
+"""Disk that a run takes: from the lengths of its demonstrations, and from what a step was measured to take.
+
+The sizes are rounded up from four runs of one demonstration of 90 steps (``benchmarks/disk.py``, see
+``docs/scaling-out.md``). Episodes are counted as long as their demonstrations.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.axes import PhysicsPerturbation, RenderPerturbation, axes_of, kind_of
+from pipeline.config import Config, DemosConfig, PlanConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.libero.demonstrations import HDF5Source, StarterSource
+from pipeline.libero.tasks import select_tasks
+from pipeline.types import Extra
+
+JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
+"""A frame, by quality."""
+MAP_KB: dict[Extra, float] = {"depth": 31.0, "segmentation": 3.0}
+"""A view of one step."""
+POSES_KB, MOTION_KB = 0.7, 0.5
+"""One step: object poses; state, action and what else is beside the frames."""
+VIDEO_KB = 15.0
+"""One step in LeRobot, both views as video."""
+IN_TEXT = 1.2
+"""How much larger LeRobot's columns of base64 are than the PNG files in them."""
+MERGE = {"video": 2.1, "images": 3.8}
+"""What lies there while LeRobot's parts are merged, in multiples of the dataset: the parts and copies of rows too."""
+TRAJECTORY_KB, STATE_KB = 100.0, 1.2
+"""A trajectory, and each step of it."""
+EPISODE_KB = 50.0
+"""An episode in a dataset, however short."""
+RUN_MB = 100.0
+"""A run's sheets, report and tables."""
+
+PUBLISHED = 50
+"""Demonstrations of a task in LIBERO's files."""
+
+
+def needed_mb(config: Config) -> dict[str, float]:
+    """Folder of a run to the megabytes that it takes; ``.work`` is empty again when LeRobot's parts are merged.
+
+    Every planned episode counts as kept, and so does the clean twin of every demonstration.
+    """
+    tasks, views, extras = _lengths(config.demos), len(SCHEMA.views), config.render.extras
+    twins, planned = sum(map(len, tasks)), sum(config.plan.episodes.values())
+    mean_steps = float(np.mean([np.mean(task) for task in tasks]))
+    twin_steps = sum(map(sum, tasks))
+    steps, episodes = twin_steps + planned * mean_steps, twins + planned
+    own = _own(config.plan)
+    frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
+    map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
+    poses_kb = POSES_KB if "object_poses" in extras else 0.0
+    shown_kb = VIDEO_KB if config.export.lerobot.frames == "video" else views * frame_kb + MOTION_KB
+    lerobot = steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
+    needed_kb = {
+        "trajectories": (twins + own.trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
+        "frames": (views * twin_steps + own.frames * mean_steps) * frame_kb
+        + (views * twin_steps + own.maps * mean_steps) * map_kb
+        + steps * (poses_kb + MOTION_KB),
+        "rlds": steps * (views * (frame_kb + map_kb) + poses_kb + MOTION_KB) + episodes * EPISODE_KB,
+        "lerobot": lerobot,
+        ".work": lerobot * (MERGE[config.export.lerobot.frames] - 1),
+    }
+    return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
+
+
+class _Own(NamedTuple):
+    """What planned episodes have that their twins do not: trajectories, and views of frames and of maps."""
+
+    trajectories: float
+    frames: float
+    maps: float
+
+
+def _own(plan: PlanConfig) -> _Own:
+    trajectories = frames = maps = 0.0
+    for name, episodes in plan.episodes.items():
+        kinds = [kind_of(axis) for axis in axes_of(name)]
+        physics = [kind for kind in kinds if issubclass(kind, PhysicsPerturbation)]
+        cameras = [kind for kind in kinds if issubclass(kind, RenderPerturbation) and "cam_pos" in kind.fields]
+        trajectories += episodes * (1 + plan.reserve) * bool(physics)
+        frames += episodes * len({view for kind in kinds for view in kind.views})
+        maps += episodes * len({view for kind in (*physics, *cameras) for view in kind.views})
+    return _Own(trajectories, frames, maps)
+
+
+def _lengths(demos: DemosConfig) -> list[list[int]]:
+    """Steps of the demonstrations of each task; where its file is not there yet, as long as the starter set's one."""
+    starter = {entry.task: entry.steps for entry in StarterSource().index(select_tasks(demos.tasks)).entries}
+    if demos.root is None:
+        return [[steps] for steps in starter.values()]
+    source = HDF5Source(demos.root)
+    return [
+        source.lengths(task)[: demos.per_task] or [steps] * (demos.per_task or PUBLISHED)
+        for task, steps in starter.items()
+    ]
