@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 from pipeline.config import Config, DemosConfig
 from pipeline.libero.tasks import select_tasks
-from pipeline.validation.doctor import DEMOS_PER_TASK
+from pipeline.validation.disk import PUBLISHED
 
 
 def sliced(config: Config, tasks: Sequence[str] | None) -> Config:
     """One demonstration of each task, and its share of the episodes."""
     patterns = tuple(tasks or config.demos.tasks)
     chosen = len(select_tasks(patterns))
-    whole = len(select_tasks(config.demos.tasks)) * (config.demos.per_task or DEMOS_PER_TASK[config.demos.source])
+    per_task = config.demos.per_task or (PUBLISHED if config.demos.source == "hdf5" else 1)
+    whole = len(select_tasks(config.demos.tasks)) * per_task
     episodes = {name: max(1, round(number * chosen / whole)) for name, number in config.plan.episodes.items()}
     return config.model_copy(
         update={

@@ -38,13 +38,12 @@ from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.types import Task
-from pipeline.validation.doctor import DEMOS_PER_TASK
+from pipeline.validation.disk import PUBLISHED
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 STAND_INS = REPOSITORY / "benchmarks" / "rehearsal_stand_ins.py"
 DEMOS = Path("data/rehearsal_demos")
 FIGURES = Path("data/rehearsal_figures")
-PER_TASK = DEMOS_PER_TASK["hdf5"]
 LOOK_S = 0.5
 """How often memory is looked at."""
 
@@ -77,7 +76,7 @@ def demonstrations(wanted: DemosConfig) -> None:
 def _recordings(task: Task, starter: StarterSource) -> Iterator[hdf5.Recording]:
     demo = starter.of(task)
     model_xml = demo.model_xml or shared(task).place_fixtures(0)
-    for number in range(PER_TASK):
+    for number in range(PUBLISHED):
         actions = np.clip(demo.actions[:STEPS] + seeding.rng("rehearsal", number).normal(0, 0.01, (STEPS, 7)), -1, 1)
         states = np.repeat(demo.init_state[None], STEPS, axis=0)
         yield hdf5.Recording(actions, states, np.zeros((STEPS, 9)), model_xml, {})
@@ -89,7 +88,7 @@ def configuration(source: Path, episodes: int, workers: int) -> Path:
     whole = sum(content["plan"]["episodes"].values())
     share = episodes / whole
     content["name"] = f"rehearsal_{episodes}"
-    content["demos"] |= {"root": str(DEMOS), "per_task": max(1, round(PER_TASK * share))}
+    content["demos"] |= {"root": str(DEMOS), "per_task": max(1, round(PUBLISHED * share))}
     content["plan"]["episodes"] = {name: max(1, round(n * share)) for name, n in content["plan"]["episodes"].items()}
     for section, name in (("rlds", "shards"), ("lerobot", "parts")):
         content["export"][section][name] = max(1, round(content["export"][section][name] * share))
