@@ -21,7 +21,7 @@ from pipeline.run.streams import streams_of
 AXES = ("layout", "pose", "robot")
 """Each of their episodes has a replay of its own."""
 
-SEED = 3
+SEED = 15
 """Under it, the camera of the first candidate of layout and camera together shows nothing of the added object."""
 
 

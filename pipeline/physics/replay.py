@@ -58,7 +58,9 @@ def replay(
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         environment.restore(scene)
-        refusal, states, alphas, actions, succeeded = refused, [], [], [], []
+        # What has no first look is dropped with the state that it was put in.
+        refusal, states, alphas = refused, [environment.state], [environment.site_alpha]
+        actions, succeeded = [], []
         try:
             environment.settle(0 if refused else config.settle_steps)
             states, alphas = [environment.state], [environment.site_alpha]
