@@ -13,6 +13,7 @@ from rich.console import Console
 
 from pipeline.arguments import positive
 from pipeline.axes import Axes
+from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.evaluation import analyses
 from pipeline.evaluation import command as evaluation_command
@@ -24,7 +25,6 @@ from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish import attribution
 from pipeline.rewriting.language_model import LanguageModel
 from pipeline.rewriting.rewrite import extend
-from pipeline.run.compute import runner
 from pipeline.run.stage import owned
 from pipeline.testset import benchmark
 from pipeline.validation import doctor
@@ -81,7 +81,7 @@ def _sources(arguments: argparse.Namespace) -> int:
 
 def _expand(arguments: argparse.Namespace) -> int:
     # The simulator takes seconds to import, which the other commands can do without.
-    from pipeline.physics.expand import expand
+    from pipeline.run.expand import expand
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
     with runner(ComputeConfig(), arguments.out) as run:

@@ -17,15 +17,15 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import BOWL, MILK, STOVE, rot, run_stages, tiny_config
 
+from pipeline.compute.pool import loop
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum
 from pipeline.formats import lerobot_video, rlds_write
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
-from pipeline.rendering.jpeg import decode, encode
+from pipeline.images.jpeg import decode, encode
 from pipeline.run import manifest
-from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case

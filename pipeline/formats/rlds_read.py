@@ -17,7 +17,7 @@ from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.rlds_layout import VERSION, dataset_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans
-from pipeline.rendering.jpeg import decode
+from pipeline.images.jpeg import decode
 from pipeline.types import Extra, Geometry
 
 MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")

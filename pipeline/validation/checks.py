@@ -16,8 +16,8 @@ from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import MATRICES, SCHEMA
 from pipeline.formats.read_back import Copy, Fault, sampled
+from pipeline.images.jpeg import decode
 from pipeline.libero.tasks import find_task
-from pipeline.rendering.jpeg import decode
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.types import Episode, Frame, Trajectory
 

@@ -15,9 +15,9 @@ from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
-from pipeline.rendering.jpeg import decode, encode
+from pipeline.images.jpeg import decode, encode
+from pipeline.planning.streams import streams_of
 from pipeline.rendering.last_scene import LastScene
-from pipeline.run.streams import streams_of
 from pipeline.types import Frame, Trajectory
 from pipeline.validation.checks import Case, psnr_db
 
