@@ -28,8 +28,8 @@ from pipeline.compute.pool import loop
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
 from pipeline.planning import plan
-from pipeline.rendering.culling import Culling
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.culling import Culling
 from pipeline.run.replay import replay_plan
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark

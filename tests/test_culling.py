@@ -13,9 +13,9 @@ from arenas import TASKS
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.culling import Culling
 from pipeline.rendering.opengl import say_once
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.culling import Culling
 from pipeline.types import Frame
 
 GEOMS = 30

@@ -16,8 +16,8 @@ from test_culling import plain
 from pipeline import seeding
 from pipeline.axes.background import BackgroundAxis
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.culling import Picture
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.culling import Picture
 
 BODIES = 12
 CAMERAS = ("fixed", "moving")

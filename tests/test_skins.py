@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from test_culling import plain
 
 from pipeline import gl, seeding
-from pipeline.rendering.faces import Faces
-from pipeline.rendering.mesh_pieces import BATCH_FACES, PIECE_FACES
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.samples import Projection, faces_that_show, room
-from pipeline.rendering.skins import GEOM, SKINS
+from pipeline.rendering.software.faces import Faces
+from pipeline.rendering.software.mesh_pieces import BATCH_FACES, PIECE_FACES
+from pipeline.rendering.software.samples import Projection, faces_that_show, room
+from pipeline.rendering.software.skins import GEOM, SKINS
 from pipeline.types import Floats, Frame
 
 SIZE_PX = 64, 48

@@ -15,14 +15,14 @@ from pipeline import gl
 from pipeline.axes import RenderPerturbation
 from pipeline.axes.base import FIELDS
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.culling import Culling, Picture
-from pipeline.rendering.layer import Layer
-from pipeline.rendering.mesh_pieces import MeshPieces
 from pipeline.rendering.opengl import check, making_context
-from pipeline.rendering.samples import SAMPLES
-from pipeline.rendering.skins import SKINS, Skins, bare
-from pipeline.rendering.still import Still
-from pipeline.rendering.textures import Textures
+from pipeline.rendering.software.culling import Culling, Picture
+from pipeline.rendering.software.layer import Layer
+from pipeline.rendering.software.mesh_pieces import MeshPieces
+from pipeline.rendering.software.samples import SAMPLES
+from pipeline.rendering.software.skins import SKINS, Skins, bare
+from pipeline.rendering.software.still import Still
+from pipeline.rendering.software.textures import Textures
 from pipeline.scenes.compiled import Images, compiled
 from pipeline.types import Frame
 

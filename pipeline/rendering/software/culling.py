@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rendering.mesh_pieces import MARGIN_M, boxes_of
-from pipeline.rendering.samples import Projection
+from pipeline.rendering.software.mesh_pieces import MARGIN_M, boxes_of
+from pipeline.rendering.software.samples import Projection
 from pipeline.types import Floats
 
 LEAST_SCREEN_M = 0.1

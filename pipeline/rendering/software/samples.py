@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.jit import compiled
-from pipeline.rendering.faces import Faces
-from pipeline.rendering.mesh_pieces import BATCH_FACES, PIECE_FACES
+from pipeline.rendering.software.faces import Faces
+from pipeline.rendering.software.mesh_pieces import BATCH_FACES, PIECE_FACES
 from pipeline.types import Floats
 
 MARGIN_PX = 1 / 128

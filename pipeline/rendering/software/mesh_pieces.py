@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rendering import display_list
-from pipeline.rendering.layer import Layer
 from pipeline.rendering.opengl import calls, check
+from pipeline.rendering.software import display_list
+from pipeline.rendering.software.layer import Layer
 from pipeline.types import Floats
 
 BATCH_FACES = 341

@@ -15,10 +15,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.rendering.faces import Faces, faces_of
-from pipeline.rendering.mesh_pieces import Boxes, MeshPieces
 from pipeline.rendering.opengl import calls
-from pipeline.rendering.samples import SAMPLES, Projection, faces_that_show, room
+from pipeline.rendering.software.faces import Faces, faces_of
+from pipeline.rendering.software.mesh_pieces import Boxes, MeshPieces
+from pipeline.rendering.software.samples import SAMPLES, Projection, faces_that_show, room
 
 SKINS = 64
 """As many with places in a texture, and as many without; LIBERO's scenes have up to 50 large meshes."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import mujoco
 
-from pipeline.rendering import display_list
 from pipeline.rendering.opengl import calls, failure
+from pipeline.rendering.software import display_list
 
 VERTICES = "#version 400 compatibility\nvoid main() { gl_Position = gl_Vertex; }"
 
