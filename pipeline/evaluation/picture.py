@@ -8,12 +8,13 @@ from contextlib import ExitStack
 import mujoco
 import numpy as np
 
-from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.axes import AnyPerturbation, RenderPerturbation, of_layer
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.settings import VIEWS
 from pipeline.evaluation.simulator import Observed
 from pipeline.images.jpeg import to_policy
+from pipeline.rendering.frames import noisy
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame
@@ -46,10 +47,7 @@ class Picture:
         state = np.concatenate([[0.0], observed.qpos, np.zeros(renderer.model.nv)])
         renderer.restore(state, observed.site_alpha)
         frame = renderer.frame(SCHEMA.views[VIEWS[view]].camera)
-        for noise in of_layer(perturbations, PixelPerturbation):
-            if VIEWS[view] in noise.views:
-                frame = noise.apply(frame, step)
-        return to_policy(frame)
+        return to_policy(noisy(frame, VIEWS[view], perturbations, step))
 
     def restore(self) -> None:
         """Undo an episode's looks."""
