@@ -16,12 +16,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.software.mujoco_3_2_7 import REFLECTING_SQUARE
+from pipeline.rendering.software.mujoco_3_2_7 import REFLECTING_SQUARE, WIDEST_MAP_DEG
 from pipeline.rendering.software.samples import Projection
 from pipeline.types import Floats
 
 MARGIN_M = 1e-3
 """Added around every box, for what the rasteriser rounds."""
+
+
+WIDEST_CONE = np.radians(80)
+"""Half the opening angle of cones up to which it is worked out what is in them."""
+
+SHADOW_MARGIN_M = 0.05
+"""So near to a picture, a shadow counts as in it: more than two pixels of a lamp's map."""
+
+
+class Lamp(NamedTuple):
+    """What a lamp with shadows needs: (ngeom,) which geoms cast them into the picture, and which it may light there."""
+
+    casts: NDArray[np.bool_]
+    lights: NDArray[np.bool_]
 
 
 class Picture(NamedTuple):
@@ -32,7 +46,7 @@ class Picture(NamedTuple):
         mirror: (ngeom,) the opaque one that reflects, if there is one.
         seen: (ngeom,) which are before the camera.
         images: (ngeom,) which show in the mirror.
-        lamps: how many of them cast shadows.
+        lamps: those with shadows, in MuJoCo's order.
         sites: (nsite,) which sites.
         projection: by which to choose single faces, or None.
         layered: whether it can be put together of layers, of what is opaque and does not reflect.
@@ -43,7 +57,7 @@ class Picture(NamedTuple):
     mirror: NDArray[np.bool_]
     seen: NDArray[np.bool_]
     images: NDArray[np.bool_]
-    lamps: int
+    lamps: tuple[Lamp, ...]
     sites: NDArray[np.bool_]
     projection: Projection | None
     layered: bool
@@ -75,13 +89,13 @@ class Culling:
         turns = data.geom_xmat.reshape(-1, 3, 3).transpose(0, 2, 1)
         corners_m = data.geom_xpos[:, None] + self._corners_m @ turns
         seen = self.shown & view.shows(corners_m)
-        lamps = int((self._model.light_castshadow & self._model.light_active).sum())
+        with_shadows = np.flatnonzero(self._model.light_castshadow & self._model.light_active)
+        lamps = tuple(self._lamp(data, view, corners_m, seen, clear, lamp) for lamp in with_shadows.tolist())
         images = np.zeros_like(seen)
         if mirror is not None and seen[mirror]:
             images = self.shown & self._images(data, view, corners_m, mirror)
         return Picture(
-            # What is not in the picture may cast a shadow into it.
-            opaque=(self.shown if lamps else seen) & ~clear,
+            opaque=np.logical_or.reduce([seen, *(lamp.casts for lamp in lamps)]) & ~clear,
             clear=clear & (seen | images | bool(lamps)),
             mirror=(np.arange(len(seen)) == mirror) & images.any(),
             seen=seen,
@@ -97,7 +111,7 @@ class Culling:
         """All that there is, in every pass, at once."""
         every, clear = np.ones_like(self.shown), self._see_through()
         flat = np.isin(np.arange(len(every)), self._flat)
-        return Picture(self.shown & ~clear, clear, flat, every, every, 0, self._sites(True), None, False)
+        return Picture(self.shown & ~clear, clear, flat, every, every, (), self._sites(True), None, False)
 
     def _images(self, data: mujoco.MjData, view: _View, corners_m: Floats, mirror: int) -> NDArray[np.bool_]:
         """(ngeom,) which geoms show in a mirror."""
@@ -108,6 +122,32 @@ class Culling:
         opening_m = data.geom_xpos[mirror] + square_m @ data.geom_xmat[mirror].reshape(3, 3).T
         above = (heights_m > 0).any(axis=1)
         return np.asarray(above & view.shows(image_m) & view.shows_through(image_m, opening_m))
+
+    def _lamp(
+        self,
+        data: mujoco.MjData,
+        view: _View,
+        corners_m: Floats,
+        seen: NDArray[np.bool_],
+        clear: NDArray[np.bool_],
+        lamp: int,
+    ) -> Lamp:
+        model, origin_m = self._model, data.light_xpos[lamp]
+        # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
+        if model.light_directional[lamp]:
+            return Lamp(self.shown, seen | clear)
+        middles_m = corners_m.mean(axis=1)
+        radii_m = np.linalg.norm(corners_m[:, 0] - middles_m, axis=1)
+        axis = data.light_xdir[lamp] / np.linalg.norm(data.light_xdir[lamp])
+        lights = seen & _in_cone(middles_m, radii_m, origin_m, axis, np.radians(model.light_cutoff[lamp])) | clear
+        # A square map of a part of the cone, within a cone through the square's corners.
+        map_deg = min(model.light_cutoff[lamp] * model.vis.map.shadowscale, WIDEST_MAP_DEG)
+        corner = np.arctan(np.sqrt(2) * np.tan(np.radians(map_deg)))
+        # Out of the picture, it may still stand between the lamp and what is in it.
+        # By a metre's distance from the lamp, its shadow reaches a hundred metres.
+        shadows_m = np.concatenate([corners_m, corners_m + 100 * (corners_m - origin_m)], axis=1)
+        casts = _in_cone(middles_m, radii_m, origin_m, axis, corner) & view.shows(shadows_m, SHADOW_MARGIN_M)
+        return Lamp(self.shown & casts & lights.any(), lights)
 
     def _mirror(self, data: mujoco.MjData, view: _View, clear: NDArray[np.bool_]) -> tuple[int | None, bool]:
         """The geom whose mirror images MuJoCo draws: the first that reflects, if the camera is before it.
@@ -159,6 +199,16 @@ class Culling:
         return bool(((opacity > 0) & (opacity < 1)).any())
 
 
+def _in_cone(middles_m: Floats, radii_m: Floats, tip_m: Floats, axis: Floats, angle: float) -> NDArray[np.bool_]:
+    """(N,) which balls may reach into a cone, by half its opening angle in radians."""
+    if angle > WIDEST_CONE:
+        return np.ones(len(radii_m), np.bool_)
+    ways_m = middles_m - tip_m
+    along_m = ways_m @ axis
+    across_m = np.linalg.norm(ways_m - along_m[:, None] * axis, axis=1)
+    return np.asarray(across_m * np.cos(angle) - along_m * np.sin(angle) < radii_m)
+
+
 class _View:
     """The pyramid that a camera sees, in its own frame: it looks along -z, with y up."""
 
@@ -178,14 +228,14 @@ class _View:
         matrix = onto @ np.column_stack([self._axes.T, -self._axes.T @ self.position_m])
         return Projection(matrix, *self._depths_m, self._size_px)
 
-    def shows(self, corners_m: Floats) -> NDArray[np.bool_]:
-        """(N,) whether what has ``corners_m`` (N, 8, 3) may be in the picture."""
+    def shows(self, corners_m: Floats, margin_m: float = 0.0) -> NDArray[np.bool_]:
+        """(N,) whether what has ``corners_m`` (N, K, 3) may be in the picture, or within a margin around it."""
         right, up, back = np.moveaxis((corners_m - self.position_m) @ self._axes, -1, 0)
         inside = np.ones(len(corners_m), np.bool_)
         for off_axis, tangent in ((right, self._tangents[0]), (up, self._tangents[1])):
             # A box is outside when all of it is beyond one side; the sides pass through the camera.
-            inside &= ~(off_axis + tangent * back > 0).all(axis=1)
-            inside &= ~(off_axis - tangent * back < 0).all(axis=1)
+            inside &= ~(off_axis + tangent * back > margin_m).all(axis=1)
+            inside &= ~(off_axis - tangent * back < -margin_m).all(axis=1)
         return inside
 
     def shows_through(self, corners_m: Floats, opening_m: Floats) -> NDArray[np.bool_]:

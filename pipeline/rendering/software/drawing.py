@@ -169,10 +169,8 @@ class SoftwareDrawing(PlainDrawing):
             drawn = drawn | picture.images
             passes.append(Pass(Draws.MIRROR, picture.images | picture.clear))
         passes.append(Pass(Draws.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear))
-        if picture.lamps:
-            # Every lamp's two passes draw the same; what can be seen through is drawn in the last.
-            lit = Pass(Draws.LAMP_LIGHT, picture.seen | picture.clear)
-            passes += picture.lamps * [Pass(Draws.LAMP_MAP, self._culling.shown), lit]
+        for lamp in picture.lamps:
+            passes += [Pass(Draws.LAMP_MAP, lamp.casts), Pass(Draws.LAMP_LIGHT, lamp.lights)]
         self._draw_passes(shot, drawn, passes, layer, last)
 
     def _draw_passes(

@@ -31,6 +31,9 @@ SKINS = 64
 OPAQUE = 0.995
 """MuJoCo's least opacity of what it does not take to be seen through (``mjr_render``)."""
 
+WIDEST_MAP_DEG = 80.0
+"""Half the widest angle of MuJoCo's maps of what casts shadows (``mjr_render``)."""
+
 REFLECTING_SQUARE = np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])
 """Corners of a box's upper z face, which is what reflects (``mjr_render``), in units of its half sizes."""
 
@@ -101,6 +104,10 @@ def adopt_size(context: mujoco.MjrContext, model: mujoco.MjModel) -> None:
     context.fogEnd = model.stat.extent * model.vis.map.fogend
 
 
+_SKY = -mujoco.mjtTextureRole.mjNTEXROLE + mujoco.mjtTextureRole.mjTEXROLE_RGB
+"""Where a context has the sky's texture: the last of all materials that it has room for is the sky's."""
+
+
 def texels(model: mujoco.MjModel) -> list[NDArray[np.uint8]]:
     """The bytes of each texture, where the model has them."""
     sizes = model.tex_height * model.tex_width * model.tex_nchannel
@@ -126,6 +133,8 @@ def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mu
     context.texture[model.ntex :] = 0
     context.ntexture, context.textureType[: model.ntex] = model.ntex, model.tex_type
     context.mat_texid[: model.mat_texid.size] = model.mat_texid.ravel()
+    skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    context.mat_texid[_SKY] = skies[0] if len(skies) else -1
     context.mat_texrepeat[: model.mat_texrepeat.size] = model.mat_texrepeat.ravel()
     context.mat_texuniform[: model.nmat] = model.mat_texuniform
     for texture in copied:
