@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import posixpath
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 
 import mujoco
@@ -64,37 +64,6 @@ def take_images(scene: ET.Element) -> dict[str, dict[str, str]]:
         del texture.attrib["file"]
         texture.attrib.update(builtin="flat", width="1", height="1")
     return taken
-
-
-class Images:
-    """The images of a scene that was compiled without them (``physics_of``).
-
-    Args:
-        model_xml: MJCF of the scene.
-    """
-
-    def __init__(self, model_xml: str):
-        self._model_xml = model_xml
-        scene = ET.fromstring(model_xml)
-        self._compiler = scene.findall("compiler")
-        self._taken = take_images(scene)
-
-    def content(self, name: str) -> tuple[tuple[str, str], ...] | None:
-        """Tells a texture that is an image from any other; None when it is none."""
-        attributes = self._taken.get(name, {})
-        return tuple(sorted(item for item in attributes.items() if item[0] != "name")) or None
-
-    def load(self, names: Sequence[str]) -> mujoco.MjModel:
-        """A model of nothing but these textures, in their order."""
-        scene = ET.Element("mujoco")
-        scene.extend(self._compiler)
-        asset = ET.SubElement(scene, "asset")
-        asset.extend(ET.Element("texture", self._taken[name]) for name in names)
-        return compiled(ET.tostring(scene, encoding="unicode"))
-
-    def scene(self) -> mujoco.MjModel:
-        """The scene compiled with its images."""
-        return compiled(self._model_xml)
 
 
 def put_images(scene: ET.Element, taken: Mapping[str, Mapping[str, str]]) -> None:
