@@ -109,7 +109,7 @@ def compared(trajectory: Trajectory, camera: str, frames: int, shadows: bool, dr
                 took_s = time.process_time() - start
                 spent_s[name] += took_s
                 beside_s[name] += took_s - (drawn.spent_s - drawn_before_s)
-            same += np.array_equal(*pictures)
+            same += np.array_equal(pictures[0], pictures[1])
     return {
         **{f"{name}_ms": round(1000 * seconds / len(steps), 1) for name, seconds in spent_s.items()},
         **{f"{name}_beside_drawing_ms": round(1000 * seconds / len(steps), 2) for name, seconds in beside_s.items()},

@@ -29,6 +29,7 @@ SCENE = '<mujoco><worldbody><light/><camera name="eye" pos="0 0 3"/><geom size="
 @pytest.fixture(autouse=True)
 def asked_anew() -> Iterator[None]:
     savings.why_plain.cache_clear()
+    savings._say.cache_clear()
     yield
     savings.why_plain.cache_clear()
 
@@ -58,6 +59,14 @@ def test_another_version_or_device_draws_plainly_and_says_so(
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
     assert other in record.getMessage()
+
+
+def test_a_scene_that_shares_no_context_is_drawn_plainly(caplog: pytest.LogCaptureFixture) -> None:
+    endless = SCENE.replace("</worldbody>", '<geom type="plane" size="0 0 1" pos="0 0 -1" group="1"/></worldbody>')
+    with closing(Renderer(endless)) as renderer:
+        assert type(renderer.drawing) is PlainDrawing
+    (record,) = caplog.records
+    assert "a floor without bounds" in record.getMessage()
 
 
 def test_other_pixels_of_the_small_scene_draw_plainly(

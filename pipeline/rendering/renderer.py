@@ -87,11 +87,12 @@ class Renderer:
         Returns:
             A function for each choice, after which frames show it.
         """
-        if not isinstance(self.drawing, SideBySide):
-            (choice,) = choices
-            with self.perturbed(choice):
+        if len(choices) == 1:
+            with self.perturbed(choices[0]):
                 yield [lambda: None]
             return
+        if not isinstance(self.drawing, SideBySide):
+            raise TypeError(f"{type(self.drawing).__name__} holds one choice of textures, not {len(choices)}")
         shows = []
         try:
             for choice in choices:

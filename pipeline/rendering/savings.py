@@ -1,6 +1,6 @@
 """Which drawing a scene gets: MuJoCo's own, or one that gives the same pixels for less work.
 
-Savings are used only where they were tested, and where a small scene drawn both ways has equal pixels (0.3 s for each
+Savings are used only where they were tested, and where a small scene drawn both ways has equal pixels (0.6 s for each
 process). Everywhere else, and by request, a scene is drawn by MuJoCo as it is, several times slower without a GPU.
 """
 
@@ -36,12 +36,13 @@ def drawing_of(model: mujoco.MjModel) -> Drawing:
 
         if SoftwareDrawing.possible(model):
             return SoftwareDrawing(model)
+        _say("a scene has height fields, skins, a floor without bounds, or not four samples a pixel")
     return PlainDrawing(model)
 
 
 @functools.cache
 def why_plain() -> str | None:
-    """Why no savings are used in this process, which is logged where nobody asked for it; None where they are."""
+    """Why no savings are used in this process, logged where nobody asked for it; None where they are."""
     if os.environ.get(PLAIN):
         return f"{PLAIN} is set"
     device = gl.choose().device
@@ -55,5 +56,10 @@ def why_plain() -> str | None:
         if (found := fault()) is None:
             return None
         reason = f"on {device} {found}"
-    logging.getLogger(__name__).warning("scenes are drawn by MuJoCo as it is: %s", reason)
+    _say(reason)
     return reason
+
+
+@functools.cache
+def _say(reason: str) -> None:
+    logging.getLogger(__name__).warning("drawn by MuJoCo as it is: %s", reason)

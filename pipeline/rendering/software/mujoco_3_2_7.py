@@ -90,8 +90,14 @@ def fixed(model: mujoco.MjModel) -> tuple[object, ...]:
 
 
 def samples(count: int) -> NDArray[np.float32]:
-    """(count, 2) where in a pixel of the current context its samples are, 0 to 1 to the right and up."""
+    """(count, 2) where in a pixel of the current context its samples are, 0 to 1 to the right and up.
+
+    Raises:
+        PipelineError: when OpenGL cannot draw each of them by itself.
+    """
     opengl = calls()
+    if opengl.glGetIntegerv(opengl.GL_MAJOR_VERSION) < 4:
+        raise failure("OpenGL has no shaders that run once for each sample, as layers need")
     places = [opengl.glGetMultisamplefv(opengl.GL_SAMPLE_POSITION, sample) for sample in range(count)]
     return np.array(places, np.float32)
 
