@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Iterator
 from statistics import mean
 from typing import get_args
@@ -34,7 +35,8 @@ def weakest_and_strongest(task: Task) -> Iterator[LightPerturbation]:
     """A draw of each component at levels 1 and 5.
 
     Of ``diffuse`` it is a darker, a brighter and a tinted one, where drawn; of ``combined`` one with shadows and one
-    without; of ``direction`` one for each edge of the range of the azimuth, where a tilt changes least.
+    without; of ``direction`` one for each edge of the range of the azimuth, where a tilt changes least. Last comes the
+    weakest tint in yellow, a hue that changes least in the study.
     """
     for component in COMPONENTS:
         levels: tuple[Level, ...] = (1, 5)
@@ -48,6 +50,8 @@ def weakest_and_strongest(task: Task) -> Iterator[LightPerturbation]:
                 (edges,) = TILT_AZIMUTH_DEG
                 kinds = {edge: one.model_copy(update={"tilt_azimuth_deg": edge}) for edge in edges}
             yield from kinds.values()
+    ((weakest, _),) = LightAxis().ranges[0].saturation
+    yield NEUTRAL.model_copy(update={"diffuse_scale_rgb": colorsys.hsv_to_rgb(1 / 6, weakest, 1.0)})
 
 
 def share_changed(before: Frame, after: Frame) -> float:
@@ -135,7 +139,8 @@ def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
         assert [exposure(frame) for frame in clean.values()] == [None, None]
         dimmest = {"diffuse_scale_rgb": (0.0, 0.0, 0.0), "tilt_deg": 32.0}
         brightest = {"diffuse_scale_rgb": (2.0, 2.0, 2.0), "specular_scale": 30.0}
-        lit = {"shadows": True, "tilt_deg": 20.0, "tilt_azimuth_deg": 200.0, "fill_scale": 0.3}
+        # The table and the floor below the wrist's camera are brightest with lamps turned so.
+        lit = {"shadows": True, "tilt_deg": 20.0, "tilt_azimuth_deg": 200.0}
         for corner in (dimmest, brightest | lit):
             with shown.perturbed([NEUTRAL.model_copy(update=corner)]):
                 assert [exposure(frame) for frame in frames(shown).values()] == [None, None], corner

@@ -1,8 +1,8 @@
 """Light: colour, direction, gloss and shadows of the scene's lamps. Render layer; both views change.
 
 Every lamp of the model changes in the same way (the kitchen has three, the other arenas two), relative to what it is
-in the scene. The head light that MuJoCo fixes to each camera stays, so no draw makes a frame black. LIBERO-Plus
-changes the same four properties; its values are not published outside its asset archive.
+in the scene, and stays where it is. The head light that MuJoCo fixes to each camera stays too, so no draw makes a frame
+black. What is known of LIBERO-Plus's light, and what is not, is in docs/axes.md.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ FLOOR_SHININESS = 0.1
 TILT_AZIMUTH_DEG = ((135.0, 270.0),)
 """Towards where lamps are turned. LIBERO's two stand at (1, 1, 4) and (-3, -3, 4) m and light 45 degrees about where
 they point: the first lights the scene, the second misses it. Turned by 20 degrees to the other side, from 315 to 90,
-they leave the scene to the head light, and neither their colour nor their shadows would show."""
+they leave much of the scene to the head light: of their shadows nothing shows, and of their colour little."""
 
 DARK_LEVEL, DARK_SHARE = 10, 0.6
 BRIGHT_LEVEL, BRIGHT_SHARE = 250, 0.25
@@ -82,13 +82,7 @@ class LightPerturbation(RenderPerturbation):
         """Change every lamp of the model."""
         _limit(model.light_diffuse, model.light_directional, SHOWN_DIFFUSE)
         model.light_diffuse *= np.array(self.diffuse_scale_rgb)
-        if self.specular_scale > 1:
-            # What a surface reflects as a highlight it does not scatter. The root brings 2 to 30 to 0.9 to 0.6.
-            scattered = self.specular_scale ** (-1 / 6)
-            model.light_diffuse *= scattered
-            model.light_specular *= self.specular_scale
-            model.mat_shininess[model.mat_specular == 0] = FLOOR_SHININESS
-            model.mat_specular[:] = np.maximum(model.mat_specular, 1 - scattered**2)
+        model.light_specular *= self.specular_scale
         if self.tilt_deg:
             azimuth = np.deg2rad(self.tilt_azimuth_deg)
             # Turning what points down about this axis takes it towards the azimuth.
@@ -102,6 +96,13 @@ class LightPerturbation(RenderPerturbation):
             # In MuJoCo a lamp's ambient light stops at shadows, the emission of a surface does not. A third of what
             # is taken from the lamps: with more, walls outshine the table, with less, all darkens.
             model.mat_emission += self.fill_scale * SHADOWED_DIFFUSE / 3
+        if self.specular_scale > 1:
+            # What a surface reflects as a highlight it does not scatter. The root brings 2 to 30 to 0.9 to 0.6.
+            # This comes after the limits: else a bright lamp with shadows would be as bright as without gloss.
+            scattered = self.specular_scale ** (-1 / 6)
+            model.light_diffuse *= scattered
+            model.mat_shininess[model.mat_specular == 0] = FLOOR_SHININESS
+            model.mat_specular[:] = np.maximum(model.mat_specular, 1 - scattered**2)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Nothing to compare with: the test tasks are known by number, not by their lamps."""
@@ -148,7 +149,7 @@ class LightAxis(Axis):
     """The ranges to draw from, chosen by looking at all arenas: from just noticeable to as far as all still shows.
 
     Noticeable: of the agent view's pixels, 5 % differ by 8 grey levels or more. So it was at levels 1 and 5 of every
-    component in every arena, twelve draws each, but for a weak tint in the study (see docs/axes.md).
+    component in every arena, twelve draws each (see docs/axes.md).
 
     Attributes:
         components: which of them. ``shadows`` turns the lamps, too. ``combined`` changes diffuse light, direction and
@@ -163,11 +164,11 @@ class LightAxis(Axis):
     )
     combined_share: float = Field(default=0.6, ge=0.0, le=1.0)
     ranges: tuple[LightRange, LightRange, LightRange, LightRange, LightRange] = (
-        _range((0.7, 0.8), (1.25, 1.4), (0.15, 0.25), (3, 4), (8, 11), (0.24, 0.3)),
-        _range((0.58, 0.7), (1.4, 1.55), (0.25, 0.33), (4, 6), (11, 15), (0.18, 0.24)),
-        _range((0.44, 0.58), (1.55, 1.7), (0.33, 0.42), (6, 10), (15, 20), (0.12, 0.18)),
-        _range((0.25, 0.44), (1.7, 1.85), (0.42, 0.52), (10, 17), (20, 26), (0.06, 0.12)),
-        _range((0.05, 0.25), (1.85, 2.0), (0.52, 0.65), (17, 30), (26, 32), (0.0, 0.06)),
+        _range((0.7, 0.8), (1.25, 1.4), (0.25, 0.3), (3, 4), (8, 11), (0.24, 0.3)),
+        _range((0.58, 0.7), (1.4, 1.55), (0.3, 0.37), (4, 6), (11, 15), (0.18, 0.24)),
+        _range((0.44, 0.58), (1.55, 1.7), (0.37, 0.44), (6, 10), (15, 20), (0.12, 0.18)),
+        _range((0.25, 0.44), (1.7, 1.85), (0.44, 0.53), (10, 17), (20, 26), (0.06, 0.12)),
+        _range((0.05, 0.25), (1.85, 2.0), (0.53, 0.65), (17, 30), (26, 32), (0.0, 0.06)),
     )
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LightPerturbation:
