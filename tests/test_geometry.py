@@ -22,25 +22,25 @@ from back_project import back_project
 
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.light import LightPerturbation
+from pipeline.compute.pool import loop
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.episodes import Episodes
-from pipeline.formats.export import export
 from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
-from pipeline.physics.replay import replay_plan
+from pipeline.planning import plan
+from pipeline.planning.streams import Stream
 from pipeline.rendering.instances import COMMON
 from pipeline.rendering.last_scene import LastScene
-from pipeline.rendering.render import render, render_plan
+from pipeline.rendering.render import render
 from pipeline.rendering.renderer import Renderer
-from pipeline.run import plan
-from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.frame_store import Rendered
-from pipeline.run.streams import Stream
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.run.export import export
+from pipeline.run.render import render_plan
+from pipeline.run.replay import replay_plan
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Extra, Task, Trajectory
+from pipeline.types import Extra, Rendered, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
 
 EXTRAS: tuple[Extra, ...] = ("depth", "object_poses", "segmentation")

@@ -20,8 +20,8 @@ from pipeline.config import load
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish import seen
 from pipeline.run import manifest
-from pipeline.run.frame_store import FrameStore
 from pipeline.seeding import rng
+from pipeline.stores.frame_store import FrameStore
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 
