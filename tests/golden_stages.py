@@ -76,31 +76,26 @@ def checks() -> dict[str, Any]:
     )
     row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
     row |= {"steps": steps + 1, "place": 1, "instruction": "task_1"}
-    whole = Copy(
-        dataset="whole",
-        motion={name: getattr(made, name) for name in ("action", "state", "joint_state")},
-        instructions=["task_1"] * steps,
-        provenance={name: str(row[name]) for name in SCHEMA.provenance},
-        frames={(view, t): decode(made.frames[view][t]) for view in SCHEMA.views for t in sampled(steps)},
-        marks={"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz},
-        place={"place": 1},
-        geometry=made.geometry,
-        encoded=made.frames,
-    )
     view, other = SCHEMA.views
-    wrong = replace(
-        whole,
+    shown = {(name, t): decode(made.frames[name][t]) for name in SCHEMA.views for t in sampled(steps)}
+    marks = {"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz}
+    stored = replace(made, instruction="task_1", provenance={name: str(row[name]) for name in SCHEMA.provenance})
+    whole = Copy("whole", stored, ["task_1"] * steps, shown, marks, {"place": 1})
+    wrong = Copy(
         dataset="wrong",
-        motion={**whole.motion, "action": whole.motion["action"] + np.float32(0.01)},
+        episode=replace(
+            stored,
+            action=made.action + np.float32(0.01),
+            provenance={},
+            frames={},
+            geometry={name: replace(seen, intrinsics=-seen.intrinsics) for name, seen in made.geometry.items()},
+        ),
         instructions=["something else"] * steps,
-        provenance={},
-        frames={**whole.frames, **{(view, t): whole.frames[other, t] for t in sampled(steps)}},
+        decoded={**shown, **{(view, t): shown[other, t] for t in sampled(steps)}},
         marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
         place={"place": 2},
-        geometry={name: replace(seen, intrinsics=-seen.intrinsics) for name, seen in made.geometry.items()},
-        encoded=None,
     )
-    blank = replace(wrong, dataset="blank", frames={place: frame * 0 for place, frame in whole.frames.items()})
+    blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in shown.items()})
     case = of_episodes.Case(row, made, trajectory, [whole, wrong, blank], None)
     found = {name: len(list(check(case))) for name, check in of_episodes.CHECKS.items()}
     limits = {name: value for name, value in vars(of_episodes).items() if isinstance(value, float)}
