@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import runpy
 import shutil
 import sys
@@ -272,6 +273,8 @@ def test_a_run_goes_on_where_steps_and_frames_are_the_same(
     shown = capsys.readouterr().err
     assert "fail  same machine" in shown
     assert "4567" in shown
+    run_stage(config)  # This machine was tried, and is the same.
+    monkeypatch.setattr(platform, "uname", lambda: ("Linux", "another"))
     with pytest.raises(PipelineError, match="this machine cannot make the run"):
         run_stage(config)
 
