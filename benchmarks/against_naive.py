@@ -32,19 +32,19 @@ import numpy as np  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 
 from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer  # noqa: E402
+from pipeline.compute.pool import loop  # noqa: E402
 from pipeline.config import Config, load  # noqa: E402
 from pipeline.episode_schema import SCHEMA  # noqa: E402
+from pipeline.images.jpeg import encode, to_policy  # noqa: E402
 from pipeline.libero.tasks import find_task, select_tasks  # noqa: E402
 from pipeline.physics.environment import DUMMY_ACTION  # noqa: E402
-from pipeline.physics.replay import replay_plan  # noqa: E402
-from pipeline.rendering.jpeg import encode, to_policy  # noqa: E402
-from pipeline.rendering.render import render_plan  # noqa: E402
-from pipeline.run import plan  # noqa: E402
-from pipeline.run.compute import loop  # noqa: E402
-from pipeline.run.frame_store import FrameStore, shown_of  # noqa: E402
+from pipeline.planning import plan  # noqa: E402
+from pipeline.planning.streams import streams_of  # noqa: E402
 from pipeline.run.outcome import rejections  # noqa: E402
-from pipeline.run.streams import streams_of  # noqa: E402
-from pipeline.run.trajectory_store import TrajectoryStore  # noqa: E402
+from pipeline.run.render import render_plan  # noqa: E402
+from pipeline.run.replay import replay_plan  # noqa: E402
+from pipeline.stores.frame_store import FrameStore, shown_of  # noqa: E402
+from pipeline.stores.trajectory_store import TrajectoryStore  # noqa: E402
 from pipeline.testset import benchmark  # noqa: E402
 from pipeline.types import Trajectory  # noqa: E402
 

@@ -27,9 +27,9 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.base import Format
 from pipeline.formats.episodes import Episodes
-from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
+from pipeline.run.export import export
 from pipeline.types import Episode, Geometry
 
 PER_PART = 150

@@ -20,11 +20,10 @@ from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
+from pipeline.planning.streams import streams_of
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.render import render
-from pipeline.run.frame_store import Rendered
-from pipeline.run.streams import streams_of
-from pipeline.types import Extra, Task, Trajectory
+from pipeline.types import Extra, Rendered, Task, Trajectory
 
 ASKED: tuple[tuple[Extra, ...], ...] = (
     (),

@@ -24,14 +24,14 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 # isort: split
 import numpy as np
 
+from pipeline.compute.pool import loop
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
-from pipeline.physics.replay import replay_plan
+from pipeline.planning import plan
 from pipeline.rendering.culling import Culling
 from pipeline.rendering.renderer import Renderer
-from pipeline.run import plan
-from pipeline.run.compute import loop
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.run.replay import replay_plan
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.types import Frame, Trajectory
 

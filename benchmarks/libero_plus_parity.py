@@ -33,8 +33,8 @@ from pipeline.axes.noise import NoisePerturbation
 from pipeline.evaluation.episode import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import RUNNABLE, by_name
 from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, select
+from pipeline.images.jpeg import to_policy
 from pipeline.machine_code import machine_code
-from pipeline.rendering.jpeg import to_policy
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import SUITES
 from pipeline.types import Floats, Frame

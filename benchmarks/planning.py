@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pipeline.config import DemosConfig, load
-from pipeline.run import leakage, plan
+from pipeline.planning import leakage, plan
 from pipeline.testset import benchmark
 
 

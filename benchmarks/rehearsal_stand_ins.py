@@ -19,18 +19,17 @@ import pipeline  # before NumPy, whose machine code it fixes
 import cv2
 import numpy as np
 
-import pipeline.physics.replay
-import pipeline.rendering.render
+import pipeline.run.render
+import pipeline.run.replay
 import pipeline.validation.doctor
 import pipeline.validation.validate
 from pipeline import seeding
 from pipeline.axes import PhysicsPerturbation
 from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.jpeg import encode
-from pipeline.run.frame_store import Rendered
-from pipeline.run.streams import Stream
-from pipeline.types import Demo, Frame, Geometry, Scene, Task, Trajectory, Verdict
+from pipeline.images.jpeg import encode
+from pipeline.planning.streams import Stream
+from pipeline.types import Demo, Frame, Geometry, Rendered, Scene, Task, Trajectory, Verdict
 
 STEPS = 8
 """The fewest that OpenVLA-OFT can read: one of its chunks."""
@@ -98,9 +97,9 @@ def _pattern(name: str) -> Frame:
 def put_in() -> None:
     """Have this process work with the stand-ins."""
     for module, name, stand_in in (
-        (pipeline.physics.replay, "shared", lambda task: None),
-        (pipeline.physics.replay, "replay", replay),
-        (pipeline.rendering.render, "render", render),
+        (pipeline.run.replay, "shared", lambda task: None),
+        (pipeline.run.replay, "replay", replay),
+        (pipeline.run.render, "render", render),
         (pipeline.validation.validate, "rendered", lambda *_: ()),
     ):
         setattr(module, name, stand_in)

@@ -26,12 +26,12 @@ os.environ |= {"LP_NUM_THREADS": "1"}
 from episode_slice import sliced
 
 from pipeline import gl
+from pipeline.compute.pool import Run, loop, runner
 from pipeline.config import ComputeConfig, load
-from pipeline.physics.replay import replay_plan
-from pipeline.rendering.render import render_plan
+from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
-from pipeline.run import plan
-from pipeline.run.compute import Run, loop, runner
+from pipeline.run.render import render_plan
+from pipeline.run.replay import replay_plan
 from pipeline.testset import benchmark
 from pipeline.types import Frame
 

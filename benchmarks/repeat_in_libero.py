@@ -23,8 +23,8 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 import numpy as np
 
 from pipeline.libero.tasks import find_task
-from pipeline.run import plan
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.planning import plan
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Scene, Task, Trajectory
 
 STEP_S = 0.05

@@ -26,14 +26,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.axes import from_json
+from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
 from pipeline.evaluation.results import wilson
 from pipeline.libero.tasks import SUITES
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay_plan
-from pipeline.run import plan
-from pipeline.run.compute import runner
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.planning import plan
+from pipeline.run.replay import replay_plan
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 
 AXES: dict[str, tuple[str, dict[str, Any]]] = {

@@ -28,15 +28,15 @@ from rich.table import Table
 
 from pipeline import seeding
 from pipeline.axes.noise import NoiseAxis
+from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, DemosConfig, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.lerobot_video import VideoEncoder
+from pipeline.images.jpeg import decode, encode, to_policy
 from pipeline.libero.demonstrations import DemoEntry
-from pipeline.physics.replay import ReplayJob
-from pipeline.rendering.jpeg import decode, encode, to_policy
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.compute import runner
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.run.replay import ReplayJob
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Frame
 
 TASKS = (

@@ -19,7 +19,7 @@ from pipeline.axes.base import Axis, RenderPerturbation
 from pipeline.libero.tasks import find_task
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 

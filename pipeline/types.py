@@ -152,6 +152,31 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class Rendered:
+    """Everything that a policy may see of one trajectory.
+
+    Attributes:
+        replay_mode: how the trajectory's actions came about.
+        state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
+        streams: stream id to K encoded frames.
+        rejected: stream id to the reason why it was not rendered.
+        geometry: id of a stream's geometry to what it is.
+        object_poses: (K, 24, 7), None where they were not asked for.
+        instances: names of the things that segmentation and poses number; none without those.
+    """
+
+    replay_mode: str
+    state: NDArray[np.float32]
+    joint_state: NDArray[np.float32]
+    action: NDArray[np.float32]
+    streams: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
+    rejected: Mapping[str, str] = field(default_factory=dict)
+    geometry: Mapping[str, Geometry] = field(default_factory=dict)
+    object_poses: NDArray[np.float32] | None = None
+    instances: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
 class Episode:
     """What a policy sees, ready for the writers; names, units and signs are those of ``schemas/episode.json``.
 

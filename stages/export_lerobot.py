@@ -1,8 +1,8 @@
 """Stage export_lerobot: the kept episodes as a LeRobot v3.0 dataset, through lerobot itself."""
 
 from pipeline.config import Config
-from pipeline.formats.export_run import export_run
 from pipeline.formats.lerobot import LeRobot
+from pipeline.run.export import export_run
 from pipeline.run.stage import main
 
 

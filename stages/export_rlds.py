@@ -1,8 +1,8 @@
 """Stage export_rlds: the kept episodes as RLDS, a set for each suite, without TensorFlow."""
 
 from pipeline.config import Config
-from pipeline.formats.export_run import export_run
 from pipeline.formats.rlds import Rlds
+from pipeline.run.export import export_run
 from pipeline.run.stage import main
 
 

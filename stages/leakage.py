@@ -3,7 +3,7 @@
 from rich.console import Console
 
 from pipeline.config import Config
-from pipeline.run import leakage, plan
+from pipeline.planning import leakage, plan
 from pipeline.run.stage import main
 from pipeline.testset import benchmark
 

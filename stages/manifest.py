@@ -2,11 +2,11 @@
 
 from pipeline.config import Config
 from pipeline.files import write_json
-from pipeline.formats import registry
+from pipeline.formats import motion_statistics, registry
 from pipeline.formats.rlds_layout import by_suite
-from pipeline.run import manifest, motion_statistics, outcome
-from pipeline.run.frame_store import FrameStore
+from pipeline.run import manifest, outcome
 from pipeline.run.stage import main
+from pipeline.stores.frame_store import FrameStore
 
 
 def run(config: Config) -> None:

@@ -3,7 +3,7 @@
 import sys
 
 from pipeline.config import Config
-from pipeline.run import plan
+from pipeline.planning import plan
 from pipeline.run.stage import main
 from pipeline.testset import benchmark
 

@@ -4,17 +4,17 @@ Where frames are refused, it replays the reserves that take their place, as the 
 """
 
 from pipeline import gl
+from pipeline.compute.pool import runner
 from pipeline.config import Config
 from pipeline.files import read_json
-from pipeline.physics.replay import replay_plan
-from pipeline.rendering.render import render_plan
-from pipeline.run import plan
-from pipeline.run.compute import runner
-from pipeline.run.frame_store import FrameStore, shown_of
+from pipeline.planning import plan
 from pipeline.run.machine import same_machine
 from pipeline.run.outcome import rejections
+from pipeline.run.render import render_plan
+from pipeline.run.replay import replay_plan
 from pipeline.run.stage import main
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:

@@ -1,13 +1,13 @@
 """Stage replay: run the physics of every planned trajectory and judge it; needs no GL. Resumes where it was stopped."""
 
+from pipeline.compute.pool import runner
 from pipeline.config import Config
 from pipeline.files import write_json
-from pipeline.physics.replay import replay_plan
-from pipeline.run import plan
-from pipeline.run.compute import runner
+from pipeline.planning import plan
 from pipeline.run.machine import same_machine
+from pipeline.run.replay import replay_plan
 from pipeline.run.stage import main
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:

@@ -3,10 +3,10 @@
 from rich.console import Console
 
 from pipeline import gl
+from pipeline.compute.pool import runner
 from pipeline.config import Config
 from pipeline.publish import preview, sheets
 from pipeline.run import manifest
-from pipeline.run.compute import runner
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.stage import main
 

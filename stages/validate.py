@@ -1,10 +1,10 @@
 """Stage validate: reopen the datasets and the manifest, and stop where anything is off."""
 
 from pipeline import gl
+from pipeline.compute.pool import runner
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
-from pipeline.run.compute import runner
 from pipeline.run.stage import main
 from pipeline.validation.validate import validate
 

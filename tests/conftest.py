@@ -30,7 +30,7 @@ from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import fetch_testset
 from pipeline.types import Demo, Task, Trajectory

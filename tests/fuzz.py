@@ -46,12 +46,13 @@ from pipeline.libero import bddl, hdf5
 from pipeline.libero.assets import relocate
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.starts import recorded_start
-from pipeline.run import manifest, plan
-from pipeline.run.frame_store import FrameStore, Rendered
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.planning import plan
+from pipeline.run import manifest
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.tables import write_table
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Scene, Trajectory, Verdict
+from pipeline.types import Rendered, Scene, Trajectory, Verdict
 
 LIMIT_S = 20
 """What takes longer counts as a hang."""

@@ -25,12 +25,12 @@ import numpy as np
 
 from pipeline.axes import PhysicsPerturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer
 from pipeline.config import RenderConfig, ReplayConfig
+from pipeline.images.jpeg import encode
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
-from pipeline.rendering.jpeg import encode
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Floats, Frame, Trajectory
 

@@ -21,9 +21,9 @@ from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.episodes import Episodes
-from pipeline.formats.export import export
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
+from pipeline.run.export import export
 from pipeline.types import Episode, Extra, Geometry
 
 IDS = [f"episode-{k}" for k in (3, 0, 4, 1, 5, 2)]

@@ -15,14 +15,14 @@ from conftest import MILK, STOVE, starter_demo
 
 from pipeline.axes import Axes
 from pipeline.axes.layout import LayoutAxis
+from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import hdf5
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError
-from pipeline.physics.replay import replay_plan
-from pipeline.run import plan
-from pipeline.run.compute import loop
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.planning import plan
+from pipeline.run.replay import replay_plan
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Scene, Verdict
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes import from_json, to_json
 from pipeline.axes.camera import CameraAxis, CameraPerturbation
 from pipeline.axes.noise import NoiseAxis
-from pipeline.run import leakage
+from pipeline.planning import leakage
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
 

@@ -20,12 +20,12 @@ from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 from PIL import Image
 
 from pipeline import gl
+from pipeline.compute.cluster import Workplace
+from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, RenderConfig
 from pipeline.errors import PipelineError
 from pipeline.machine_code import SETTINGS
-from pipeline.rendering.render import RenderJob
-from pipeline.run.cluster import Workplace
-from pipeline.run.compute import runner
+from pipeline.run.render import RenderJob
 
 Start = Callable[..., str]
 

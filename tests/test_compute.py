@@ -17,9 +17,9 @@ import pytest
 from conftest import REPOSITORY
 
 from pipeline import gl
+from pipeline.compute.pool import TRIES, Expendable, loop, runner
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
-from pipeline.run.compute import TRIES, Expendable, loop, runner
 
 
 def square(number: int) -> int:
@@ -165,8 +165,8 @@ def test_a_cluster_that_goes_away_is_not_waited_for(
 ) -> None:
     import dask
 
-    monkeypatch.setattr("pipeline.run.compute.ALONE_S", 2)
-    monkeypatch.setattr("pipeline.run.compute.LOOK_S", 1)
+    monkeypatch.setattr("pipeline.compute.pool.ALONE_S", 2)
+    monkeypatch.setattr("pipeline.compute.pool.LOOK_S", 1)
     script = Path(sys.executable).parent / "dask"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])}
     with socket.socket() as free:
@@ -205,7 +205,7 @@ def test_a_cluster_that_goes_away_is_not_waited_for(
 def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     import dask
 
-    monkeypatch.setattr("pipeline.run.compute.CONNECT_S", 1)
+    monkeypatch.setattr("pipeline.compute.pool.CONNECT_S", 1)
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),

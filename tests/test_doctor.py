@@ -18,7 +18,8 @@ from pipeline.catalogue import wheels
 from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig, load
 from pipeline.errors import PipelineError
 from pipeline.identity import machine as machine_here
-from pipeline.run import machine, plan
+from pipeline.planning import plan
+from pipeline.run import machine
 from pipeline.run.machine import same_machine
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet

@@ -34,7 +34,7 @@ from pipeline.evaluation.initial_states import libero_states  # noqa: E402
 from pipeline.evaluation.replay_server import replaying  # noqa: E402
 from pipeline.evaluation.settings import Wanted  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select  # noqa: E402
-from pipeline.rendering.jpeg import to_policy  # noqa: E402
+from pipeline.images.jpeg import to_policy  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
 
 ACTIONS = rng("test_evaluation").uniform(-1, 1, (4, 7))

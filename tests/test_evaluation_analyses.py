@@ -28,7 +28,7 @@ from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask, Selection, draw, select
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
-from pipeline.run import plan
+from pipeline.planning import plan
 
 BY: dict[str, Any] = {"policy": "p", "identity": "claimed:p", "settings": {"prompt": "clean"}}
 

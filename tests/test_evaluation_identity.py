@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from conftest import STOVE
 
+from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation import episode, merging, results
 from pipeline.evaluation.episode import EpisodeEnvironment
@@ -25,7 +26,6 @@ from pipeline.evaluation.replay_server import running
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
-from pipeline.run.compute import loop
 
 STEPS = 4
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
+from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.job import _environment
@@ -21,7 +22,6 @@ from pipeline.evaluation.replay_server import running
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import Selection
-from pipeline.run.compute import loop
 
 FAULTY_AND_STOVE = Selection(
     suites=("libero_object", "libero_goal"), tasks=("pick_up_the_milk*", "push_the_plate*", "turn_on*")

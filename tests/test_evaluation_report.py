@@ -20,8 +20,8 @@ from pipeline.evaluation.merging import read
 from pipeline.evaluation.paper_table import paper_table
 from pipeline.evaluation.results import EpisodeFiles, Row
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.images.mp4 import mp4
 from pipeline.publish import evaluation_report
-from pipeline.rendering.mp4 import mp4
 from pipeline.seeding import digest
 
 

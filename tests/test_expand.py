@@ -12,13 +12,13 @@ import pytest
 from conftest import STOVE, link_testset, starter_demo
 from machine_paths import told
 
+from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.libero.assets import libero_assets
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
-from pipeline.physics.expand import APART_RAD, Expansion, expand
 from pipeline.physics.replay import replay
-from pipeline.run.compute import loop
+from pipeline.run.expand import APART_RAD, Expansion, expand
 from pipeline.testset import benchmark
 
 TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))

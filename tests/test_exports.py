@@ -16,9 +16,9 @@ from synthetic import IDS, episode, episodes, files, loop
 
 from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.base import Format
-from pipeline.formats.export import export, is_current
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
+from pipeline.run.export import export, is_current
 from pipeline.types import Episode
 
 PIECES = 3
@@ -52,7 +52,7 @@ def killed_export(name: str, data: Path, where: str) -> None:
         source = replace(source, load=partial(load_until, last=IDS[-1]))
     patch = pytest.MonkeyPatch()
     if where == "metadata":
-        patch.setattr("pipeline.formats.export.sync", lambda _: kill())
+        patch.setattr("pipeline.run.export.sync", lambda _: kill())
     elif where in ("rename", "record"):
         from pipeline.files import put_in_place
 
@@ -63,7 +63,7 @@ def killed_export(name: str, data: Path, where: str) -> None:
             if where == "record" and path == made.folder:
                 kill()
 
-        patch.setattr("pipeline.formats.export.put_in_place", put)
+        patch.setattr("pipeline.run.export.put_in_place", put)
     export(made, source, loop)
 
 

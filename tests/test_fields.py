@@ -14,8 +14,8 @@ import pytest
 
 from pipeline.axes.base import CAMERA_FIELDS, FIELDS, RenderPerturbation
 from pipeline.errors import PipelineError
+from pipeline.images.jpeg import to_policy
 from pipeline.rendering.geometry import matrices
-from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Floats, Frame
 

@@ -22,25 +22,25 @@ from back_project import back_project
 
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.light import LightPerturbation
+from pipeline.compute.pool import loop
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.episodes import Episodes
-from pipeline.formats.export import export
 from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
-from pipeline.physics.replay import replay_plan
+from pipeline.planning import plan
+from pipeline.planning.streams import Stream
 from pipeline.rendering.instances import COMMON
 from pipeline.rendering.last_scene import LastScene
-from pipeline.rendering.render import render, render_plan
+from pipeline.rendering.render import render
 from pipeline.rendering.renderer import Renderer
-from pipeline.run import plan
-from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.frame_store import Rendered
-from pipeline.run.streams import Stream
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.run.export import export
+from pipeline.run.render import render_plan
+from pipeline.run.replay import replay_plan
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Extra, Task, Trajectory
+from pipeline.types import Extra, Rendered, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
 
 EXTRAS: tuple[Extra, ...] = ("depth", "object_poses", "segmentation")
@@ -212,15 +212,16 @@ def test_both_datasets_have_what_the_store_has(run: Path) -> None:
 def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:
     case = cases(run)[0]
     (copy, *_) = case.copies
-    seen = copy.geometry["image"]
-    assert copy.object_poses is not None
+    made = copy.episode
+    seen = made.geometry["image"]
+    assert made.object_poses is not None
     for spoilt, what in (
-        (replace(copy, geometry={**copy.geometry, "image": replace(seen, extrinsics=seen.extrinsics.T)}), "image_ext"),
-        (replace(copy, geometry={**copy.geometry, "image": copy.geometry["wrist_image"]}), "image_"),
-        (replace(copy, object_poses=copy.object_poses[::-1]), "object_poses"),
-        (replace(copy, instances=copy.instances[:-1]), "instances"),
+        (replace(made, geometry={**made.geometry, "image": replace(seen, extrinsics=seen.extrinsics.T)}), "image_ext"),
+        (replace(made, geometry={**made.geometry, "image": made.geometry["wrist_image"]}), "image_"),
+        (replace(made, object_poses=made.object_poses[::-1]), "object_poses"),
+        (replace(made, instances=made.instances[:-1]), "instances"),
     ):
-        findings = list(CHECKS["geometry"](replace(case, copies=[spoilt])))
+        findings = list(CHECKS["geometry"](replace(case, copies=[replace(copy, episode=spoilt)])))
         assert findings
         assert {finding.what.startswith(what) for finding in findings} == {True}
 

@@ -29,8 +29,8 @@ from pipeline.axes.scene import displacements
 from pipeline.errors import PipelineError
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
-from pipeline.run import leakage, plan
-from pipeline.run.plan import Row, draws_of
+from pipeline.planning import leakage, plan
+from pipeline.planning.plan import Row, draws_of
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Task

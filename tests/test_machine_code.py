@@ -93,7 +93,7 @@ import numpy
 from pathlib import Path
 from pipeline.errors import PipelineError
 from pipeline.run.machine import same_machine
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 for use in (TrajectoryStore, same_machine):
     try:
         use(Path("none"))

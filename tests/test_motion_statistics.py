@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline import seeding
-from pipeline.run import motion_statistics
-from pipeline.run.motion_statistics import Motion
+from pipeline.formats import motion_statistics
+from pipeline.formats.motion_statistics import Motion
 
 
 @pytest.fixture

@@ -16,15 +16,14 @@ import pytest
 from PIL import Image
 
 from pipeline import seeding
+from pipeline.compute.pool import loop
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
-from pipeline.formats import rlds_write
+from pipeline.formats import motion_statistics, rlds_write
 from pipeline.formats.episodes import Episodes
-from pipeline.formats.export import export
 from pipeline.formats.rlds import Rlds
-from pipeline.run import motion_statistics
-from pipeline.run.compute import loop
+from pipeline.run.export import export
 from pipeline.types import Episode, Geometry
 from pipeline.validation import oft, oft_check
 

@@ -20,7 +20,7 @@ from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task, tasks
-from pipeline.run import plan
+from pipeline.planning import plan
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Verdict

@@ -32,7 +32,8 @@ from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.formats.tfrecord import framed
 from pipeline.libero.assets import libero_assets, package_folder
-from pipeline.run import inputs, plan
+from pipeline.planning import plan
+from pipeline.run import inputs
 from pipeline.testset.benchmark import TestSet
 
 WEDGE = "v 0 0 0\nv .08 0 0\nv 0 .06 0\nv 0 0 .07\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
@@ -193,7 +194,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 
 made, read = (TrajectoryStore(Path(folder)) for folder in sys.argv[1:])
 demo = StarterSource().of(find_task("libero_goal", "turn_on_the_stove"))

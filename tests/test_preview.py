@@ -17,18 +17,18 @@ from pipeline import __main__ as command_line
 from pipeline.axes import Axes, PhysicsPerturbation, RenderPerturbation, to_json
 from pipeline.axes.base import Axis, Nearest
 from pipeline.axes.language import LanguageAxis
+from pipeline.compute.pool import loop
 from pipeline.config import PlanConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
+from pipeline.images.jpeg import decode
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.environment import Environment
+from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
 from pipeline.publish import preview, sheets
-from pipeline.rendering.jpeg import decode
 from pipeline.rendering.last_scene import scene_of_process
 from pipeline.rendering.render import render
-from pipeline.run import plan
-from pipeline.run.compute import loop
-from pipeline.run.streams import streams_of
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, RollOut, Scene, Task, Trajectory, Verdict

@@ -19,14 +19,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.axes import PhysicsPerturbation
+from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
-from pipeline.physics.replay import replay, replay_plan
+from pipeline.physics.replay import replay
 from pipeline.physics.success import verdict
-from pipeline.run import plan
-from pipeline.run.compute import loop
+from pipeline.planning import plan
+from pipeline.run.replay import replay_plan
 from pipeline.scenes.noops import NOOP_NORM, kept_actions
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task, Trajectory

@@ -23,11 +23,11 @@ from PIL import Image
 from pipeline.axes import AnyPerturbation, Axes, to_json
 from pipeline.config import Config, RenderConfig
 from pipeline.errors import PipelineError
+from pipeline.images.jpeg import encode
+from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
 from pipeline.publish import clips, coverage, figures, pages, report, yields
 from pipeline.publish.coverage import Draw
-from pipeline.rendering.jpeg import encode
-from pipeline.rendering.mp4 import VIDEO_BYTES
 from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.tables import write_table

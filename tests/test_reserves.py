@@ -14,9 +14,10 @@ from kills import contents
 from pipeline import gl
 from pipeline.config import Config
 from pipeline.libero.tasks import find_task
-from pipeline.rendering.render import RenderJob
-from pipeline.run import manifest, plan
-from pipeline.run.streams import streams_of
+from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
+from pipeline.run import manifest
+from pipeline.run.render import RenderJob
 
 AXES = ("layout", "pose", "robot")
 """Each of their episodes has a replay of its own."""

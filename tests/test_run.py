@@ -24,11 +24,12 @@ from synthetic import records
 from pipeline.axes import from_json
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.jpeg import decode
+from pipeline.images.jpeg import decode
+from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
-from pipeline.run import manifest, plan
+from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.validation import oft_check
 
 

@@ -19,10 +19,11 @@ from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig, load
 from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.planning import plan
 from pipeline.publish import seen
-from pipeline.run import manifest, plan
-from pipeline.run.frame_store import FrameStore
+from pipeline.run import manifest
 from pipeline.seeding import rng
+from pipeline.stores.frame_store import FrameStore
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats

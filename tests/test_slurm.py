@@ -16,10 +16,10 @@ import pytest
 from conftest import REPOSITORY
 from pydantic import ValidationError
 
+from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
 from pipeline.machine_code import machine_code
-from pipeline.run.compute import runner
 
 DEADLINE_S = 60.0
 

@@ -23,19 +23,21 @@ from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.robot import RobotPerturbation
+from pipeline.compute.pool import loop
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.physics.replay import replay_plan
-from pipeline.rendering.render import STREAMS_OF_A_JOB, portions, render, render_plan
-from pipeline.run import outcome, plan
-from pipeline.run.compute import loop
-from pipeline.run.frame_store import FrameStore, shown_of
-from pipeline.run.sealed_file import sealed
-from pipeline.run.store import TABLE
-from pipeline.run.streams import Stream, streams_of
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.planning import plan
+from pipeline.planning.streams import Stream, streams_of
+from pipeline.rendering.render import render
+from pipeline.run import outcome
+from pipeline.run.render import STREAMS_OF_A_JOB, portions, render_plan
+from pipeline.run.replay import replay_plan
 from pipeline.seeding import rng
+from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.sealed_file import sealed
+from pipeline.stores.store import TABLE
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
@@ -208,7 +210,7 @@ def test_another_quality_and_another_shape_of_frames_are_other_frames(
     today = made_by()
     assert FrameStore(tmp_path, config.render.model_copy(update={"jpeg_quality": 80})).made_by != today
     smaller = SCHEMA.frame.model_copy(update={"shape": (128, 128, 3)})
-    monkeypatch.setattr("pipeline.run.frame_store.SCHEMA", SCHEMA.model_copy(update={"frame": smaller}))
+    monkeypatch.setattr("pipeline.stores.frame_store.SCHEMA", SCHEMA.model_copy(update={"frame": smaller}))
     assert made_by() != today
 
 
@@ -253,7 +255,7 @@ def test_frames_are_the_same_in_one_file_and_in_several(
 ) -> None:
     """As when a trajectory has more streams than a job renders."""
     render_plan(rows, config, replayed, tmp_path / "one", loop)
-    monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", 1)
+    monkeypatch.setattr("pipeline.run.render.STREAMS_OF_A_JOB", 1)
     files = render_plan(rows, config, replayed, tmp_path / "several", loop)
     streams = {s.stream_id: s.geometry.stream_id for row in rows[:2] for s in streams_of(row.perturbations).values()}
     assert len(streams) == len(files) == 4
@@ -275,14 +277,14 @@ def test_a_plan_that_grows_or_shrinks_has_the_files_of_a_first_run_and_renders_w
     monkeypatch: pytest.MonkeyPatch,
     streams_of_a_job: int,
 ) -> None:
-    monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", streams_of_a_job)
+    monkeypatch.setattr("pipeline.run.render.STREAMS_OF_A_JOB", streams_of_a_job)
     made: list[str] = []
 
     def noted(trajectory: Any, task: Any, streams: Sequence[Stream], render_config: Any, opened: Any) -> Any:
         made.extend(stream.stream_id for stream in streams)
         return render(trajectory, task, streams, render_config, opened)
 
-    monkeypatch.setattr("pipeline.rendering.render.render", noted)
+    monkeypatch.setattr("pipeline.run.render.render", noted)
 
     def files(planned: Sequence[plan.Row], folder: str) -> dict[str, bytes]:
         store = FrameStore(tmp_path / folder, config.render)
@@ -328,7 +330,7 @@ def test_a_rejection_that_is_no_longer_planned_is_forgotten(
 def test_a_damaged_file_is_rendered_again_and_hinders_no_other(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.rendering.render.STREAMS_OF_A_JOB", 2)
+    monkeypatch.setattr("pipeline.run.render.STREAMS_OF_A_JOB", 2)
     files = render_plan(rows, config, replayed, tmp_path, loop)
     store = FrameStore(tmp_path, config.render)
     whole, damaged = sorted(files)

@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import chdir
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +18,15 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import BOWL, MILK, STOVE, rot, run_stages, tiny_config
 
+from pipeline.compute.pool import loop
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum
 from pipeline.formats import lerobot_video, rlds_write
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
-from pipeline.rendering.jpeg import decode, encode
+from pipeline.images.jpeg import decode, encode
 from pipeline.run import manifest
-from pipeline.run.compute import loop
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
@@ -249,7 +250,7 @@ def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory])
 
     def found(sign: float) -> list[Fault]:
         commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
-        copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {}, {}, {})
+        copy = Copy("rlds", replace(made, action=commanded), [], {}, {}, {})
         return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], None)))
 
     assert found(1.0) == []

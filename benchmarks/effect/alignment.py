@@ -26,7 +26,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.episode import EpisodeEnvironment
 from pipeline.evaluation.settings import VIEWS, Settings, Wanted
 from pipeline.evaluation.tasks import Selection, select
-from pipeline.rendering.jpeg import decode
+from pipeline.images.jpeg import decode
 from pipeline.types import Floats
 
 KEYS = {name: SCHEMA.views[view].lerobot_key for name, view in VIEWS.items()}

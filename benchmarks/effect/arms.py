@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import replaced, scratch
-from pipeline.rendering.jpeg import decode, resized
+from pipeline.images.jpeg import decode, resized
 from pipeline.seeding import digest
 
 EpisodeRow = Mapping[str, Any]

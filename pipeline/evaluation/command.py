@@ -9,8 +9,8 @@ from typing import Any
 
 from pipeline import gl
 from pipeline.arguments import positive
+from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig
-from pipeline.run.compute import runner
 from pipeline.testset import benchmark
 
 

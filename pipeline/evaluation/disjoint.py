@@ -22,7 +22,7 @@ from pipeline.axes.robot import RobotPerturbation
 from pipeline.axes.scene import ScenePerturbation
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, checksum, edition
-from pipeline.run import plan
+from pipeline.planning import plan
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.testset.definitions import Value

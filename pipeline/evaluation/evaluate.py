@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline import gl
+from pipeline.compute.pool import Expendable, Run
 from pipeline.errors import PipelineError
 from pipeline.evaluation.job import EvaluationJob, Videos, current, episode_id, without_result
 from pipeline.evaluation.policy_config import PolicyConfig
@@ -18,7 +19,6 @@ from pipeline.evaluation.selection import check_settings
 from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import EvaluationTask, Selection, select
 from pipeline.files import replaced
-from pipeline.run.compute import Expendable, Run
 from pipeline.seeding import digest
 
 EPISODES_A_JOB = 10

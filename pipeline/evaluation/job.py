@@ -14,6 +14,7 @@ from typing import Literal
 import mujoco
 
 from pipeline import gl
+from pipeline.compute.pool import LOST
 from pipeline.errors import PipelineError
 from pipeline.evaluation import asset_archive, libero_plus
 from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment
@@ -23,8 +24,7 @@ from pipeline.evaluation.results import EpisodeFiles, Row, made_by, versions
 from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.rendering.mp4 import mp4
-from pipeline.run.compute import LOST
+from pipeline.images.mp4 import mp4
 from pipeline.seeding import digest
 from pipeline.types import Frame
 

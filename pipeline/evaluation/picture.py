@@ -13,7 +13,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.settings import VIEWS
 from pipeline.evaluation.simulator import Observed
-from pipeline.rendering.jpeg import to_policy
+from pipeline.images.jpeg import to_policy
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Frame

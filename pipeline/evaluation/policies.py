@@ -14,7 +14,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.evaluation.settings import VIEWS, Wanted
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.rendering.jpeg import resized
+from pipeline.images.jpeg import resized
 from pipeline.seeding import digest
 from pipeline.types import Floats
 

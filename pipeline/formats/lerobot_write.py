@@ -39,7 +39,7 @@ from pipeline.formats.episodes import Load
 from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, Frames, camera_column, features
 from pipeline.formats.lerobot_video import VideoEncoder
-from pipeline.run.motion_statistics import describe
+from pipeline.formats.motion_statistics import describe
 from pipeline.types import Episode, Extra, Floats, Frame
 
 PART_VIDEO_MB = 1e-6

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from pipeline.images.jpeg import decode
+from pipeline.images.mp4 import mp4
 from pipeline.publish.sheets import MOMENT
-from pipeline.rendering.jpeg import decode
-from pipeline.rendering.mp4 import mp4
 from pipeline.types import Frame
 
 PICTURE_PX, PICTURE_QUALITY = 1100, 80

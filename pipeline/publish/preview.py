@@ -25,20 +25,20 @@ from pipeline.axes import (
     RenderPerturbation,
     of_layer,
 )
+from pipeline.compute.pool import Run
 from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import replaced
+from pipeline.images.jpeg import to_policy
 from pipeline.libero.demonstrations import Problem
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import first_look, roll_out
+from pipeline.planning.plan import draws_of
 from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
-from pipeline.rendering.jpeg import to_policy
 from pipeline.rendering.last_scene import LastScene, scene_of_process
-from pipeline.run.compute import Run
-from pipeline.run.plan import draws_of
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task

@@ -17,6 +17,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.libero.tasks import find_task
+from pipeline.planning.streams import streams_of
 from pipeline.publish import clips, coverage, figures, pages, seen, yields
 from pipeline.publish.clips import Clip
 from pipeline.publish.coverage import AxisPlots, Draw
@@ -25,8 +26,7 @@ from pipeline.publish.sheets import describe
 from pipeline.publish.yields import Rows, Table
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.frame_store import FrameStore
-from pipeline.run.streams import streams_of
+from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats
 

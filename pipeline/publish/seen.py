@@ -33,17 +33,17 @@ from pipeline.axes.robot import RobotPerturbation
 from pipeline.axes.scene import ScenePerturbation, Shifts, displacements
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
+from pipeline.images.jpeg import decode
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.libero.tasks import find_task
-from pipeline.rendering.jpeg import decode
+from pipeline.planning.plan import Row
+from pipeline.planning.streams import streams_of
 from pipeline.run import outcome
-from pipeline.run.frame_store import FrameStore
-from pipeline.run.plan import Row
-from pipeline.run.streams import streams_of
-from pipeline.run.trajectory_store import TrajectoryStore
 from pipeline.scenes.compiled import physics_to_read
 from pipeline.scenes.swept_path import SURFACES
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats
 

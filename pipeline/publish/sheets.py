@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from pipeline.axes import from_json
 from pipeline.axes.base import Perturbation
 from pipeline.files import replaced
-from pipeline.rendering.jpeg import decode
+from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Frame
 
 LINE_PX = 16

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from pipeline.axes import RenderPerturbation, of_layer
 from pipeline.episode_schema import MAPS, SCHEMA
+from pipeline.images.jpeg import encode_exactly, to_policy
+from pipeline.planning.streams import Stream
 from pipeline.rendering.instances import Instances
-from pipeline.rendering.jpeg import encode_exactly, to_policy
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.streams import Stream
 from pipeline.types import Extra, Floats, Geometry, Trajectory
 
 

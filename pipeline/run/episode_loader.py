@@ -10,9 +10,9 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import Edition, edition
 from pipeline.identity import versions
-from pipeline.run import plan
-from pipeline.run.frame_store import FrameStore
-from pipeline.run.streams import streams_of
+from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
+from pipeline.stores.frame_store import FrameStore
 from pipeline.types import Episode
 
 

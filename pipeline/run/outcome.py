@@ -10,11 +10,11 @@ from typing import Any
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
-from pipeline.run import plan
-from pipeline.run.frame_store import FrameStore, Shown, shown_of
-from pipeline.run.streams import streams_of
-from pipeline.run.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
 from pipeline.seeding import digest
+from pipeline.stores.frame_store import FrameStore, Shown, shown_of
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
 
 

@@ -19,8 +19,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
+from pipeline.formats import motion_statistics
 from pipeline.formats.tfrecord import METADATA, columns, records
-from pipeline.run import motion_statistics
 
 CHUNK = 8
 """Actions that OFT predicts at once on LIBERO: the current one and seven to come."""

@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
-from pipeline.run import motion_statistics
+from pipeline.formats import motion_statistics
 from pipeline.validation import oft
 
 SAME = 1e-9

@@ -15,23 +15,24 @@ import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
 from pipeline import gl
+from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Row
 from pipeline.formats.episodes import Episodes
-from pipeline.formats.export import export
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
 from pipeline.libero.tasks import find_task
-from pipeline.physics.replay import ReplayJob
-from pipeline.rendering.render import RenderJob
-from pipeline.run import manifest, plan
-from pipeline.run.compute import loop
+from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
+from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.frame_store import FrameStore, shown_of
-from pipeline.run.streams import streams_of
+from pipeline.run.export import export
+from pipeline.run.render import RenderJob
+from pipeline.run.replay import ReplayJob
+from pipeline.stores.frame_store import FrameStore, shown_of
 from pipeline.types import Verdict
 
 

@@ -10,7 +10,8 @@ from typing import Any
 from pipeline.files import read_json
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Fault
-from pipeline.run import manifest, plan
+from pipeline.planning import plan
+from pipeline.run import manifest
 from pipeline.validation import oft_check
 
 

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pipeline.compute.pool import Run
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json, scratch
@@ -20,9 +21,8 @@ from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import formats_of
 from pipeline.rendering.last_scene import scene_of_process
 from pipeline.run import manifest
-from pipeline.run.compute import Run
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.validation import oft, run_checks
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import rendered, witnesses

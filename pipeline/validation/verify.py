@@ -6,14 +6,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.compute.pool import Run
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.formats.read_back import Written
 from pipeline.formats.registry import formats_of
-from pipeline.run.compute import Run
-from pipeline.run.frame_store import FrameStore
-from pipeline.run.store import Store
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.store import Store
+from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:

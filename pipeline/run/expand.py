@@ -19,14 +19,14 @@ from pipeline.axes import Axes
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.catalogue.scene_files import portable
+from pipeline.compute.pool import Run
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import hdf5
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay_plan
-from pipeline.run import plan
-from pipeline.run.compute import Run
-from pipeline.run.trajectory_store import TrajectoryStore
+from pipeline.planning import plan
+from pipeline.run.replay import replay_plan
 from pipeline.scenes.compiled import CompiledScene, proprioception
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Scene, Trajectory
 

@@ -18,11 +18,11 @@ from typing import Any, Generic, Protocol, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from pipeline.compute.cluster import InPlace, Workplace, joined
+from pipeline.compute.slurm import slurm_cluster
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
-from pipeline.run.cluster import InPlace, Workplace, joined
-from pipeline.run.slurm import slurm_cluster
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -11,19 +11,43 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from pipeline.compute.pool import Run, runner
+from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Load
+from pipeline.run import outcome
+from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.seeding import digest
 
-if TYPE_CHECKING:  # this package imports no simulator, and this would
-    from pipeline.run.compute import Run
-
 AnyFormat = Format[Any]
+
+
+def export_run(target: Format[Any], config: Config) -> None:
+    """Bring a run's dataset up to date, and say what was done."""
+    episodes = kept_episodes(config)
+    if is_current(target, episodes):
+        print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
+        return
+    with runner(config.compute, config.data) as workers:
+        export(target, episodes, workers)
+    print(f"wrote {len(episodes.ids)} episodes to {target.folder}")
+
+
+def kept_episodes(config: Config) -> Episodes:
+    """The kept episodes of a run, in the order they are written."""
+    run = outcome.read(config)
+    return Episodes(
+        ids=run.kept,
+        load=EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render),
+        suites={row.episode_id: row.suite for row in run.rows},
+        content=run.contents(),
+        demos={row.episode_id: row.demo_id for row in run.rows},
+    )
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:

@@ -12,8 +12,8 @@ import pyarrow as pa
 
 from pipeline.catalogue.scene_files import located, portable
 from pipeline.identity import fingerprint
-from pipeline.run.sealed_file import SealedFile
-from pipeline.run.store import Store
+from pipeline.stores.sealed_file import SealedFile
+from pipeline.stores.store import Store
 from pipeline.types import Scene, Trajectory, Verdict
 
 _COLUMNS = {

@@ -27,7 +27,7 @@ from pipeline.axes.base import Nearest
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.tasks import find_task
-from pipeline.run.plan import Row
+from pipeline.planning.plan import Row
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 

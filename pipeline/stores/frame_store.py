@@ -20,10 +20,10 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.identity import fingerprint
-from pipeline.run.sealed_file import SealedFile
-from pipeline.run.store import Store
 from pipeline.seeding import digest
-from pipeline.types import Geometry
+from pipeline.stores.sealed_file import SealedFile
+from pipeline.stores.store import Store
+from pipeline.types import Geometry, Rendered
 
 _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 """The schema's parts that say what files of a store hold."""
@@ -35,31 +35,6 @@ _COLUMNS = {
     "streams": pa.list_(pa.string()),
     "rejected": pa.string(),
 }
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """Everything that a policy may see of one trajectory.
-
-    Attributes:
-        replay_mode: how the trajectory's actions came about.
-        state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
-        streams: stream id to K encoded frames.
-        rejected: stream id to the reason why it was not rendered.
-        geometry: id of a stream's geometry to what it is.
-        object_poses: (K, 24, 7), None where they were not asked for.
-        instances: names of the things that segmentation and poses number; none without those.
-    """
-
-    replay_mode: str
-    state: NDArray[np.float32]
-    joint_state: NDArray[np.float32]
-    action: NDArray[np.float32]
-    streams: Mapping[str, Sequence[bytes]] = field(default_factory=dict)
-    rejected: Mapping[str, str] = field(default_factory=dict)
-    geometry: Mapping[str, Geometry] = field(default_factory=dict)
-    object_poses: NDArray[np.float32] | None = None
-    instances: Sequence[str] = ()
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import pyarrow as pa
 
 from pipeline.errors import PipelineError
 from pipeline.files import keep_below, replaced
-from pipeline.run.sealed_file import BrokenSealError, SealedFile, sealed, unsealed
+from pipeline.stores.sealed_file import BrokenSealError, SealedFile, sealed, unsealed
 from pipeline.tables import read_table, write_table
 
 TABLE = "index.parquet"
