@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 
 from pipeline import gl
 from pipeline.axes.noise import NoisePerturbation
-from pipeline.evaluation.episode import EpisodeEnvironment
+from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import RUNNABLE, by_name
-from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, select
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import EvaluationTask, balanced
 from pipeline.images.jpeg import to_policy
 from pipeline.machine_code import machine_code
 from pipeline.seeding import rng

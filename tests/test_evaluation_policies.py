@@ -11,17 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from model_server import running
 
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.job import _environment
-from pipeline.evaluation.policies import PolicyError, checked_actions
-from pipeline.evaluation.policy_config import PolicyConfig
-from pipeline.evaluation.replay_server import running
+from pipeline.evaluation.policies import PolicyConfig, PolicyError, checked_actions
 from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.rollout import _environment
+from pipeline.evaluation.selection import Selection
 from pipeline.evaluation.settings import Settings
-from pipeline.evaluation.tasks import Selection
 
 FAULTY_AND_STOVE = Selection(
     suites=("libero_object", "libero_goal"), tasks=("pick_up_the_milk*", "push_the_plate*", "turn_on*")

@@ -14,12 +14,11 @@ from html_page import Page, needs_nothing_beside_itself, screenshot
 from scipy.stats import binomtest
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.comparison import compare, mcnemar, paired
-from pipeline.evaluation.findings import FAILURES
-from pipeline.evaluation.merging import read
-from pipeline.evaluation.paper_table import paper_table
-from pipeline.evaluation.results import EpisodeFiles, Row
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.evaluation.findings import FAILURES, paper_table
+from pipeline.evaluation.results import EpisodeFiles, Row, read
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.statistics import compare, mcnemar, paired
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.publish import evaluation_report
 from pipeline.seeding import digest

@@ -18,9 +18,11 @@ from pipeline import seeding
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
-from pipeline.evaluation.initial_states import libero_states, moved_state, pickled_array
-from pipeline.evaluation.results import summary, wilson
-from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, draw, select
+from pipeline.evaluation.libero_plus import moved_state, pickled_array
+from pipeline.evaluation.own_draws import draw
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.statistics import summary, wilson
+from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
 from pipeline.libero.starts import HOME_RAD
 
 

@@ -32,8 +32,8 @@ from scipy.stats import chi2_contingency
 
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
-from pipeline.evaluation.bootstrap import Interval, interval
 from pipeline.evaluation.results import REFUSED, Row
+from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
 from pipeline.types import Floats
 

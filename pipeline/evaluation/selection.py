@@ -1,25 +1,38 @@
-"""What of the tasks is evaluated on, as a user names it."""
+"""Which of the tasks to evaluate on, as a user names them."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+import difflib
+import fnmatch
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import combinations, product
 from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
 
+from pipeline.axes import axes_of
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
-from pipeline.evaluation import disjoint
-from pipeline.evaluation.held_out import LEVELS, OWN_AXES
-from pipeline.evaluation.settings import Settings
+from pipeline.evaluation import goals, libero_plus
+from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, drawn_task
+from pipeline.evaluation.tasks import EvaluationTask, Source, _clean, balanced, read_tasks
+from pipeline.libero.tasks import tasks
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import SUITES
-
-Source = Literal["libero", "libero_plus", "own", "goals"]
+from pipeline.types import Task
 
 INITIAL_STATES = 50
 """LIBERO's, of each task."""
+
+
+COLUMNS = {"suites": "suite", "axes": "axis", "components": "component", "levels": "level"}
+"""Fields of a selection to what they restrict."""
+
+
+PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
+"""The six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
 
 
 class Selection(Frozen):
@@ -49,26 +62,24 @@ class Selection(Frozen):
     seed: int = 0
 
 
-def check_settings(selection: Selection, settings: Settings) -> None:
-    """Have no episode that says a setting which it does not have.
+def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
+    """The tasks that a selection names, in a fixed order.
+
+    Args:
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
 
     Raises:
-        PipelineError: when one would, or the plan cannot be read.
+        PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.
     """
-    if settings.seed != selection.seed:
-        raise PipelineError(
-            f"tasks are drawn under seed {selection.seed}, what perturbs them under {settings.seed}",
-            where="seed",
-            expected="one seed for both",
-        )
-    if settings.plan is not None:
-        disjoint.sha256_of(settings.plan)
-        if selection.file is None and selection.source not in ("own", "pairs"):
-            raise PipelineError(
-                f"{selection.source} has no held-out draws to keep clear of a plan",
-                where="plan",
-                expected="--source own",
-            )
+    check_names(selection)
+    listed = list(_listed(selection))
+    _check_listed(selection, listed)
+    wanted = [task for task in listed if _matches(task, selection)]
+    if selection.source == "libero_plus" and selection.file is None:
+        wanted = _runnable(wanted, selection, archive)
+    if not wanted:
+        raise _nothing_left(selection, listed)
+    return wanted if selection.subset is None else balanced(wanted, selection.subset, selection.seed)
 
 
 def check_names(selection: Selection) -> None:
@@ -124,3 +135,111 @@ def check(field: str, named: Iterable[object], known: Collection[object], select
             where=field,
             expected=" or ".join(str(name) for name in sorted(known, key=str)),
         )
+
+
+def _listed(selection: Selection) -> Iterator[EvaluationTask]:
+    if selection.file is not None:
+        yield from read_tasks(selection.file, selection.seed)
+        return
+    if selection.source == "libero_plus":
+        for test in benchmark.load().tasks:
+            level = libero_plus.level_of(test)
+            yield EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, level, 0)
+        return
+    every = [(place, task) for suite in selection.suites for place, task in enumerate(tasks(suite))]
+    for place, task in every:
+        for number in range(selection.episodes):
+            match selection.source:
+                case "libero":
+                    yield _clean(task, number)
+                case "goals":
+                    for replacement in goals.replacements(task):
+                        name, kind = replacement.name(task, number), replacement.category
+                        yield EvaluationTask("goals", task.suite, task.name, name, "goal", kind, 0, number)
+                case "own":
+                    kinds = product(selection.axes or OWN_AXES, selection.levels or LEVELS)
+                    drawn = (drawn_task(task, axis, level, number, selection.seed) for axis, level in kinds)
+                    yield from filter(None, drawn)
+                case "pairs":
+                    yield from _pairs(task, place + number, number, selection)
+
+
+def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator[EvaluationTask]:
+    """All combinations of none, one and two axes on one initial state, at one level.
+
+    Args:
+        turn: place of the task in its suite and number of the state, added: which of the levels it is.
+    """
+    levels, axes = selection.levels or LEVELS, axes_of("+".join(selection.axes or PAIR_AXES))
+    pairs = ("+".join(pair) for pair in combinations(axes, 2))
+    yield _clean(task, number)
+    level = levels[turn % len(levels)]
+    drawn = (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs))
+    yield from filter(None, drawn)
+
+
+def _matches(task: EvaluationTask, selection: Selection) -> bool:
+    kinds = (
+        (task.axis, selection.axes),
+        (task.component, selection.components),
+        (task.level, selection.levels),
+    )
+    # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
+    restricted = ((task.suite, selection.suites), *(() if selection.source == "pairs" else kinds))
+    named = any(fnmatch.fnmatch(name, pattern) for pattern in selection.tasks for name in (task.name, task.base))
+    return all(not allowed or value in allowed for value, allowed in restricted) and (named or not selection.tasks)
+
+
+def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
+    """Have every name that chooses among the listed tasks be one of theirs.
+
+    Raises:
+        PipelineError: when one is not.
+    """
+    # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
+    for field in () if selection.source == "pairs" else ("axes", "components", "levels"):
+        check(field, getattr(selection, field), {getattr(task, COLUMNS[field]) for task in listed}, selection)
+    names = {name for task in listed for name in (task.name, task.base)}
+    names |= {task.name for suite in SUITES for task in tasks(suite)}
+    for pattern in selection.tasks:
+        if not fnmatch.filter(names, pattern):
+            closest = difflib.get_close_matches(pattern, names, cutoff=0)
+            raise PipelineError(f"no task is named {pattern!r}", where="tasks", expected=" or ".join(closest))
+
+
+def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> PipelineError:
+    """What there is of each restriction among the tasks that keep to all others."""
+    there = []
+    for field, column in COLUMNS.items():
+        if getattr(selection, field):
+            others = selection.model_copy(update={field: ()})
+            values = {getattr(task, column) for task in listed if _matches(task, others)}
+            there += [f"{field} {' or '.join(str(value) for value in sorted(values))}"] if values else []
+    return PipelineError(
+        "no task is left",
+        where=f"selection {selection.model_dump(mode='json', exclude_defaults=True)}",
+        expected="with the other restrictions as they are, " + "; or ".join(there) if there else None,
+    )
+
+
+def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
+    """Those that can be rebuilt; says how many cannot.
+
+    Raises:
+        PipelineError: when nothing can be rebuilt of an axis that is asked for by name.
+    """
+    tests = libero_plus.by_name()
+    left = [task for task in wanted if libero_plus.runnable(tests[task.suite, task.name], archive)]
+    missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
+    counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
+    if missing and (not left or {*selection.axes} - {task.axis for task in left}):
+        raise PipelineError(
+            f"{counts} of {len(wanted)} tasks need files of LIBERO-Plus's asset archive",
+            where="axes" if archive is None else archive,
+            expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}, or 62 of background in libero_object",
+            remedy=f"name the unpacked archive: --assets DIR; or --axis {' '.join(libero_plus.RUNNABLE)}; or held-out "
+            "draws of the same axes: --source own",
+        )
+    if missing:
+        print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")
+    return left

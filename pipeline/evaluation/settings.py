@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pydantic import Field, field_serializer
 
 from pipeline.axes.base import Frozen
-from pipeline.evaluation import disjoint
+from pipeline.errors import PipelineError
+from pipeline.evaluation import own_draws
 from pipeline.evaluation.libero_plus import Prompt
+from pipeline.evaluation.selection import Selection
 
 VIEWS = {"agentview": "image", "wrist": "wrist_image"}
 """What policies call the views, to their names in ``schemas/episode.json``."""
@@ -42,7 +45,7 @@ class Settings(Frozen):
 
     @field_serializer("plan")
     def _name_by_content(self, plan: Path) -> str:
-        return disjoint.sha256_of(plan)
+        return own_draws.sha256_of(plan)
 
 
 class Wanted(NamedTuple):
@@ -60,3 +63,29 @@ class Wanted(NamedTuple):
     state: bool = True
     shortest_rotation: bool = False
     images: bool = True
+
+
+Look = Callable[[Wanted], dict[str, Any]]
+"""Gives the observation; frames are rendered when it is called."""
+
+
+def check_settings(selection: Selection, settings: Settings) -> None:
+    """Have no episode that says a setting which it does not have.
+
+    Raises:
+        PipelineError: when one would, or the plan cannot be read.
+    """
+    if settings.seed != selection.seed:
+        raise PipelineError(
+            f"tasks are drawn under seed {selection.seed}, what perturbs them under {settings.seed}",
+            where="seed",
+            expected="one seed for both",
+        )
+    if settings.plan is not None:
+        own_draws.sha256_of(settings.plan)
+        if selection.file is None and selection.source not in ("own", "pairs"):
+            raise PipelineError(
+                f"{selection.source} has no held-out draws to keep clear of a plan",
+                where="plan",
+                expected="--source own",
+            )

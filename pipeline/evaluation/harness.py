@@ -1,5 +1,5 @@
 """The tasks as a benchmark of vla-eval, the field's harness: ``vla-eval run`` with a configuration that names
-``pipeline.evaluation.vla_eval_benchmark:PerturbedLibero`` evaluates any of its model servers.
+``pipeline.evaluation.harness:PerturbedLibero`` evaluates any of its model servers.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
+from vla_eval.model_servers.base import ModelServer, SessionContext
+from vla_eval.model_servers.serve import run_server
 from vla_eval.specs import (
     GRIPPER_CLOSE_POS,
     IMAGE_RGB,
@@ -21,11 +23,12 @@ from vla_eval.specs import (
 
 from pipeline import gl
 from pipeline.errors import PipelineError
-from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import NextLook
-from pipeline.evaluation.selection import check_settings
-from pipeline.evaluation.settings import Settings, Wanted
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.evaluation.reference_policies import Replay, TrackedReplay
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.settings import Settings, Wanted, check_settings
+from pipeline.evaluation.tasks import EvaluationTask
 
 
 class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
@@ -138,3 +141,38 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         self._last = self._environment.observation(self._wanted)
         self._next_look.looked()
         return self._last
+
+
+class ReplayServer(ModelServer):  # type: ignore[misc]
+    """Answers with the actions of the starter set's demonstration of the task.
+
+    Args:
+        chunk: how many actions each answer has; all are taken before the next look. Of no effect when tracked.
+        tracked: follow the demonstration's path by the state in each observation, one action at a time.
+    """
+
+    def __init__(self, *, chunk: int = 1, tracked: bool = False):
+        self._chunk, self._tracked = chunk, tracked
+        self._replays: dict[str, Replay | TrackedReplay] = {}
+
+    async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
+        replay = self._replays[ctx.session_id] = TrackedReplay() if self._tracked else Replay(self._chunk)
+        replay.begin(EvaluationTask.of_harness(config["task"]))
+
+    async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
+        actions = self._replays[ctx.session_id].act(lambda _: obs)
+        # A chunk of one is sent as one action (7,), but not the last action of a longer one: it keeps none.
+        await ctx.send_action({"actions": actions.squeeze() if self._tracked or self._chunk == 1 else actions})
+
+    def get_observation_params(self) -> dict[str, Any]:
+        return {"send_state": self._tracked}
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        return {"image": IMAGE_RGB, **({"state": STATE_EEF_POS_AA_GRIP} if self._tracked else {})}
+
+
+if __name__ == "__main__":
+    run_server(ReplayServer)

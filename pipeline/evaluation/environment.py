@@ -15,15 +15,14 @@ from numpy.typing import ArrayLike
 from pipeline.axes import AnyPerturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.evaluation import disjoint, goals, libero_plus
+from pipeline.evaluation import goals, libero_plus, own_draws
 from pipeline.evaluation.asset_archive import Assets, having
-from pipeline.evaluation.drawn_scene import drawn_scene
-from pipeline.evaluation.initial_states import libero_states, moved_state
-from pipeline.evaluation.picture import Picture
+from pipeline.evaluation.libero_plus import moved_state
+from pipeline.evaluation.own_draws import drawn_scene
 from pipeline.evaluation.results import REFUSED
 from pipeline.evaluation.settings import VIEWS, Settings, Wanted
-from pipeline.evaluation.simulator import Observed, Simulator
-from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.evaluation.simulator import Observed, Picture, Simulator
+from pipeline.evaluation.tasks import EvaluationTask, libero_states
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
@@ -235,7 +234,7 @@ class EpisodeEnvironment:
         scene = None
         if self.task.source == "own":
             nominal = partial(self._nominal, seed, demo)
-            planned = None if self.settings.plan is None else disjoint.planned(self.settings.plan)
+            planned = None if self.settings.plan is None else own_draws.planned(self.settings.plan)
             self._perturbations, scene = drawn_scene(self.task, self.settings.seed, demo, nominal, planned)
         self.resolved = scene.resolved if scene else {}
         self._start(demo, seed, scene)

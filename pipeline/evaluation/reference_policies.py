@@ -10,8 +10,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.policies import Look
-from pipeline.evaluation.settings import Wanted
+from pipeline.evaluation.settings import Look, Wanted
 from pipeline.evaluation.simulator import Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource

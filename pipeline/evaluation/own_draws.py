@@ -1,18 +1,20 @@
-"""The proof that held-out draws are none of a plan: how close each comes to the nearest planned one."""
+"""Draws of the axes that no plan has: how they are drawn, and kept clear of a plan."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.axes import AnyPerturbation, from_json
+from pipeline import seeding
+from pipeline.axes import AnyAxis, AnyPerturbation, Axes, PhysicsPerturbation, axes_of, from_json
 from pipeline.axes.background import BackgroundPerturbation
+from pipeline.axes.base import Level
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.layout import LayoutPerturbation
 from pipeline.axes.light import LightPerturbation
@@ -20,13 +22,134 @@ from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.axes.scene import ScenePerturbation
-from pipeline.errors import PipelineError
+from pipeline.errors import PipelineError, RefusedError
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum, edition
+from pipeline.libero.tasks import find_task
+from pipeline.physics.roll_out import roll_out
 from pipeline.planning import plan
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.testset.definitions import Value
-from pipeline.types import Floats, Task
+from pipeline.types import Demo, Floats, Scene, Task
+
+LEVELS: tuple[Level, ...] = (1, 2, 3, 4, 5)
+
+
+OWN_AXES = ("layout", "pose", "robot", "camera", "light", "background", "noise")
+"""The axes with draws of their own to hold out. Language is none: its rewrites are a list, which training uses up."""
+
+
+def sample(task: Task, name: str, level: int, number: int, seed: int, attempt: int = 0) -> AnyPerturbation:
+    """One held-out draw.
+
+    Its key begins with ``evaluation``, which no plan's does, so that no seed makes the two draw alike. What a draw is
+    joined with is not part of the key: a pair has the draws of its singles.
+
+    Args:
+        name: of the axis.
+        number: counts the draws of a task, axis and level.
+        attempt: counts the draws that were refused.
+    """
+    key = seeding.rng("evaluation", seed, name, task.suite, task.name, level, number, attempt)
+    drawn: AnyPerturbation = default_axis(name).model_copy(update={"levels": (level,)}).sample(key, task, number)
+    return drawn
+
+
+@cache
+def default_axis(name: str) -> AnyAxis:
+    """An axis with its default ranges; noise has the strengths of the benchmark's even severities.
+
+    Noise has one strength for each component and level. With the default ones, held-out draws would be as strong as
+    those that plans train on; from the benchmark's, plans keep clear.
+    """
+    if name == "noise":
+        tests = benchmark.load().of("noise")
+        effects = {(test.component, test.parameters["severity"]): libero_plus.noise(test, 0).effect for test in tests}
+        components = dict.fromkeys(test.component for test in tests)
+        return NoiseAxis.model_validate(
+            {component: tuple(effects[component, 2 * level] for level in LEVELS) for component in components}
+        )
+    default: AnyAxis = getattr(Axes.model_validate({name: {}}), name)
+    return default
+
+
+def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> AnyPerturbation:
+    """The perturbation of a held-out draw on one axis: of ``axis`` where the task joins several."""
+    base = find_task(task.suite, task.base)
+    return sample(base, axis or task.axis, task.level, task.number, seed, attempt)
+
+
+def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
+    """A held-out draw on a LIBERO task; None where an axis cannot change anything that the task has.
+
+    Args:
+        axis: one, or several joined by +.
+    """
+    axes = axes_of(axis)
+    if not all(default_axis(one).applies(task) for one in axes):
+        return None
+    component = "+".join(sample(task, one, level, number, seed).component for one in axes)
+    name = f"{task.name}_{axis}_level{level}_draw{number}"
+    return EvaluationTask("own", task.suite, task.name, name, axis, component, level, number)
+
+
+ATTEMPTS = 20
+"""How often a draw that its scene refuses, or that a plan has, is drawn anew."""
+
+
+def drawn_scene(
+    task: EvaluationTask, seed: int, demo: Demo, nominal: Callable[[], Scene], planned: PlannedDraws | None
+) -> tuple[tuple[AnyPerturbation, ...], Scene | None]:
+    """What a task draws, in the order in which it applies, and the scene with it; None where physics stay LIBERO's.
+
+    Each axis has the first draw that the scene takes by itself. That is so too where other axes join it, so that a
+    pair has the draws of its singles. They apply one after the other, as those of a plan do.
+
+    Args:
+        seed: of all draws.
+        demo: of the task, in the initial state that the episode begins in.
+        nominal: gives the scene without any change.
+        planned: what draws must keep clear of.
+
+    Raises:
+        RefusedError: when the scene takes no draw of an axis, or not the draws of several together.
+    """
+    perturbations: list[AnyPerturbation] = []
+    scene = None
+    for axis in axes_of(task.axis):
+        drawn, alone = _fitting(task, axis, seed, demo, nominal, planned)
+        perturbations.append(drawn)
+        if isinstance(drawn, PhysicsPerturbation):
+            scene = alone if scene is None else drawn.apply(scene, demo, roll_out)
+    return tuple(perturbations), scene
+
+
+def _fitting(
+    task: EvaluationTask,
+    axis: str,
+    seed: int,
+    demo: Demo,
+    nominal: Callable[[], Scene],
+    planned: PlannedDraws | None,
+) -> tuple[AnyPerturbation, Scene | None]:
+    """The first draw of an axis that is none of the plan's and that the scene takes, and that scene.
+
+    Raises:
+        RefusedError: when there is none.
+    """
+    for attempt in range(ATTEMPTS):
+        drawn = draw(task, seed, attempt, axis)
+        if planned is not None and planned.overlap(drawn, find_task(task.suite, task.base)):
+            continue
+        if not isinstance(drawn, PhysicsPerturbation):
+            return drawn, None
+        try:
+            return drawn, drawn.apply(nominal(), demo, roll_out)
+        except RefusedError:
+            continue
+    raise RefusedError(f"no_{axis}_draw_fits")
 
 
 class PlannedDraws:
