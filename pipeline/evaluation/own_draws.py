@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache, cached_property
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,6 @@ from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.base import Level
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.layout import LayoutPerturbation
-from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
@@ -36,24 +35,42 @@ from pipeline.types import Demo, Floats, Scene, Task
 
 LEVELS: tuple[Level, ...] = (1, 2, 3, 4, 5)
 
-
 OWN_AXES = ("layout", "pose", "robot", "camera", "light", "background", "noise")
 """The axes with draws of their own to hold out. Language is none: its rewrites are a list, which training uses up."""
 
+ATTEMPTS = 20
+"""How often a draw that its scene refuses, or that a plan has, is drawn anew."""
 
-def sample(task: Task, name: str, level: int, number: int, seed: int, attempt: int = 0) -> AnyPerturbation:
-    """One held-out draw.
+
+def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
+    """A held-out draw on a LIBERO task; None where an axis cannot change anything that the task has.
+
+    Args:
+        axis: one, or several joined by +.
+        number: counts the draws of a task, axis and level.
+    """
+    axes = axes_of(axis)
+    if not all(default_axis(one).applies(task) for one in axes):
+        return None
+    name = f"{task.name}_{axis}_level{level}_draw{number}"
+    drawn = EvaluationTask("own", task.suite, task.name, name, axis, "", level, number)
+    return replace(drawn, component="+".join(draw(drawn, seed, axis=one).component for one in axes))
+
+
+def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> AnyPerturbation:
+    """The perturbation of a held-out draw on one axis.
 
     Its key begins with ``evaluation``, which no plan's does, so that no seed makes the two draw alike. What a draw is
     joined with is not part of the key: a pair has the draws of its singles.
 
     Args:
-        name: of the axis.
-        number: counts the draws of a task, axis and level.
         attempt: counts the draws that were refused.
+        axis: which, where the task joins several.
     """
-    key = seeding.rng("evaluation", seed, name, task.suite, task.name, level, number, attempt)
-    drawn: AnyPerturbation = default_axis(name).model_copy(update={"levels": (level,)}).sample(key, task, number)
+    name = axis or task.axis
+    key = seeding.rng("evaluation", seed, name, task.suite, task.base, task.level, task.number, attempt)
+    ranges = default_axis(name).model_copy(update={"levels": (task.level,)})
+    drawn: AnyPerturbation = ranges.sample(key, find_task(task.suite, task.base), task.number)
     return drawn
 
 
@@ -73,30 +90,6 @@ def default_axis(name: str) -> AnyAxis:
         )
     default: AnyAxis = getattr(Axes.model_validate({name: {}}), name)
     return default
-
-
-def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> AnyPerturbation:
-    """The perturbation of a held-out draw on one axis: of ``axis`` where the task joins several."""
-    base = find_task(task.suite, task.base)
-    return sample(base, axis or task.axis, task.level, task.number, seed, attempt)
-
-
-def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
-    """A held-out draw on a LIBERO task; None where an axis cannot change anything that the task has.
-
-    Args:
-        axis: one, or several joined by +.
-    """
-    axes = axes_of(axis)
-    if not all(default_axis(one).applies(task) for one in axes):
-        return None
-    component = "+".join(sample(task, one, level, number, seed).component for one in axes)
-    name = f"{task.name}_{axis}_level{level}_draw{number}"
-    return EvaluationTask("own", task.suite, task.name, name, axis, component, level, number)
-
-
-ATTEMPTS = 20
-"""How often a draw that its scene refuses, or that a plan has, is drawn anew."""
 
 
 def drawn_scene(
@@ -119,44 +112,36 @@ def drawn_scene(
     perturbations: list[AnyPerturbation] = []
     scene = None
     for axis in axes_of(task.axis):
-        drawn, alone = _fitting(task, axis, seed, demo, nominal, planned)
-        perturbations.append(drawn)
-        if isinstance(drawn, PhysicsPerturbation):
-            scene = alone if scene is None else drawn.apply(scene, demo, roll_out)
+        drawn = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
+        apart = (one for one in drawn if planned is None or not planned.overlap(one, demo.task))
+        fitting = _first_that_fits(apart, demo, nominal)
+        if fitting is None:
+            raise RefusedError(f"no_{axis}_draw_fits")
+        perturbation, alone = fitting
+        perturbations.append(perturbation)
+        if isinstance(perturbation, PhysicsPerturbation):
+            scene = alone if scene is None else perturbation.apply(scene, demo, roll_out)
     return tuple(perturbations), scene
 
 
-def _fitting(
-    task: EvaluationTask,
-    axis: str,
-    seed: int,
-    demo: Demo,
-    nominal: Callable[[], Scene],
-    planned: PlannedDraws | None,
-) -> tuple[AnyPerturbation, Scene | None]:
-    """The first draw of an axis that is none of the plan's and that the scene takes, and that scene.
-
-    Raises:
-        RefusedError: when there is none.
-    """
-    for attempt in range(ATTEMPTS):
-        drawn = draw(task, seed, attempt, axis)
-        if planned is not None and planned.overlap(drawn, find_task(task.suite, task.base)):
-            continue
-        if not isinstance(drawn, PhysicsPerturbation):
-            return drawn, None
+def _first_that_fits(
+    drawn: Iterable[AnyPerturbation], demo: Demo, nominal: Callable[[], Scene]
+) -> tuple[AnyPerturbation, Scene | None] | None:
+    """The first draw that the scene takes, and the scene with it, or None where physics stay LIBERO's."""
+    for one in drawn:
+        if not isinstance(one, PhysicsPerturbation):
+            return one, None
         try:
-            return drawn, drawn.apply(nominal(), demo, roll_out)
+            return one, one.apply(nominal(), demo, roll_out)
         except RefusedError:
             continue
-    raise RefusedError(f"no_{axis}_draw_fits")
+    return None
 
 
 class PlannedDraws:
     """What a plan draws, to keep held-out draws clear of it.
 
-    Distances are those of the leakage report, with the plan in the place of the benchmark's test tasks. Of light, whose
-    test tasks cannot be compared with, two draws are 0 apart where all their parameters are equal, else 1.
+    Distances are those of the leakage report, with the plan in the place of the benchmark's test tasks.
 
     Args:
         rows: of the plan, reserves among them.
@@ -164,12 +149,10 @@ class PlannedDraws:
 
     def __init__(self, rows: Iterable[plan.Row]):
         self._draws: dict[str, list[AnyPerturbation]] = defaultdict(list)
-        self._episodes: dict[str, list[str]] = defaultdict(list)
         tests: list[TestTask] = []
         for row in rows:
             for one in from_json(row.perturbations):
                 self._draws[one.axis].append(one)
-                self._episodes[one.axis].append(row.episode_id)
                 tests.append(TestTask(row.suite, row.task, row.episode_id, one.axis, one.component, _as_test(one)))
         self._tests = TestSet(tuple(tests))
 
@@ -177,11 +160,11 @@ class PlannedDraws:
         """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
         episode, where there is none to compare with."""
         distances = self._distances(drawn, task)
-        if np.isnan(distances).all():
+        distances = np.where(np.isnan(distances), np.inf, distances)
+        if not np.isfinite(distances).any():
             return math.inf, ""
-        closest = int(np.nanargmin(distances))
-        distance = float(distances[closest])
-        return distance, self._episodes[drawn.axis][closest] if math.isfinite(distance) else ""
+        closest = int(distances.argmin())
+        return float(distances[closest]), self._tests.of(drawn.axis)[closest].name
 
     def count(self, name: str) -> int:
         """How many planned draws an axis has."""
@@ -193,37 +176,32 @@ class PlannedDraws:
         return distance == 0 or distance < drawn.clearance
 
     def _distances(self, drawn: AnyPerturbation, task: Task) -> Floats:
-        """(N,) to the planned draws of the axis, NaN where there is nothing to compare."""
-        match drawn:
-            case RobotPerturbation():
-                return np.asarray(np.linalg.norm(self._robot_offsets_rad - drawn.joint_offsets_rad, axis=1))
-            case NoisePerturbation():
-                return np.abs(self._severities[drawn.component] - drawn.severity(benchmark.load()))
-            case BackgroundPerturbation():
-                shown = _images(drawn)
-                return np.array([0.0 if shown & images else 1.0 for images in self._background_images])
-            case LightPerturbation():
-                return np.array([float(planned != drawn) for planned in self._draws["light"]])
-            case _:
-                return drawn.distances(self._tests, task)
+        """(N,) to the planned draws of the axis, not finite where there is nothing to compare."""
+        if drawn.axis in COMPARED_IN_PAIRS:
+            return np.array([_distance(drawn, planned) for planned in self._draws[drawn.axis]])
+        return drawn.distances(self._tests, task)
 
-    @cached_property
-    def _robot_offsets_rad(self) -> Floats:
-        offsets = [one.joint_offsets_rad for one in self._draws["robot"] if isinstance(one, RobotPerturbation)]
-        return np.array(offsets).reshape(-1, 7)
 
-    @cached_property
-    def _severities(self) -> Mapping[str, Floats]:
-        """Component to (N,) the severities of the planned draws of noise, NaN where they are of another."""
-        test = benchmark.load()
-        draws = [one for one in self._draws["noise"] if isinstance(one, NoisePerturbation)]
-        severities = np.array([one.severity(test) for one in draws])
-        components = np.array([one.component for one in draws], dtype=str)
-        return {name: np.where(components == name, severities, np.nan) for name in NoiseAxis.model_fields}
+COMPARED_IN_PAIRS = ("robot", "noise", "background", "light")
+"""The axes whose own ``distances`` read what is known of the benchmark alone."""
 
-    @cached_property
-    def _background_images(self) -> list[frozenset[str]]:
-        return [_images(one) for one in self._draws["background"] if isinstance(one, BackgroundPerturbation)]
+
+def _distance(one: AnyPerturbation, other: AnyPerturbation) -> float:
+    """Between two draws on the same axis of ``COMPARED_IN_PAIRS``; NaN where they cannot be compared.
+
+    Of light, whose test tasks cannot be compared with, two draws are 0 apart where all their parameters are equal.
+    """
+    match one, other:
+        case RobotPerturbation(), RobotPerturbation():
+            return math.dist(one.joint_offsets_rad, other.joint_offsets_rad)
+        case NoisePerturbation(), NoisePerturbation():
+            test = benchmark.load()
+            return abs(one.severity(test) - other.severity(test)) if one.component == other.component else math.nan
+        case BackgroundPerturbation(), BackgroundPerturbation():
+            shown = {covering.sha256 for covering in one.coverings}
+            return float(shown.isdisjoint(covering.sha256 for covering in other.coverings))
+        case _:
+            return float(one != other)
 
 
 def planned(file: Path) -> PlannedDraws:
@@ -255,10 +233,6 @@ def sha256_of(file: Path) -> str:
 @cache
 def _sha256(file: Path, version: Edition) -> str:
     return checksum(file)
-
-
-def _images(one: BackgroundPerturbation) -> frozenset[str]:
-    return frozenset(covering.sha256 for covering in one.coverings)
 
 
 def _as_test(one: AnyPerturbation) -> dict[str, Value]:
@@ -306,18 +280,16 @@ def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: P
     by_axis: dict[str, list[tuple[str, AnyPerturbation, Task]]] = defaultdict(list)
     for name, one, task in drawn:
         by_axis[one.axis].append((name, one, task))
-    return {name: _held_out(by_axis[name], planned_draws) for name in by_axis}
-
-
-def _held_out(drawn: Sequence[tuple[str, AnyPerturbation, Task]], planned_draws: PlannedDraws) -> HeldOut:
-    nearest = [(*planned_draws.nearest(one, task), name) for name, one, task in drawn]
-    smallest, episode, name = min(nearest)
-    first = drawn[0][1]
-    return HeldOut(
-        draws=len(drawn),
-        planned=planned_draws.count(first.axis),
-        overlaps=sum(planned_draws.overlap(one, task) for _, one, task in drawn),
-        smallest=smallest if math.isfinite(smallest) else None,
-        closest=(name, episode) if math.isfinite(smallest) else None,
-        clearance=first.clearance,
-    )
+    found = {}
+    for axis, draws in by_axis.items():
+        smallest, episode, name = min((*planned_draws.nearest(one, task), name) for name, one, task in draws)
+        compared = math.isfinite(smallest)
+        found[axis] = HeldOut(
+            draws=len(draws),
+            planned=planned_draws.count(axis),
+            overlaps=sum(planned_draws.overlap(one, task) for _, one, task in draws),
+            smallest=smallest if compared else None,
+            closest=(name, episode) if compared else None,
+            clearance=draws[0][1].clearance,
+        )
+    return found

@@ -17,19 +17,16 @@ from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation import goals, libero_plus
 from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, drawn_task
-from pipeline.evaluation.tasks import EvaluationTask, Source, _clean, balanced, read_tasks
+from pipeline.evaluation.tasks import EvaluationTask, Source, balanced, libero_task, read_tasks
 from pipeline.libero.tasks import tasks
-from pipeline.testset import benchmark
-from pipeline.testset.benchmark import SUITES
+from pipeline.testset.benchmark import SUITES, load
 from pipeline.types import Task
 
 INITIAL_STATES = 50
 """LIBERO's, of each task."""
 
-
 COLUMNS = {"suites": "suite", "axes": "axis", "components": "component", "levels": "level"}
 """Fields of a selection to what they restrict."""
-
 
 PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
 """The six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
@@ -71,7 +68,7 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
     Raises:
         PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.
     """
-    check_names(selection)
+    _check_names(selection)
     listed = list(_listed(selection))
     _check_listed(selection, listed)
     wanted = [task for task in listed if _matches(task, selection)]
@@ -82,13 +79,13 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
     return wanted if selection.subset is None else balanced(wanted, selection.subset, selection.seed)
 
 
-def check_names(selection: Selection) -> None:
+def _check_names(selection: Selection) -> None:
     """What can be said before anything is listed.
 
     Raises:
         PipelineError: when it names something unknown.
     """
-    check("suites", selection.suites, SUITES, selection)
+    _check_known("suites", selection.suites, SUITES, selection)
     if selection.file is not None:
         return
     if selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
@@ -111,19 +108,12 @@ def check_names(selection: Selection) -> None:
             expected=" or ".join(OWN_AXES),
             remedy="--source libero_plus --axis language, whose 1,537 instructions every plan keeps clear of",
         )
-    offered: dict[str, Collection[object]] = {
-        "libero": {"clean"},
-        "libero_plus": {axis for axis, _ in benchmark.COUNTS},
-        "own": OWN_AXES,
-        "goals": {"goal"},
-        "pairs": OWN_AXES,
-    }
-    check("axes", selection.axes, offered[selection.source], selection)
     if selection.source in ("own", "pairs"):
-        check("levels", selection.levels, LEVELS, selection)
+        _check_known("axes", selection.axes, OWN_AXES, selection)
+        _check_known("levels", selection.levels, LEVELS, selection)
 
 
-def check(field: str, named: Iterable[object], known: Collection[object], selection: Selection) -> None:
+def _check_known(field: str, named: Iterable[object], known: Collection[object], selection: Selection) -> None:
     """Have every name of a field be known.
 
     Raises:
@@ -142,7 +132,7 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
         yield from read_tasks(selection.file, selection.seed)
         return
     if selection.source == "libero_plus":
-        for test in benchmark.load().tasks:
+        for test in load().tasks:
             level = libero_plus.level_of(test)
             yield EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, level, 0)
         return
@@ -151,7 +141,7 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
         for number in range(selection.episodes):
             match selection.source:
                 case "libero":
-                    yield _clean(task, number)
+                    yield libero_task(task, number)
                 case "goals":
                     for replacement in goals.replacements(task):
                         name, kind = replacement.name(task, number), replacement.category
@@ -172,22 +162,25 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
     """
     levels, axes = selection.levels or LEVELS, axes_of("+".join(selection.axes or PAIR_AXES))
     pairs = ("+".join(pair) for pair in combinations(axes, 2))
-    yield _clean(task, number)
+    yield libero_task(task, number)
     level = levels[turn % len(levels)]
     drawn = (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs))
     yield from filter(None, drawn)
 
 
-def _matches(task: EvaluationTask, selection: Selection) -> bool:
-    kinds = (
-        (task.axis, selection.axes),
-        (task.component, selection.components),
-        (task.level, selection.levels),
-    )
+def _restricting(selection: Selection) -> list[str]:
+    """The fields that choose among the listed tasks."""
     # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
-    restricted = ((task.suite, selection.suites), *(() if selection.source == "pairs" else kinds))
+    fields = ("suites",) if selection.source == "pairs" else COLUMNS
+    return [field for field in fields if getattr(selection, field)]
+
+
+def _matches(task: EvaluationTask, selection: Selection) -> bool:
     named = any(fnmatch.fnmatch(name, pattern) for pattern in selection.tasks for name in (task.name, task.base))
-    return all(not allowed or value in allowed for value, allowed in restricted) and (named or not selection.tasks)
+    fields = _restricting(selection)
+    return all(getattr(task, COLUMNS[field]) in getattr(selection, field) for field in fields) and (
+        named or not selection.tasks
+    )
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
@@ -196,9 +189,10 @@ def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> Non
     Raises:
         PipelineError: when one is not.
     """
-    # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
-    for field in () if selection.source == "pairs" else ("axes", "components", "levels"):
-        check(field, getattr(selection, field), {getattr(task, COLUMNS[field]) for task in listed}, selection)
+    for field in _restricting(selection):
+        if field != "suites":
+            known = {getattr(task, COLUMNS[field]) for task in listed}
+            _check_known(field, getattr(selection, field), known, selection)
     names = {name for task in listed for name in (task.name, task.base)}
     names |= {task.name for suite in SUITES for task in tasks(suite)}
     for pattern in selection.tasks:

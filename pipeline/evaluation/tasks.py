@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import BaseModel
 
 from pipeline import seeding
 from pipeline.errors import PipelineError
@@ -60,30 +60,20 @@ class EvaluationTask:
         """The task that ``for_harness`` gave, or one of the harness's own LIBERO class, which words it."""
         if "source" not in task:
             known = next(known for known in tasks(task["suite"]) if known.instruction == task["name"])
-            return _clean(known, int(task.get("episode_idx", 0)))
+            return libero_task(known, int(task.get("episode_idx", 0)))
         return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
 
 
-def _clean(task: Task, number: int) -> EvaluationTask:
+def libero_task(task: Task, number: int) -> EvaluationTask:
+    """LIBERO's own task, from its initial state of that number."""
     return EvaluationTask("libero", task.suite, task.name, f"{task.name}_state{number}", "clean", "clean", 0, number)
 
 
 @cache
 def libero_states(task: Task) -> Floats:
-    """(50, S) the initial states that LIBERO evaluates a task from: time, qpos, qvel.
-
-    Raises:
-        PipelineError: when the installed LIBERO has none.
-    """
-    path = libero_folder() / "init_files" / task.suite / f"{task.name}.pruned_init.npz"
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            states: Floats = np.asarray(arrays["states"], np.float64)
-    except (OSError, KeyError, ValueError) as error:
-        raise PipelineError(
-            f"no initial states of {task.suite}/{task.name} ({error})", where=path, remedy="bash setup.sh"
-        ) from error
-    return states
+    """(50, S) the initial states that LIBERO evaluates a task from: time, qpos, qvel."""
+    with np.load(libero_folder() / "init_files" / task.suite / f"{task.name}.pruned_init.npz") as arrays:
+        return np.asarray(arrays["states"], np.float64)
 
 
 def balanced(wanted: Iterable[EvaluationTask], count: int, seed: int) -> list[EvaluationTask]:
@@ -107,6 +97,13 @@ def _in_turn(wanted: list[EvaluationTask], columns: tuple[str, ...], seed: int) 
     return [task for turn in zip_longest(*rows) for task in turn if task is not None]
 
 
+class _TaskList(BaseModel):
+    """What a file of tasks holds; the tasks may have more fields, such as ``difficulty``."""
+
+    seed: int
+    tasks: list[EvaluationTask]
+
+
 def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
     """The tasks that ``analyse construct`` or ``analyse grade`` listed.
 
@@ -114,20 +111,16 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
         PipelineError: when the file is not such a list, or its draws were made under another seed.
     """
     try:
-        content = json.loads(file.read_text())
-        names = EvaluationTask.__dataclass_fields__
-        described = [{name: task[name] for name in names} for task in content["tasks"]]
-        listed = TypeAdapter(list[EvaluationTask]).validate_python(described)
-        drawn_under = content["seed"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        listed = _TaskList.model_validate_json(file.read_bytes())
+    except (OSError, ValueError) as error:
         raise PipelineError(
-            f"not a list of tasks ({error!r})", where=file, expected="a file that `analyse construct` wrote"
+            f"not a list of tasks ({error})", where=file, expected="a file that `analyse construct` wrote"
         ) from error
-    if drawn_under != seed:
+    if listed.seed != seed:
         raise PipelineError(
-            f"these tasks were drawn under seed {drawn_under}, not {seed}", where=file, remedy=f"--seed {drawn_under}"
+            f"these tasks were drawn under seed {listed.seed}, not {seed}", where=file, remedy=f"--seed {listed.seed}"
         )
-    return listed
+    return listed.tasks
 
 
 def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
