@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.evaluate import evaluate
 from pipeline.evaluation.policies import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import EvaluationJob, _environment, episode_id
+from pipeline.evaluation.rollout import Evaluation, EvaluationJob, _environment
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import EvaluationTask
@@ -56,9 +57,13 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return actions
 
 
+def evaluation(policy: PolicyConfig, out: Path, settings: Settings = SETTINGS) -> Evaluation:
+    return Evaluation(settings, policy, policy.identity(), out)
+
+
 def run(out: Path, checkpoint: Path, label: str = "", settings: Settings = SETTINGS) -> dict[str, Any]:
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoint), label=label)
-    return evaluate(CHOSEN, settings, policy, out, loop)
+    return evaluate(evaluation(policy, out, settings), CHOSEN, loop)
 
 
 def rescale(folder: Path) -> None:
@@ -154,7 +159,7 @@ def test_a_checkpoint_that_changes_during_the_run_stops_it(tmp_path: Path, monke
 
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoint))
     with pytest.raises(PipelineError, match="has changed since the evaluation began"):
-        evaluate(CHOSEN, SETTINGS, policy, tmp_path / "out", retrained_first)
+        evaluate(evaluation(policy, tmp_path / "out"), CHOSEN, retrained_first)
     assert not list(EpisodeFiles(tmp_path / "out").rows())
 
 
@@ -164,7 +169,7 @@ def test_a_video_shows_what_the_policy_does_not_look_at(
 ) -> None:
     monkeypatch.setitem(environment.STEP_LIMITS, STOVE.suite, 20)
     chosen = CHOSEN.model_copy(update={"episodes": 2})
-    evaluate(chosen, SETTINGS, PolicyConfig(kind="open_loop"), tmp_path, loop, videos="all")
+    evaluate(replace(evaluation(PolicyConfig(kind="open_loop"), tmp_path), videos="all"), chosen, loop)
     assert "evaluate, episodes: 2/2, " in capsys.readouterr().err, "progress is counted in episodes"
     for row in EpisodeFiles(tmp_path).rows():
         assert row["looks"] == 0
@@ -194,13 +199,13 @@ def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Pat
 
 def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     tasks = tuple(select(CHOSEN.model_copy(update={"episodes": 2})))
-    policy = PolicyConfig(kind="open_loop")
-    job = EvaluationJob(tasks, SETTINGS, policy, policy.identity(), tmp_path, "", "none")
+    replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
+    job = EvaluationJob(replayed, tasks, "")
     assert job.episodes() == 2
     assert job.limit_s() > 3600
     assert job.lost() == [f"worker_lost ({task})" for task in tasks]
-    name = {"episode": episode_id(tasks[0], SETTINGS, policy.identity()), "policy": "replay", "settings": {}}
-    EpisodeFiles(tmp_path).save({**name, "identity": policy.identity(), "made_by": results.made_by(False, [])})
+    name = {"episode": replayed.episode(tasks[0]), "policy": "replay", "settings": {}}
+    EpisodeFiles(tmp_path).save({**name, "identity": replayed.identity, "made_by": results.made_by(False, [])})
     assert job.lost() == [f"worker_lost ({tasks[1]})"]
 
 
@@ -217,7 +222,7 @@ def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
 def test_a_server_needs_a_label(tmp_path: Path) -> None:
     policy = PolicyConfig(kind="server", address="ws://localhost:1")
     with pytest.raises(PipelineError, match="no label") as caught:
-        evaluate(CHOSEN, SETTINGS, policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path), CHOSEN, loop)
     assert "--label" in str(caught.value)
 
 
@@ -227,12 +232,12 @@ def test_a_server_that_is_shown_something_else_is_not_counted_as_the_same(tmp_pa
     server = ("-m", "pipeline.evaluation.harness", "--args.tracked")
     with running(*server, "false") as address:
         policy = PolicyConfig(kind="server", address=address, label="act")
-        found = evaluate(CHOSEN, SETTINGS, policy, tmp_path, loop)
+        found = evaluate(evaluation(policy, tmp_path), CHOSEN, loop)
     assert found["settings"] | {"state": False, "images": True} == found["settings"]
     assert found["policy"] == {"name": "act", "identity": "claimed:act"}
     more = CHOSEN.model_copy(update={"episodes": 2})
     with running(*server, "true") as address, pytest.raises(PipelineError, match="seen in different ways: state"):
-        evaluate(more, SETTINGS, PolicyConfig(kind="server", address=address, label="act"), tmp_path, loop)
+        evaluate(evaluation(PolicyConfig(kind="server", address=address, label="act"), tmp_path), more, loop)
     assert json.loads((tmp_path / "summary.json").read_text()) == found, "no summary of both together"
     assert {policy.name for policy in results.read([tmp_path])} == {"act, state False", "act, state True"}
 
@@ -240,12 +245,12 @@ def test_a_server_that_is_shown_something_else_is_not_counted_as_the_same(tmp_pa
 def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path) -> None:
     policy = PolicyConfig(kind="open_loop")
     with pytest.raises(PipelineError, match="look_every"):
-        evaluate(CHOSEN, Settings(look_every=8), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(look_every=8)), CHOSEN, loop)
     plan = tmp_path / "plan.parquet"
     with pytest.raises(PipelineError, match="cannot be read"):
-        evaluate(CHOSEN, Settings(plan=plan), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(plan=plan)), CHOSEN, loop)
     plan.touch()
     with pytest.raises(PipelineError, match="plan"):
-        evaluate(CHOSEN, Settings(plan=plan), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(plan=plan)), CHOSEN, loop)
     with pytest.raises(PipelineError, match="seed"):
-        evaluate(CHOSEN, Settings(seed=1), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(seed=1)), CHOSEN, loop)

@@ -16,7 +16,6 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.tasks import write_tasks
 from pipeline.files import replaced
-from pipeline.testset import benchmark
 
 
 def add_commands(commands: Any) -> None:
@@ -32,8 +31,10 @@ def _add_evaluate(commands: Any) -> None:
         description="Writes one file for each episode, and summary.json with success rates and their 95 % intervals. "
         "Run again after a kill, it goes on. The policy is a model server of vla-eval (started by you), or a "
         "checkpoint of lerobot on disk.",
+        argument_default=argparse.SUPPRESS,  # of what is left out, the defaults are those of the models' fields
     )
-    command.add_argument("out", type=Path, metavar="DIR", help="folder of the results")
+    add = command.add_argument
+    add("out", type=Path, metavar="DIR", help="folder of the results")
     acting = command.add_mutually_exclusive_group(required=True)
     acting.add_argument("--server", metavar="URL", help="address of a model server, such as ws://localhost:8000")
     acting.add_argument("--checkpoint", type=Path, metavar="DIR", help="a policy that lerobot saved")
@@ -45,89 +46,90 @@ def _add_evaluate(commands: Any) -> None:
         help="the demonstrations, as a check: their own actions (open_loop, as without a value), or their paths, "
         "followed by feedback (tracked)",
     )
-    command.add_argument(
-        "--source",
-        choices=("libero", "libero_plus", "own", "pairs", "goals"),
-        default="libero",
-        help="of the tasks (default: libero)",
-    )
-    command.add_argument(
-        "--tasks-from", type=Path, metavar="FILE", help="in place of a source, a list that `analyse construct` wrote"
-    )
-    command.add_argument(
-        "--plan", type=Path, metavar="FILE", help="draw held-out draws anew that overlap with this training plan"
-    )
-    command.add_argument("--suite", nargs="+", default=benchmark.SUITES, metavar="SUITE", help="of these suites only")
-    command.add_argument("--axis", nargs="+", default=(), metavar="AXIS", help="of these axes only")
-    command.add_argument("--component", nargs="+", default=(), metavar="NAME", help="of these components only")
-    command.add_argument("--level", nargs="+", type=int, default=(), metavar="N", help="of these levels only")
-    command.add_argument(
-        "--task", nargs="+", default=(), metavar="PATTERN", help="named so, or perturbing one so named"
-    )
-    command.add_argument("--subset", type=positive, metavar="N", help="so many, spread evenly over all of these")
-    command.add_argument(
-        "--episodes",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="initial states, of which LIBERO has 50, or draws of each task (default: 1)",
-    )
-    command.add_argument(
-        "--prompt",
-        choices=("clean", "benchmark", "blank"),
-        default="clean",
-        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name; "
-        "or say nothing at all",
-    )
-    command.add_argument(
-        "--black",
-        choices=("none", "agentview", "all"),
-        default="none",
-        help="show the policy black frames in place of the agent view, or of all views (default: none)",
-    )
-    command.add_argument(
-        "--initial-states",
-        choices=("libero", "demonstration"),
-        default="libero",
-        help="LIBERO's own (default), or the first state of the starter set's demonstration",
-    )
-    command.add_argument("--seed", type=int, default=0, help="of the subset and of every draw (default: 0)")
-    command.add_argument(
+    _add_selection(command)
+    _add_settings(command)
+    add(
         "--label",
-        default="",
         metavar="NAME",
         help="name of the policy in the results; a server must have one, another for each policy (default of a "
         "checkpoint: its folder and a part of the hash of its content)",
     )
-    command.add_argument(
-        "--look-every",
-        type=positive,
-        default=1,
-        metavar="N",
-        help="a server that keeps its chunk of actions to itself takes N of each: it is shown the scene once in N "
-        "control steps (default: 1)",
-    )
-    command.add_argument(
+    add(
         "--assets",
+        dest="archive",
         type=Path,
         metavar="DIR",
         help="LIBERO-Plus's unpacked asset archive, which its light, layout and most of its background tasks need",
     )
-    command.add_argument(
+    add(
         "--timeout",
+        dest="timeout_s",
         type=positive,
-        default=120,
         metavar="S",
         help="seconds that a server's answer may take (default: 120)",
     )
-    command.add_argument("--workers", type=positive, metavar="N", help="processes (default: one for each core)")
-    command.add_argument(
-        "--videos",
-        choices=("none", "failures", "all"),
-        default="none",
-        help="of which episodes to keep a video (default: none)",
-    )
+    add("--workers", type=positive, default=0, metavar="N", help="processes (default: one for each core)")
+    add("--videos", choices=("none", "failures", "all"), help="of which episodes to keep a video (default: none)")
     command.set_defaults(run=_evaluate)
+
+
+def _add_selection(command: argparse.ArgumentParser) -> None:
+    """Fields of ``Selection``."""
+    add = command.add_argument
+    add(
+        "--source",
+        choices=("libero", "libero_plus", "own", "pairs", "goals"),
+        help="of the tasks (default: libero)",
+    )
+    add(
+        "--tasks-from",
+        dest="file",
+        type=Path,
+        metavar="FILE",
+        help="in place of a source, a list that `analyse construct` wrote",
+    )
+    add("--suite", dest="suites", nargs="+", metavar="SUITE", help="of these suites only")
+    add("--axis", dest="axes", nargs="+", metavar="AXIS", help="of these axes only")
+    add("--component", dest="components", nargs="+", metavar="NAME", help="of these components only")
+    add("--level", dest="levels", nargs="+", type=int, metavar="N", help="of these levels only")
+    add("--task", dest="tasks", nargs="+", metavar="PATTERN", help="named so, or perturbing one so named")
+    add("--subset", type=positive, metavar="N", help="so many, spread evenly over all of these")
+    add(
+        "--episodes",
+        type=positive,
+        metavar="N",
+        help="initial states, of which LIBERO has 50, or draws of each task (default: 1)",
+    )
+    add("--seed", type=int, help="of the subset and of every draw (default: 0)")
+
+
+def _add_settings(command: argparse.ArgumentParser) -> None:
+    """Fields of ``Settings``, but the seed, which is the selection's."""
+    add = command.add_argument
+    add("--plan", type=Path, metavar="FILE", help="draw held-out draws anew that overlap with this training plan")
+    add(
+        "--prompt",
+        choices=("clean", "benchmark", "blank"),
+        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name; "
+        "or say nothing at all",
+    )
+    add(
+        "--black",
+        choices=("none", "agentview", "all"),
+        help="show the policy black frames in place of the agent view, or of all views (default: none)",
+    )
+    add(
+        "--initial-states",
+        choices=("libero", "demonstration"),
+        help="LIBERO's own (default), or the first state of the starter set's demonstration",
+    )
+    add(
+        "--look-every",
+        type=positive,
+        metavar="N",
+        help="a server that keeps its chunk of actions to itself takes N of each: it is shown the scene once in N "
+        "control steps (default: 1)",
+    )
 
 
 def _evaluate(arguments: argparse.Namespace) -> int:
@@ -136,39 +138,22 @@ def _evaluate(arguments: argparse.Namespace) -> int:
 
     from pipeline.evaluation.evaluate import evaluate
     from pipeline.evaluation.policies import PolicyConfig
+    from pipeline.evaluation.rollout import Evaluation
     from pipeline.evaluation.selection import Selection
     from pipeline.evaluation.settings import Settings
 
-    selection = Selection(
-        source=arguments.source,
-        file=arguments.tasks_from,
-        suites=tuple(arguments.suite),
-        axes=tuple(arguments.axis),
-        components=tuple(arguments.component),
-        levels=tuple(arguments.level),
-        tasks=tuple(arguments.task),
-        episodes=arguments.episodes,
-        subset=arguments.subset,
-        seed=arguments.seed,
-    )
-    settings = Settings(
-        prompt=arguments.prompt,
-        seed=arguments.seed,
-        initial_states=arguments.initial_states,
-        black=arguments.black,
-        plan=arguments.plan,
-        look_every=arguments.look_every,
-    )
-    policy = PolicyConfig(
-        kind=arguments.replay or ("checkpoint" if arguments.checkpoint else "server"),
-        address=str(arguments.checkpoint or arguments.server or ""),
-        label=arguments.label,
-        timeout_s=arguments.timeout,
-    )
+    def given(*names: str) -> dict[str, Any]:
+        return {name: value for name, value in vars(arguments).items() if name in names}
+
+    kind, address = next(iter(given("server", "checkpoint", "replay").items()))
+    policy = {"kind": address} if kind == "replay" else {"kind": kind, "address": str(address)}
+    config = PolicyConfig.model_validate(policy | given("label", "timeout_s"))
+    settings = Settings.model_validate(given(*Settings.model_fields))
+    evaluation = Evaluation(settings, config, config.identity(), arguments.out, **given("videos", "archive"))
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
     with runner(compute, arguments.out, gl.Shared) as run:
-        found = evaluate(selection, settings, policy, arguments.out, run, arguments.videos, arguments.assets, workers)
+        found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
     return 0
 

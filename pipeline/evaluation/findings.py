@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import yaml
 
-from pipeline.evaluation import libero_plus
+from pipeline.evaluation.libero_plus import level_of
 from pipeline.evaluation.results import Evaluated, Row
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary, wilson
-from pipeline.testset.benchmark import TestTask
+from pipeline.testset import benchmark
 
 SOURCES = ("libero_plus", "own", "libero")
 """Of tasks, in a report's order; others follow."""
 
-
 FAILURES = 3
 """So many are shown of each policy, source and axis."""
-
 
 _FACTS = ("episode", "source", "suite", "name", "axis", "component", "level", "prompt", "reason", "steps", "looks")
 
@@ -53,7 +52,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
             for policy in policies
         },
         "common": {source: _common([rows for policy in policies if (rows := policy.of(source))]) for source in sources},
-        "paper_table": _plain(paper_table(tested)) if tested else None,
+        "paper_table": asdict(paper_table(tested)) if tested else None,
         "comparisons": [
             {"source": source, "first": one.name, "second": other.name, **compare(pairs)}
             for source in sources
@@ -91,17 +90,7 @@ def _versions(rows: Sequence[Row]) -> dict[str, list[str]]:
     return {name: sorted({row["versions"][name] for row in rows if name in row["versions"]}) for name in names}
 
 
-def _plain(value: Any) -> Any:
-    """Named tuples as objects, by the names of their fields."""
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        value = value._asdict()
-    if isinstance(value, Mapping):
-        return {name: _plain(field) for name, field in value.items()}
-    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
-
-
 PUBLISHED = Path(__file__).with_name("published.yaml")
-
 
 COLUMNS = {
     "camera": ("camera",),
@@ -114,12 +103,12 @@ COLUMNS = {
 }
 """The paper's dimensions to this project's axes."""
 
-
 NAMES = {("layout", "objects"): "confounding objects", ("pose", "pose"): "displaced targets"}
 """What the paper calls the two components of its layout."""
 
 
-class Estimate(NamedTuple):
+@dataclass(frozen=True)
+class Estimate:
     """A success rate over the benchmark's tasks, from some of them.
 
     Attributes:
@@ -138,7 +127,8 @@ class Estimate(NamedTuple):
     absent: str = ""
 
 
-class Line(NamedTuple):
+@dataclass(frozen=True)
+class Line:
     """A row of the table.
 
     Attributes:
@@ -154,7 +144,8 @@ class Line(NamedTuple):
     shared: Estimate | None
 
 
-class Published(NamedTuple):
+@dataclass(frozen=True)
+class Published:
     """A row of the paper's table, in percent; ``shared`` is as in ``Line``, and not in the paper."""
 
     name: str
@@ -163,7 +154,8 @@ class Published(NamedTuple):
     shared: float | None
 
 
-class PaperTable(NamedTuple):
+@dataclass(frozen=True)
+class PaperTable:
     """The table.
 
     Attributes:
@@ -183,10 +175,14 @@ class PaperTable(NamedTuple):
 def paper_table(policies: Mapping[str, Sequence[Row]]) -> PaperTable:
     """Set policies beside the published models.
 
+    An evaluation on a balanced subset has as many easy tasks as hard ones, and the benchmark has not. So an episode
+    stands for as many test tasks as there are of its axis, component and level for each one that was run. What no
+    episode was run of is left out of a column, and said.
+
     Args:
         policies: name to episodes on test tasks.
     """
-    tasks = {column: sum(_tests(axis).total() for axis in axes) for column, axes in COLUMNS.items()}
+    tasks = {column: _sizes(axes, 1).total() for column, axes in COLUMNS.items()}
     cells = {
         name: {column: cell for column, axes in COLUMNS.items() if (cell := _cell(rows, axes))}
         for name, rows in policies.items()
@@ -218,15 +214,11 @@ def _cell(rows: Sequence[Row], axes: Sequence[str]) -> Estimate | None:
         outcomes[row["axis"], row["component"], row["level"]].append(bool(row["success"]))
     if not outcomes:
         return None
-    sizes: Counter[Any] = Counter()
-    for axis in axes:
-        for (component, level, _), count in _tests(axis).items():
-            sizes[axis, component, level] += count
     strata = {
         stratum: Estimate(len(listed), sum(listed) / len(listed), len(listed), 0, 1)
         for stratum, listed in outcomes.items()
     }
-    return _joined(strata, sizes)._replace(absent=_absent(chosen, axes))
+    return replace(_joined(strata, _sizes(axes, 3)), absent=_absent(chosen, axes))
 
 
 def _joined(parts: Mapping[Any, Estimate], sizes: Mapping[Any, int]) -> Estimate:
@@ -244,23 +236,31 @@ def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
 
 
 def _absent(rows: Sequence[Row], axes: Sequence[str]) -> str:
-    """Which components, suites and levels of a column have no episode."""
-    said = []
-    for axis in axes:
-        run = {row["component"] for row in rows if row["axis"] == axis}
-        sizes: Counter[str] = Counter()
-        for (component, _, _), count in _tests(axis).items():
-            sizes[component] += count if component not in run else 0
-        said += [f"{NAMES.get((axis, name), name)} ({count:,} tasks)" for name, count in sorted((+sizes).items())]
-    tests = [key for axis in axes if axis in {row["axis"] for row in rows} for key in _tests(axis)]
-    for at, column in ((2, "suite"), (1, "level")):
-        missing = {key[at] for key in tests} - {row[column] for row in rows}
-        said += [f"{column} {value}" if column == "level" else str(value) for value in sorted(missing)]
-    return ", ".join(said)
+    """Which components, suites and levels of a column have no episode; ``rows`` are those of its axes."""
+    run = {(row["axis"], row["component"]) for row in rows}
+    components = {kind: count for kind, count in _sizes(axes, 2).items() if kind not in run}
+    tests = [kind for kind in _tests() if kind[0] in {axis for axis, _ in run}]
+    suites = {suite for *_, suite in tests} - {row["suite"] for row in rows}
+    levels = {level for _, _, level, _ in tests} - {row["level"] for row in rows}
+    return ", ".join(
+        [
+            *(f"{NAMES.get(kind, kind[1])} ({count:,} tasks)" for kind, count in sorted(components.items())),
+            *sorted(suites),
+            *(f"level {level}" for level in sorted(levels)),
+        ]
+    )
+
+
+def _sizes(axes: Sequence[str], columns: int) -> Counter[Any]:
+    """How many test tasks of some axes there are, by the first columns of ``_tests``."""
+    sizes: Counter[Any] = Counter()
+    for kind, count in _tests().items():
+        if kind[0] in axes:
+            sizes[kind[:columns]] += count
+    return sizes
 
 
 @cache
-def _tests(axis: str) -> Counter[tuple[str, int, str]]:
-    """How many test tasks of an axis there are of each component, level and suite."""
-    tests: Iterable[TestTask] = libero_plus.by_name().values()
-    return Counter((test.component, libero_plus.level_of(test), test.suite) for test in tests if test.axis == axis)
+def _tests() -> Counter[tuple[str, str, int, str]]:
+    """How many test tasks there are of each axis, component, level and suite."""
+    return Counter((test.axis, test.component, level_of(test), test.suite) for test in benchmark.load().tasks)

