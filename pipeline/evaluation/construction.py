@@ -22,10 +22,8 @@ from pipeline.testset.benchmark import SUITES
 CANDIDATES = 500
 """Of each axis in each suite, spread evenly over tasks and levels."""
 
-
 SIZE = 10_000
 """How many tasks the benchmark has; LIBERO-Plus has 10,030."""
-
 
 Identity = tuple[str, str, str]
 """Source, suite and name of a task, which are once in a benchmark."""

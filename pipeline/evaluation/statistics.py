@@ -21,7 +21,6 @@ from pipeline.types import Floats
 _Z = 1.959963984540054
 """The 97.5th percentile of the normal distribution."""
 
-
 GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
 """What success rates are given by, beside the whole."""
 
@@ -63,16 +62,12 @@ def success_rate(rows: Sequence[Row]) -> dict[str, Any]:
 SAMPLE = 10
 """So many base tasks are a sample. Simulated, intervals of ten cover 94 to 96 % (tests/test_bootstrap.py)."""
 
-
 FEW = 5
 """Fewer trials of a base task say too little about how they scatter."""
 
-
 RESAMPLES = 10_000
 
-
 Name = str | int | tuple[str | int, ...]
-
 
 Statistic = Callable[[Floats], Floats]
 """Sums of outcomes over trials (n, outcomes) to n figures; NaN where one is not defined."""
