@@ -143,17 +143,17 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     }
     assert len(set(drawn)) == len(drawn)
     refused = [task for task in drawn if task.axis == "layout"][:5]
-    benchmark = construct(drawn, 3, 210, [result(task, False, "refused") for task in refused])
-    assert (benchmark.candidates, benchmark.refused, benchmark.overlapping) == (560, 5, 0)
-    assert set(Counter(task.axis for task in benchmark.tasks).values()) == {30}
-    assert not set(refused) & set(benchmark.tasks)
-    assert set(benchmark.tasks) < set(drawn)
+    chosen, counts = construct(drawn, 3, 210, [result(task, False, "refused") for task in refused])
+    assert (counts["candidates"], counts["refused"], counts["overlapping"]) == (560, 5, 0)
+    assert set(Counter(task.axis for task in chosen).values()) == {30}
+    assert not set(refused) & set(chosen)
+    assert set(chosen) < set(drawn)
     file = tmp_path / "tasks.json"
-    tasks.write_tasks(benchmark.tasks, 3, file)
-    assert select(Selection(file=file, seed=3)) == benchmark.tasks
-    chosen = select(Selection(file=file, seed=3, axes=("light",), subset=10))
-    assert len(chosen) == 10
-    assert {task.axis for task in chosen} == {"light"}
+    tasks.write_tasks(chosen, 3, file)
+    assert select(Selection(file=file, seed=3)) == chosen
+    lights = select(Selection(file=file, seed=3, axes=("light",), subset=10))
+    assert len(lights) == 10
+    assert {task.axis for task in lights} == {"light"}
     with pytest.raises(PipelineError, match="--seed 3"):
         select(Selection(file=file))
     file.write_text("[]")
@@ -174,13 +174,13 @@ def test_a_planted_copy_of_a_held_out_draw_is_found(axis: str) -> None:
     base = find_task(tasks[0].suite, tasks[0].base)
     drawn = [(task.name, draw(task, 0), base) for task in tasks]
     (found,) = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], drawn[2][1])])).values()
-    assert found.overlaps >= 1
-    assert found.smallest == 0
-    assert found.closest == (tasks[2].name, "planted")
+    assert found["overlaps"] >= 1
+    assert found["smallest"] == 0
+    assert found["closest"] == (tasks[2].name, "planted")
     other = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], draw(tasks[2], 1))]))[axis]
-    assert other.draws == 5
-    assert other.planned == 1
-    assert own_draws.compare(drawn, PlannedDraws([]))[axis].smallest is None
+    assert other["draws"] == 5
+    assert other["planned"] == 1
+    assert own_draws.compare(drawn, PlannedDraws([]))[axis]["smallest"] is None
 
 
 def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
@@ -190,9 +190,9 @@ def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
     tasks = select(Selection(source="own", axes=("noise",), episodes=2))
     planned = PlannedDraws([planned_row(tasks[0], one) for one in trained])
     found = own_draws.compare(((task.name, draw(task, 0), STOVE) for task in tasks), planned)["noise"]
-    assert found.overlaps == 0
-    assert found.smallest is not None
-    assert found.smallest >= found.clearance
+    assert found["overlaps"] == 0
+    assert found["smallest"] is not None
+    assert found["smallest"] >= found["clearance"]
 
 
 def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,11 +16,11 @@ from model_server import running
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.policies import PolicyConfig, PolicyError, checked_actions
+from pipeline.evaluation.policies import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, _environment
 from pipeline.evaluation.selection import Selection
-from pipeline.evaluation.settings import Settings
+from pipeline.evaluation.settings import PolicyError, Settings, checked_actions
 
 FAULTY_AND_STOVE = Selection(
     suites=("libero_object", "libero_goal"), tasks=("pick_up_the_milk*", "push_the_plate*", "turn_on*")

@@ -81,8 +81,6 @@ class Checkpoint:
 
     def end(self, success: bool) -> None: ...
 
-    def close(self) -> None: ...
-
 
 BESIDE = ("train_config.json", "README.md")
 """Files of a checkpoint that do not decide what it does."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -212,15 +211,15 @@ def _construct(arguments: argparse.Namespace) -> int:
     # The draws need LIBERO, which takes seconds to import.
     from pipeline.evaluation import construction, own_draws
 
-    constructed = construction.construct(
+    chosen, counts = construction.construct(
         construction.candidates(arguments.seed),
         arguments.seed,
         arguments.size or construction.SIZE,
         [row for folder in arguments.results for row in EpisodeFiles(folder).some_rows()],
         own_draws.planned(arguments.plan) if arguments.plan else None,
     )
-    write_tasks(constructed.tasks, arguments.seed, arguments.out)
-    print(json.dumps(constructed.counts()))
+    write_tasks(chosen, arguments.seed, arguments.out)
+    print(json.dumps(counts))
     return 0
 
 
@@ -252,5 +251,5 @@ def _leakage(arguments: argparse.Namespace) -> int:
     if not drawn:
         raise PipelineError("there are no held-out draws", where=arguments.results, remedy="evaluate --source own")
     findings = own_draws.compare(drawn, own_draws.planned(arguments.plan))
-    print(json.dumps({axis: asdict(finding) for axis, finding in findings.items()}))
-    return int(any(finding.overlaps for finding in findings.values()))
+    print(json.dumps(findings))
+    return int(any(finding["overlaps"] for finding in findings.values()))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import count, islice, product
 from typing import Any
 
@@ -27,35 +26,6 @@ SIZE = 10_000
 
 Identity = tuple[str, str, str]
 """Source, suite and name of a task, which are once in a benchmark."""
-
-
-@dataclass(frozen=True)
-class Construction:
-    """A benchmark, and what was left out of its candidates.
-
-    Attributes:
-        tasks: what it consists of.
-        candidates: how many were drawn.
-        refused: of these, whose scene takes no draw, as results say.
-        overlapping: of these, what a plan has or comes too close to.
-    """
-
-    tasks: list[EvaluationTask]
-    candidates: int
-    refused: int
-    overlapping: int
-
-    def counts(self) -> dict[str, Any]:
-        """What there is of each kind, JSON-serialisable."""
-        by_kind = Counter(f"{task.axis}/{task.component}" for task in self.tasks)
-        return {
-            "candidates": self.candidates,
-            "refused": self.refused,
-            "overlapping": self.overlapping,
-            "tasks": len(self.tasks),
-            "by_axis": dict(sorted(Counter(task.axis for task in self.tasks).items())),
-            "by_component": dict(sorted(by_kind.items())),
-        }
 
 
 def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
@@ -80,21 +50,30 @@ def construct(
     size: int = SIZE,
     results: Iterable[Row] = (),
     plan: PlannedDraws | None = None,
-) -> Construction:
+) -> tuple[list[EvaluationTask], dict[str, Any]]:
     """Filter candidates, and choose some evenly: axes in turn, of each axis its components, then levels, then suites.
 
     Args:
         results: episodes of candidates that were run; those whose scene was refused are left out.
         plan: a training plan; candidates that overlap with it are left out.
+
+    Returns:
+        The benchmark's tasks, and how many there are of each kind, JSON-serialisable, with those that were left out.
     """
     refused = {_identity(row) for row in results if row["reason"] == REFUSED}
     there = [task for task in drawn if (task.source, task.suite, task.name) not in refused]
-    apart = [task for task in there if plan is None or not _overlaps(task, seed, plan)]
-    return Construction(balanced(apart, size, seed), len(drawn), len(drawn) - len(there), len(there) - len(apart))
-
-
-def _overlaps(task: EvaluationTask, seed: int, plan: PlannedDraws) -> bool:
-    return plan.overlap(draw(task, seed), find_task(task.suite, task.base))
+    apart = there
+    if plan is not None:
+        apart = [task for task in there if not plan.overlap(draw(task, seed), find_task(task.suite, task.base))]
+    chosen = balanced(apart, size, seed)
+    return chosen, {
+        "candidates": len(drawn),
+        "refused": len(drawn) - len(there),
+        "overlapping": len(there) - len(apart),
+        "tasks": len(chosen),
+        "by_axis": dict(sorted(Counter(task.axis for task in chosen).items())),
+        "by_component": dict(sorted(Counter(f"{task.axis}/{task.component}" for task in chosen).items())),
+    }
 
 
 def difficulty(solved: int, models: int) -> int:

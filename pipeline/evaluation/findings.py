@@ -32,7 +32,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     Returns:
         ``policies``: name to settings, versions, number of refused episodes, ``overall``: the ``success_rate`` of all
         its episodes, and ``results``: ``summary`` by source.
-        ``paper_table``: see ``PaperTable``; None where no test task was run.
+        ``paper_table``: see there; None where no test task was run.
         ``comparisons``: each two policies on the episodes of a source that both ran, see ``compare``.
         ``common``: source to the number of episodes that all policies ran which ran any of it.
         ``failures``: episodes to show, and whether there is a video.
@@ -52,7 +52,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
             for policy in policies
         },
         "common": {source: _common([rows for policy in policies if (rows := policy.of(source))]) for source in sources},
-        "paper_table": asdict(paper_table(tested)) if tested else None,
+        "paper_table": paper_table(tested) if tested else None,
         "comparisons": [
             {"source": source, "first": one.name, "second": other.name, **compare(pairs)}
             for source in sources
@@ -127,53 +127,8 @@ class Estimate:
     absent: str = ""
 
 
-@dataclass(frozen=True)
-class Line:
-    """A row of the table.
-
-    Attributes:
-        name: of the model.
-        cells: column to its estimate, for those that were measured.
-        total: over all columns, weighted by their numbers of tasks; None where one was not measured.
-        shared: the same over the columns that every evaluated policy was measured on.
-    """
-
-    name: str
-    cells: Mapping[str, Estimate]
-    total: Estimate | None
-    shared: Estimate | None
-
-
-@dataclass(frozen=True)
-class Published:
-    """A row of the paper's table, in percent; ``shared`` is as in ``Line``, and not in the paper."""
-
-    name: str
-    rates: Mapping[str, float]
-    total: float
-    shared: float | None
-
-
-@dataclass(frozen=True)
-class PaperTable:
-    """The table.
-
-    Attributes:
-        source: of the published rows.
-        tasks: column to the number of test tasks in it.
-        shared: the columns that every evaluated policy was measured on.
-        published, evaluated: rows.
-    """
-
-    source: str
-    tasks: Mapping[str, int]
-    shared: tuple[str, ...]
-    published: list[Published]
-    evaluated: list[Line]
-
-
-def paper_table(policies: Mapping[str, Sequence[Row]]) -> PaperTable:
-    """Set policies beside the published models.
+def paper_table(policies: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
+    """The paper's table, policies beside the published models; JSON-serialisable.
 
     An evaluation on a balanced subset has as many easy tasks as hard ones, and the benchmark has not. So an episode
     stands for as many test tasks as there are of its axis, component and level for each one that was run. What no
@@ -181,29 +136,45 @@ def paper_table(policies: Mapping[str, Sequence[Row]]) -> PaperTable:
 
     Args:
         policies: name to episodes on test tasks.
+
+    Returns:
+        ``source``: of the published rows.
+        ``tasks``: column to the number of test tasks in it.
+        ``shared``: the columns that every evaluated policy was measured on.
+        ``evaluated``: rows with ``name``, ``cells``, which are column to an ``Estimate`` where it was measured,
+        ``total`` over all columns, weighted by their numbers of tasks, None where one was not measured, and ``shared``,
+        the same over the shared columns.
+        ``published``: rows with ``name``, ``rates`` by column in percent, ``total``, and ``shared``, which is not in
+        the paper.
     """
     tasks = {column: _sizes(axes, 1).total() for column, axes in COLUMNS.items()}
     cells = {
         name: {column: cell for column, axes in COLUMNS.items() if (cell := _cell(rows, axes))}
         for name, rows in policies.items()
     }
-    shared = tuple(column for column in COLUMNS if all(column in measured for measured in cells.values()))
-    lines = [
-        Line(
-            name,
-            measured,
-            _joined(measured, tasks) if len(measured) == len(COLUMNS) else None,
-            _joined({column: measured[column] for column in shared}, tasks) if shared else None,
-        )
+    shared = [column for column in COLUMNS if all(column in measured for measured in cells.values())]
+    evaluated = [
+        {
+            "name": name,
+            "cells": {column: asdict(cell) for column, cell in measured.items()},
+            "total": asdict(_joined(measured, tasks)) if len(measured) == len(COLUMNS) else None,
+            "shared": asdict(_joined({column: measured[column] for column in shared}, tasks)) if shared else None,
+        }
         for name, measured in cells.items()
     ]
     packed = yaml.safe_load(PUBLISHED.read_text())
     published = []
     for name, row in packed["models"].items():
         rates = dict(zip(packed["columns"], row["rates"], strict=True))
-        common = {column: rates[column] for column in shared}
-        published.append(Published(name, rates, row["total"], _mean(common, tasks) if shared else None))
-    return PaperTable(packed["source"], tasks, shared, published, lines)
+        mean = _mean({column: rates[column] for column in shared}, tasks) if shared else None
+        published.append({"name": name, "rates": rates, "total": row["total"], "shared": mean})
+    return {
+        "source": packed["source"],
+        "tasks": tasks,
+        "shared": shared,
+        "published": published,
+        "evaluated": evaluated,
+    }
 
 
 def _cell(rows: Sequence[Row], axes: Sequence[str]) -> Estimate | None:

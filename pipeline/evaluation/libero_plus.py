@@ -13,7 +13,7 @@ import re
 import zipfile
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -172,8 +172,9 @@ def saved_array(content: bytes) -> Floats:
     """
     import torch  # which takes seconds, and few tasks need
 
-    made_by = (np.empty(0).__reduce__()[0], "numpy.core.multiarray._reconstruct")
-    with torch.serialization.safe_globals([made_by, np.ndarray, np.dtype, np.dtypes.Float64DType]):
+    reconstruct: Any = np.empty(0).__reduce__()[0]
+    named = (reconstruct, "numpy.core.multiarray._reconstruct")
+    with torch.serialization.safe_globals([named, np.ndarray, np.dtype, np.dtypes.Float64DType]):
         return np.asarray(torch.load(io.BytesIO(content), weights_only=True), np.float64)
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -250,32 +251,16 @@ def _as_test(one: AnyPerturbation) -> dict[str, Value]:
             return {}
 
 
-@dataclass(frozen=True)
-class HeldOut:
-    """How close held-out draws of one axis come to a plan.
-
-    Attributes:
-        draws: how many there are.
-        planned: how many the plan has on this axis.
-        overlaps: the draws that a planned one repeats, or comes closer to than ``clearance``.
-        smallest: the least distance of all; None where nothing could be compared.
-        closest: the held-out draw and the planned episode that it belongs to.
-        clearance: the least distance that the leakage report allows between a plan and the benchmark.
-    """
-
-    draws: int
-    planned: int
-    overlaps: int
-    smallest: float | None
-    closest: tuple[str, str] | None
-    clearance: float
-
-
-def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: PlannedDraws) -> dict[str, HeldOut]:
-    """Axis to how close held-out draws come to a plan.
+def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:
+    """How close held-out draws come to a plan.
 
     Args:
         drawn: the name of each, the draw, and the task that it changes.
+
+    Returns:
+        Axis to how many ``draws`` there are, how many are ``planned``, in how many a plan's draw ``overlaps``, and the
+        ``smallest`` distance with the names of its draw and of its planned episode (``closest``), None where nothing
+        could be compared. ``clearance`` is the least distance that the leakage report allows.
     """
     by_axis: dict[str, list[tuple[str, AnyPerturbation, Task]]] = defaultdict(list)
     for name, one, task in drawn:
@@ -284,12 +269,12 @@ def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: P
     for axis, draws in by_axis.items():
         smallest, episode, name = min((*planned_draws.nearest(one, task), name) for name, one, task in draws)
         compared = math.isfinite(smallest)
-        found[axis] = HeldOut(
-            draws=len(draws),
-            planned=planned_draws.count(axis),
-            overlaps=sum(planned_draws.overlap(one, task) for _, one, task in draws),
-            smallest=smallest if compared else None,
-            closest=(name, episode) if compared else None,
-            clearance=draws[0][1].clearance,
-        )
+        found[axis] = {
+            "draws": len(draws),
+            "planned": planned_draws.count(axis),
+            "overlaps": sum(planned_draws.overlap(one, task) for _, one, task in draws),
+            "smallest": smallest if compared else None,
+            "closest": (name, episode) if compared else None,
+            "clearance": draws[0][1].clearance,
+        }
     return found

@@ -13,31 +13,8 @@ from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation.checkpoint import Checkpoint, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.settings import Look, Wanted
+from pipeline.evaluation.settings import Look, PolicyError, Wanted, checked_actions
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.types import Floats
-
-
-class PolicyError(PipelineError):
-    """The policy gave no action: this episode has no result, others may have one."""
-
-
-def checked_actions(answer: Any, policy: str) -> Floats:
-    """(n, 7) what a policy answered, one action or several.
-
-    Raises:
-        PolicyError: when it is anything but finite numbers of that shape.
-    """
-    expected = "(7,) or (n, 7) finite numbers: three of position, three of rotation, and the gripper"
-    try:
-        actions = np.asarray(answer, np.float64)
-    except (TypeError, ValueError) as error:
-        raise PolicyError(f"the policy's answer is not numbers ({error})", where=policy, expected=expected) from error
-    if actions.ndim not in (1, 2) or actions.shape[-1] != 7 or not actions.size:
-        raise PolicyError(f"the policy answers with shape {actions.shape}", where=policy, expected=expected)
-    if not np.isfinite(actions).all():
-        raise PolicyError("the policy answers with NaN or infinity", where=policy, expected=expected)
-    return np.atleast_2d(actions)
 
 
 class Policy(Protocol):
@@ -63,8 +40,6 @@ class Policy(Protocol):
     def end(self, success: bool) -> None:
         """It is over."""
         ...
-
-    def close(self) -> None: ...
 
 
 class PolicyConfig(Frozen):

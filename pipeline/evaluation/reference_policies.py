@@ -47,8 +47,6 @@ class Replay:
 
     def end(self, success: bool) -> None: ...
 
-    def close(self) -> None: ...
-
 
 class TrackedReplay:
     """Follows the hand's path of the demonstration by feedback, one action at a time.
@@ -76,8 +74,6 @@ class TrackedReplay:
         return next(self._actions, np.append(np.zeros(6), self._reference.actions[-1, 6]))
 
     def end(self, success: bool) -> None: ...
-
-    def close(self) -> None: ...
 
 
 @lru_cache(maxsize=8)

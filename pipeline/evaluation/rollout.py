@@ -20,9 +20,9 @@ from pipeline.compute.pool import LOST
 from pipeline.errors import PipelineError
 from pipeline.evaluation import asset_archive, libero_plus
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
-from pipeline.evaluation.policies import Policy, PolicyConfig, PolicyError, checked_actions
+from pipeline.evaluation.policies import Policy, PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles, Row, made_by, versions
-from pipeline.evaluation.settings import Settings, Wanted
+from pipeline.evaluation.settings import PolicyError, Settings, Wanted, checked_actions
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.seeding import digest

@@ -1,4 +1,4 @@
-"""What holds for all episodes of an evaluation, and what a policy asks to see of each."""
+"""What holds for all episodes of an evaluation, and what passes in each: what a policy asks to see and answers."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, field_serializer
 
 from pipeline.axes.base import Frozen
@@ -13,6 +14,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
 from pipeline.evaluation.libero_plus import Prompt
 from pipeline.evaluation.selection import Selection
+from pipeline.types import Floats
 
 VIEWS = {"agentview": "image", "wrist": "wrist_image"}
 """What policies call the views, to their names in ``schemas/episode.json``."""
@@ -67,6 +69,28 @@ class Wanted(NamedTuple):
 
 Look = Callable[[Wanted], dict[str, Any]]
 """Gives the observation; frames are rendered when it is called."""
+
+
+class PolicyError(PipelineError):
+    """The policy gave no action: this episode has no result, others may have one."""
+
+
+def checked_actions(answer: Any, policy: str) -> Floats:
+    """(n, 7) what a policy answered, one action or several.
+
+    Raises:
+        PolicyError: when it is anything but finite numbers of that shape.
+    """
+    expected = "(7,) or (n, 7) finite numbers: three of position, three of rotation, and the gripper"
+    try:
+        actions = np.asarray(answer, np.float64)
+    except (TypeError, ValueError) as error:
+        raise PolicyError(f"the policy's answer is not numbers ({error})", where=policy, expected=expected) from error
+    if actions.ndim not in (1, 2) or actions.shape[-1] != 7 or not actions.size:
+        raise PolicyError(f"the policy answers with shape {actions.shape}", where=policy, expected=expected)
+    if not np.isfinite(actions).all():
+        raise PolicyError("the policy answers with NaN or infinity", where=policy, expected=expected)
+    return np.atleast_2d(actions)
 
 
 def check_settings(selection: Selection, settings: Settings) -> None:

@@ -19,7 +19,6 @@ from pipeline.images.jpeg import to_policy
 from pipeline.physics.environment import Environment, control_env, seeded
 from pipeline.physics.stepping import ControlStep
 from pipeline.rendering.last_scene import LastScene
-from pipeline.rendering.renderer import Renderer
 from pipeline.scenes.compiled import proprioception
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
@@ -217,50 +216,42 @@ class Picture:
     def __init__(self) -> None:
         self._opened = LastScene()
         self._scene: mujoco.MjModel | str | None = None
-        self._looks: Sequence[AnyPerturbation] | None = None
-        self._changes = ExitStack()
+        self._perturbations: Sequence[AnyPerturbation] = ()
+        self._changes: ExitStack | None = None
 
-    def show(self, scene: mujoco.MjModel | str) -> None:
-        """Render from here on a model, or a scene's MJCF where the model is without its images."""
-        if scene is not self._scene:
-            self.restore()
-            self._scene = scene
+    def show(self, scene: mujoco.MjModel | str, perturbations: Sequence[AnyPerturbation]) -> None:
+        """Render from here on a model, or a scene's MJCF where the model is without its images, as it is perturbed."""
+        self.restore()
+        self._scene, self._perturbations = scene, perturbations
 
-    def frame(self, view: str, observed: Observed, perturbations: Sequence[AnyPerturbation], step: int) -> Frame:
+    def frame(self, view: str, observed: Observed, step: int) -> Frame:
         """(256, 256, 3) uint8 RGB, turned by 180 degrees.
 
         Args:
             view: one of ``VIEWS``.
-            perturbations: of the episode; the same sequence in all of it.
             step: how many steps were taken, for noise that is random.
         """
-        renderer = self._with_looks(perturbations)
+        if self._scene is None:
+            raise PipelineError("no episode was started", remedy="reset first")
+        renderer = self._opened.renderer(self._scene)
+        if self._changes is None:
+            self._changes = ExitStack()
+            self._changes.enter_context(renderer.perturbed(of_layer(self._perturbations, RenderPerturbation)))
         state = np.concatenate([[0.0], observed.qpos, np.zeros(renderer.model.nv)])
         renderer.restore(state, observed.site_alpha)
         frame = renderer.frame(SCHEMA.views[VIEWS[view]].camera)
-        for noise in of_layer(perturbations, PixelPerturbation):
+        for noise in of_layer(self._perturbations, PixelPerturbation):
             if VIEWS[view] in noise.views:
                 frame = noise.apply(frame, step)
         return to_policy(frame)
 
     def restore(self) -> None:
         """Undo an episode's looks."""
-        self._changes.close()
-        self._looks = None
+        if self._changes is not None:
+            self._changes.close()
+        self._changes = None
 
     def close(self) -> None:
         self.restore()
         self._scene = None
         self._opened.close()
-
-    def _with_looks(self, perturbations: Sequence[AnyPerturbation]) -> Renderer:
-        if self._scene is None:
-            raise PipelineError("no episode was started", remedy="reset first")
-        if self._looks is not perturbations:
-            self.restore()
-        renderer = self._opened.renderer(self._scene)
-        if self._looks is not perturbations:
-            looks = of_layer(perturbations, RenderPerturbation)
-            self._changes.enter_context(renderer.perturbed(looks))
-            self._looks = perturbations
-        return renderer
