@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.errors import PipelineError
-from pipeline.files import Edition, checksum, edition
+from pipeline.files import Edition, checksum_of, edition
 from pipeline.libero.assets import libero_assets
 from pipeline.physics.environment import control_env
 from pipeline.testset import benchmark
@@ -87,9 +87,9 @@ def contents(test: TestTask, archive: Path | None) -> list[str]:
     files = [assets / path for path in _named(test)]
     for file in files:
         if file.suffix == ".xml":
-            read = (file.parent / path for path in _referred(file, edition(file)))
+            read = (file.parent / path for path in _referred(edition(file)))
             files += [path.resolve() for path in read if path.is_file() and path.resolve() not in files]
-    return [_checksum(file, edition(file)) for file in files]
+    return [checksum_of(edition(file)) for file in files]
 
 
 def _named(test: TestTask) -> Iterable[str]:
@@ -98,16 +98,11 @@ def _named(test: TestTask) -> Iterable[str]:
 
 
 @cache
-def _referred(file: Path, version: Edition) -> tuple[str, ...]:
+def _referred(file: Edition) -> tuple[str, ...]:
     try:
-        return tuple(element.attrib["file"] for element in ET.parse(file).iterfind(".//*[@file]"))
+        return tuple(element.attrib["file"] for element in ET.parse(file.path).iterfind(".//*[@file]"))
     except ET.ParseError as error:
-        raise PipelineError(f"not XML ({error})", where=file, remedy="unpack the archive again") from error
-
-
-@cache
-def _checksum(file: Path, version: Edition) -> str:
-    return checksum(file)
+        raise PipelineError(f"not XML ({error})", where=file.path, remedy="unpack the archive again") from error
 
 
 def scene_files(test: TestTask) -> SceneFiles:

@@ -91,7 +91,7 @@ def content_of(checkpoint: Path) -> str:
     else is there but ``BESIDE`` and hidden files. What lerobot loads from elsewhere, such as a tokenizer, is not in it.
 
     Raises:
-        PipelineError: when it is no checkpoint, or cannot be read.
+        PipelineError: when it is no checkpoint.
     """
     if not (checkpoint / "config.json").is_file():
         raise PipelineError("no config.json", where=checkpoint, expected="a folder that lerobot saved a policy in")
@@ -101,7 +101,4 @@ def content_of(checkpoint: Path) -> str:
         for name, path in inside.items()
         if name.name not in BESIDE and not any(part.startswith(".") for part in name.parts)
     }
-    try:
-        return digest({name: checksum(path) for name, path in deciding.items()})
-    except OSError as error:
-        raise PipelineError(f"cannot be read ({error})", where=checkpoint) from error
+    return digest({name: checksum(path) for name, path in deciding.items()})

@@ -14,7 +14,7 @@ from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.tasks import write_tasks
-from pipeline.files import replaced
+from pipeline.files import write_json
 
 
 def add_commands(commands: Any) -> None:
@@ -201,8 +201,7 @@ def _gap(arguments: argparse.Namespace) -> int:
     measured = composition.pairs(EpisodeFiles(arguments.results).some_rows())
     composition.heatmap(measured, arguments.results / "gap.png")
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
-    with replaced(arguments.results / "gap.json") as temporary:
-        temporary.write_text(json.dumps(figures, indent=2) + "\n")
+    write_json(arguments.results / "gap.json", figures)
     print(json.dumps(figures))
     return 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from itertools import islice
@@ -17,7 +16,7 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import check_settings
 from pipeline.evaluation.statistics import summary
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import replaced
+from pipeline.files import write_json
 from pipeline.seeding import digest
 
 EPISODES_A_JOB = 10
@@ -70,8 +69,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Run, workers: in
         "selection": selection.model_dump(mode="json"),
         "settings": _one_setting(rows) or settings.model_dump(),
     }
-    with replaced(folder / "summary.json") as temporary:
-        temporary.write_text(json.dumps(found, indent=2) + "\n")
+    write_json(folder / "summary.json", found)
     if faults:
         raise without_result(faults)
     return found
@@ -95,11 +93,7 @@ def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[Evaluat
 
 
 def _one_setting(rows: Iterable[Row]) -> dict[str, Any]:
-    """What holds for all rows; empty where there is none.
-
-    Raises:
-        PipelineError: when a policy looked at other things in some than in others.
-    """
+    """What holds for all rows; empty where there is none. Refuses a policy that looked at other things in some."""
     seen = {digest(row["settings"]): row for row in rows}
     if len(seen) > 1:
         one, other, *_ = seen.values()

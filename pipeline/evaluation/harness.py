@@ -7,7 +7,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
 from vla_eval.model_servers.base import ModelServer, SessionContext
 from vla_eval.model_servers.serve import run_server
@@ -27,8 +26,10 @@ from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import NextLook
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.settings import Settings, Wanted, check_settings
+from pipeline.evaluation.settings import Settings, Wanted, check_settings, checked_actions
 from pipeline.evaluation.tasks import EvaluationTask
+
+ACTION = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
 
 
 class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
@@ -97,7 +98,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     def step(self, action: dict[str, Any]) -> StepResult:
         """Take one action (7,), or all of a chunk (n, 7) until the episode is over."""
         given = action.get("actions", action.get("action"))
-        for one in np.atleast_2d(np.asarray(given)):
+        for one in checked_actions(given, "model server"):
             progress = self._environment.step(one)
             if progress.over:
                 break
@@ -107,8 +108,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         return StepResult(self._last, float(progress.success), progress.over, {"success": progress.success})
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
-        observation: dict[str, Any] = raw_obs
-        return observation
+        return dict(raw_obs)
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         progress = self._environment.progress
@@ -124,7 +124,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         }
 
     def get_action_spec(self) -> dict[str, DimSpec]:
-        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+        return ACTION
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         spec = {"agentview": IMAGE_RGB, "language": LANGUAGE}
@@ -168,7 +168,7 @@ class ReplayServer(ModelServer):  # type: ignore[misc]
         return {"send_state": self._tracked}
 
     def get_action_spec(self) -> dict[str, DimSpec]:
-        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+        return ACTION
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         return {"image": IMAGE_RGB, **({"state": STATE_EEF_POS_AA_GRIP} if self._tracked else {})}

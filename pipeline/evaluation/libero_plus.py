@@ -52,33 +52,31 @@ class TestCamera(CameraPerturbation):
         pos_m, quat_wxyz = camera.pos.copy(), camera.quat.copy()
         # In the benchmark's order; each step leaves the other parameters neutral.
         for changed in self._steps():
-            pos_m, quat_wxyz = map(_rounded, changed.pose(pos_m, _unit(quat_wxyz)))
-        camera.pos[:], camera.quat[:] = pos_m, _unit(quat_wxyz)
+            pos_m, quat_wxyz = map(_rounded, changed.pose(pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)))
+        # SciPy's ``Rotation``, with which the benchmark turns, makes it a unit quaternion.
+        camera.pos[:], camera.quat[:] = pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)
 
     def _steps(self) -> list[CameraPerturbation]:
-        def step(**parameters: float) -> CameraPerturbation:
-            return CameraPerturbation.model_validate({"component": self.component, "level": self.level, **parameters})
-
-        # From 0 to 360, as the benchmark's names have them: a half is rounded another way after 330 than after -30.
-        azimuth_deg, yaw_deg, pitch_deg = (angle % 360 for angle in (self.azimuth_deg, self.yaw_deg, self.pitch_deg))
-        steps = [step(elevation_deg=self.elevation_deg)] if self.elevation_deg else []
-        steps.append(step(azimuth_deg=azimuth_deg))
-        if self.distance_scale != 1:
-            steps.append(step(distance_scale=self.distance_scale))
-        # In place: the benchmark turns the orientation alone, about the world's axes, as ``pose`` does.
-        steps += [step(yaw_deg=yaw_deg)] if yaw_deg else []
-        steps += [step(pitch_deg=pitch_deg)] if pitch_deg else []
-        return steps
+        # Angles from 0 to 360, as the benchmark's names have them: a half is rounded another way after 330 than after
+        # -30. The last two turn the orientation alone, about the world's axes, as ``pose`` does.
+        steps = {
+            "elevation_deg": self.elevation_deg,
+            "azimuth_deg": self.azimuth_deg % 360,
+            "distance_scale": self.distance_scale,
+            "yaw_deg": self.yaw_deg % 360,
+            "pitch_deg": self.pitch_deg % 360,
+        }
+        # But for the azimuth, nothing is rounded that is not changed.
+        neutral = {"elevation_deg": 0, "distance_scale": 1, "yaw_deg": 0, "pitch_deg": 0}
+        return [
+            CameraPerturbation.model_validate({"component": self.component, "level": self.level, name: value})
+            for name, value in steps.items()
+            if value != neutral.get(name)
+        ]
 
 
 def _rounded(part: Floats) -> Floats:
     return np.array([round(float(number), DECIMALS) for number in part])
-
-
-def _unit(quat_wxyz: Floats) -> Floats:
-    """What SciPy's ``Rotation`` makes of a quaternion before it turns it; the benchmark turns with that."""
-    unit: Floats = quat_wxyz / np.linalg.norm(quat_wxyz)
-    return unit
 
 
 @cache
@@ -190,8 +188,5 @@ def instruction(test: TestTask, prompt: Prompt) -> str:
         return str(test.parameters["text"])
     if prompt == "clean":
         return find_task(test.suite, test.base).instruction
-    name = test.name
-    if name[0].isupper():
-        # Such as KITCHEN_SCENE3_turn_on_the_stove.
-        name = re.sub(r".*?SCENE\d+_", "", name)
-    return " ".join(name.split("_"))
+    # Such as KITCHEN_SCENE3_turn_on_the_stove.
+    return re.sub(r"^[A-Z].*?SCENE\d+_", "", test.name).replace("_", " ")

@@ -25,7 +25,7 @@ from pipeline.axes.scene import ScenePerturbation
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import Edition, checksum, edition
+from pipeline.files import Edition, checksum_of, edition
 from pipeline.libero.tasks import find_task
 from pipeline.physics.roll_out import roll_out
 from pipeline.planning import plan
@@ -211,12 +211,12 @@ def planned(file: Path) -> PlannedDraws:
     Raises:
         PipelineError: when it is not a plan of this version.
     """
-    return _planned(file, sha256_of(file))
+    return _planned(_edition(file))
 
 
 @cache
-def _planned(file: Path, sha256: str) -> PlannedDraws:
-    return PlannedDraws(plan.read(file))
+def _planned(file: Edition) -> PlannedDraws:
+    return PlannedDraws(plan.read(file.path))
 
 
 def sha256_of(file: Path) -> str:
@@ -225,15 +225,14 @@ def sha256_of(file: Path) -> str:
     Raises:
         PipelineError: when the file cannot be read.
     """
+    return checksum_of(_edition(file))
+
+
+def _edition(file: Path) -> Edition:
     try:
-        return _sha256(file, edition(file))
+        return edition(file)
     except OSError as error:
         raise PipelineError(f"cannot be read ({error})", where=file, expected="data/<run>/plan.parquet") from error
-
-
-@cache
-def _sha256(file: Path, version: Edition) -> str:
-    return checksum(file)
 
 
 def _as_test(one: AnyPerturbation) -> dict[str, Value]:

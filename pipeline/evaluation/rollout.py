@@ -81,10 +81,7 @@ class Evaluation:
 
 
 def roll_out_policy(
-    environment: EpisodeEnvironment,
-    policy: Policy,
-    task: EvaluationTask,
-    film: dict[int, Frame] | None = None,
+    environment: EpisodeEnvironment, policy: Policy, task: EvaluationTask, film: dict[int, Frame] | None = None
 ) -> Row:
     """Run one episode to its end; returns what is recorded of it.
 
@@ -238,11 +235,7 @@ def _environment(settings: Settings, archive: Path | None) -> EpisodeEnvironment
 
 @lru_cache(maxsize=1)
 def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
-    """This process's policy; a server keeps its connection.
-
-    Raises:
-        PipelineError: when it is not the one that the evaluation was begun with.
-    """
+    """This process's policy, which is refused if it is not the one that the evaluation was begun with."""
     policy = config.open(look_every)
     # After it was loaded: files that were others before are others now.
     if config.identity() != identity:

@@ -80,11 +80,7 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
 
 
 def _check_names(selection: Selection) -> None:
-    """What can be said before anything is listed.
-
-    Raises:
-        PipelineError: when it names something unknown.
-    """
+    """Refuse what can be refused before anything is listed."""
     _check_known("suites", selection.suites, SUITES, selection)
     if selection.file is not None:
         return
@@ -114,11 +110,7 @@ def _check_names(selection: Selection) -> None:
 
 
 def _check_known(field: str, named: Iterable[object], known: Collection[object], selection: Selection) -> None:
-    """Have every name of a field be known.
-
-    Raises:
-        PipelineError: when one is not, with all that are.
-    """
+    """Refuse a name of a field that is not known, with all that are."""
     if unknown := [name for name in named if name not in known]:
         raise PipelineError(
             f"{selection.file or selection.source} has no {unknown[0]!r}",
@@ -162,10 +154,9 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
     """
     levels, axes = selection.levels or LEVELS, axes_of("+".join(selection.axes or PAIR_AXES))
     pairs = ("+".join(pair) for pair in combinations(axes, 2))
-    yield libero_task(task, number)
     level = levels[turn % len(levels)]
-    drawn = (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs))
-    yield from filter(None, drawn)
+    yield libero_task(task, number)
+    yield from filter(None, (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs)))
 
 
 def _restricting(selection: Selection) -> list[str]:
@@ -184,11 +175,7 @@ def _matches(task: EvaluationTask, selection: Selection) -> bool:
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
-    """Have every name that chooses among the listed tasks be one of theirs.
-
-    Raises:
-        PipelineError: when one is not.
-    """
+    """Refuse a name that none of the listed tasks has."""
     for field in _restricting(selection):
         if field != "suites":
             known = {getattr(task, COLUMNS[field]) for task in listed}
@@ -217,11 +204,7 @@ def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> Pip
 
 
 def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
-    """Those that can be rebuilt; says how many cannot.
-
-    Raises:
-        PipelineError: when nothing can be rebuilt of an axis that is asked for by name.
-    """
+    """Those that can be rebuilt; says how many cannot. Refuses an axis of which nothing can be, if it is named."""
     tests = libero_plus.by_name()
     left = [task for task in wanted if libero_plus.runnable(tests[task.suite, task.name], archive)]
     missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)

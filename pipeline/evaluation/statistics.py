@@ -1,4 +1,19 @@
-"""The statistics of an evaluation: success rates with their intervals, and differences by bootstrap."""
+"""The statistics of an evaluation: success rates with their intervals, and differences by bootstrap (Efron, 1979).
+
+What is compared is of the same trials: a test task that two policies act in, or an initial state on which the four
+combinations of two axes were run. A trial's outcomes stay together, so what makes it easy or hard for all of them
+cancels. Trials of one base task are alike, so it matters what is drawn anew:
+
+* With ``SAMPLE`` base tasks or more these are a sample, and are drawn, each with all its trials. The interval says what
+  other tasks of this kind would show. Trials are not drawn again within the drawn tasks: their scatter would count
+  twice, and simulated intervals of five trials a task cover 97.8 to 99.5 %.
+* Fewer are fixed: trials are drawn within each of them, and the interval is about these tasks alone. They tell too
+  little of others: simulated, a plain bootstrap that draws four base tasks anew covers 73 to 97 % instead of 95 %.
+* Where some base task has fewer than ``FEW`` trials, all trials are drawn as if of one. This is wider.
+
+Of n units n - 1 are drawn, which makes the variance of a mean unbiased (Rao and Wu, 1988). The percentiles are not 2.5
+and 97.5 but further out, by as much as Student's t is wider than the normal distribution (Hesterberg, 2015).
+"""
 
 from __future__ import annotations
 
@@ -12,14 +27,8 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest, norm, t
 
 from pipeline import seeding
-from pipeline.evaluation.results import (
-    REFUSED,
-    Row,
-)
+from pipeline.evaluation.results import REFUSED, Row
 from pipeline.types import Floats
-
-_Z = 1.959963984540054
-"""The 97.5th percentile of the normal distribution."""
 
 GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
 """What success rates are given by, beside the whole."""
@@ -29,9 +38,10 @@ def wilson(successes: float, trials: float) -> tuple[float, float]:
     """The 95 % interval of a success rate (Wilson, 1927); it holds for few trials and for rates near 0 and 1."""
     if trials == 0:
         return 0.0, 1.0
-    rate, z2 = successes / trials, _Z**2
+    rate, z = successes / trials, float(norm.ppf(0.975))
+    z2 = z**2
     middle = (rate + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = _Z * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials**2)) / (1 + z2 / trials)
+    half = z * math.sqrt(rate * (1 - rate) / trials + z2 / (4 * trials**2)) / (1 + z2 / trials)
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
@@ -163,9 +173,10 @@ def compare(pairs: Sequence[Pair]) -> dict[str, Any]:
         ``all`` and ``by_axis`` with ``p_value`` of McNemar's exact test, and ``difference``: the second rate minus the
         first as ``value``, and its ``Interval``.
     """
-    axes = sorted({row["axis"] for row, _ in pairs})
-    by_axis = {axis: _compared([pair for pair in pairs if pair[0]["axis"] == axis]) for axis in axes}
-    return {"all": _compared(pairs), "by_axis": by_axis}
+    by_axis: dict[str, list[Pair]] = defaultdict(list)
+    for pair in pairs:
+        by_axis[pair[0]["axis"]].append(pair)
+    return {"all": _compared(pairs), "by_axis": {axis: _compared(by_axis[axis]) for axis in sorted(by_axis)}}
 
 
 def mcnemar(only_first: int, only_second: int) -> float:
@@ -189,8 +200,7 @@ def _task(row: Row) -> tuple[Any, ...]:
 
 def _compared(pairs: Sequence[Pair]) -> dict[str, Any]:
     counts = Counter((bool(one["success"]), bool(other["success"])) for one, other in pairs)
-    both, neither = counts[True, True], counts[False, False]
-    only_first, only_second = counts[True, False], counts[False, True]
+    both, only_first, only_second = counts[True, True], counts[True, False], counts[False, True]
     outcomes = np.array([(one["success"], other["success"], 1) for one, other in pairs], float)
     measured = interval(
         [(row["suite"], row["base"]) for row, _ in pairs], [_task(row) for row, _ in pairs], outcomes, difference
@@ -200,7 +210,7 @@ def _compared(pairs: Sequence[Pair]) -> dict[str, Any]:
         "both": both,
         "only_first": only_first,
         "only_second": only_second,
-        "neither": neither,
+        "neither": counts[False, False],
         "first_rate": (both + only_first) / len(pairs),
         "second_rate": (both + only_second) / len(pairs),
         "p_value": mcnemar(only_first, only_second),
