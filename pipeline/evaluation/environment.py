@@ -38,8 +38,9 @@ class Progress:
         steps: actions taken, without the settling steps.
         success: whether the goal was reached; then the episode is over.
         over: whether it was reached, the limit was, or the simulation became unstable; or the episode cannot begin.
-        reason: ``success``, ``step_limit``, ``simulation_unstable``, ``running``, or ``refused`` where the scene does
-            not take what was drawn. Such an episode is over before its first look and says nothing of a policy.
+        reason: ``success``, ``step_limit``, ``simulation_unstable``, ``running``, ``not_begun``, or ``refused`` where
+            the scene does not take what was drawn. Such an episode is over before its first look and says nothing of a
+            policy.
     """
 
     steps: int
@@ -229,11 +230,7 @@ class EpisodeEnvironment:
 
     @property
     def _test(self) -> TestTask:
-        tests = libero_plus.by_name()
-        key = (self.task.suite, self.task.name)
-        if key not in tests:
-            raise PipelineError(f"LIBERO-Plus has no test task {self.task.name!r}", where=self.task.suite)
-        return tests[key]
+        return libero_plus.find(self.task.suite, self.task.name)
 
     def _assets(self, test: TestTask) -> Path:
         """The folder that has the files of a light, background or layout task."""

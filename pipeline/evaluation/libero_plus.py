@@ -21,6 +21,7 @@ import numpy as np
 from pipeline import seeding
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoisePerturbation
+from pipeline.errors import PipelineError
 from pipeline.evaluation import asset_archive
 from pipeline.libero.tasks import find_task
 from pipeline.testset import benchmark
@@ -83,6 +84,17 @@ def _rounded(part: Floats) -> Floats:
 def by_name() -> dict[tuple[str, str], TestTask]:
     """Every test task, by its suite and its name."""
     return {(task.suite, task.name): task for task in benchmark.load().tasks}
+
+
+def find(suite: str, name: str) -> TestTask:
+    """The test task of that name.
+
+    Raises:
+        PipelineError: when the suite has none.
+    """
+    if (suite, name) not in by_name():
+        raise PipelineError(f"LIBERO-Plus has no test task {name!r}", where=suite)
+    return by_name()[suite, name]
 
 
 def level_of(test: TestTask) -> int:

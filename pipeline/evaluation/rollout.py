@@ -76,7 +76,7 @@ class Evaluation:
         """A short name for what makes a result beside the task, the settings and the policy."""
         contents = []
         if task.source == "libero_plus":
-            contents = asset_archive.contents(libero_plus.by_name()[task.suite, task.name], self.archive)
+            contents = asset_archive.contents(libero_plus.find(task.suite, task.name), self.archive)
         return made_by(self.identity.startswith("sha256:"), contents)
 
 

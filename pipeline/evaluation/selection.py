@@ -205,8 +205,7 @@ def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> Pip
 
 def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
     """Those that can be rebuilt; says how many cannot. Refuses an axis of which nothing can be, if it is named."""
-    tests = libero_plus.by_name()
-    left = [task for task in wanted if libero_plus.runnable(tests[task.suite, task.name], archive)]
+    left = [task for task in wanted if libero_plus.runnable(libero_plus.find(task.suite, task.name), archive)]
     missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
     if missing and (not left or {*selection.axes} - {task.axis for task in left}):
