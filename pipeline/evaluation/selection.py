@@ -167,11 +167,10 @@ def _restricting(selection: Selection) -> list[str]:
 
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
-    named = any(fnmatch.fnmatch(name, pattern) for pattern in selection.tasks for name in (task.name, task.base))
-    fields = _restricting(selection)
-    return all(getattr(task, COLUMNS[field]) in getattr(selection, field) for field in fields) and (
-        named or not selection.tasks
-    )
+    if any(getattr(task, COLUMNS[field]) not in getattr(selection, field) for field in _restricting(selection)):
+        return False
+    names = (task.name, task.base)
+    return not selection.tasks or any(fnmatch.filter(names, pattern) for pattern in selection.tasks)
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
