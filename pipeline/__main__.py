@@ -24,11 +24,17 @@ from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.publish import attribution
 from pipeline.rewriting.language_model import LanguageModel
 from pipeline.rewriting.rewrite import extend
+from pipeline.run import manifest
 from pipeline.run.stage import owned
 from pipeline.testset import benchmark
 from pipeline.validation import doctor
 
 SCHEMAS = Path(__file__).parent.parent / "schemas"
+
+
+def schemas() -> dict[str, dict[str, Any]]:
+    """The files of ``schemas/`` that are written from the code."""
+    return {"config.schema.json": config_schema(), "manifest.json": manifest.described()}
 
 
 def config_schema() -> dict[str, Any]:
@@ -160,10 +166,10 @@ def _push(arguments: argparse.Namespace) -> int:
 
 
 def _schema(arguments: argparse.Namespace) -> int:
-    file = SCHEMAS / "config.schema.json"
-    with replaced(file) as temporary:
-        temporary.write_text(json.dumps(config_schema(), indent=2) + "\n")
-    print(f"wrote {file}")
+    for name, content in schemas().items():
+        with replaced(SCHEMAS / name) as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n")
+        print(f"wrote {SCHEMAS / name}")
     return 0
 
 
@@ -355,7 +361,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--endpoint", metavar="URL", help="address of the hub, when not the usual one")
     command.set_defaults(run=_push)
 
-    command = commands.add_parser("schema", help="write schemas/config.schema.json from the code")
+    command = commands.add_parser("schema", help="write the files of schemas/ that follow from the code")
     command.set_defaults(run=_schema)
     return top
 

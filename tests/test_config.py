@@ -12,7 +12,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
-from pipeline.__main__ import config_schema
+from pipeline.__main__ import config_schema, schemas
 from pipeline.config import load
 from pipeline.errors import PipelineError
 
@@ -36,9 +36,10 @@ def test_every_config_is_valid_and_named_after_its_file(file: Path) -> None:
     jsonschema.validate(yaml.safe_load(file.read_text()), config_schema())
 
 
-def test_schema_file_is_that_of_the_code() -> None:
-    stored = json.loads((REPOSITORY / "schemas" / "config.schema.json").read_text())
-    assert stored == config_schema(), "run: python -m pipeline schema"
+@pytest.mark.parametrize("name", ["config.schema.json", "manifest.json"])
+def test_schema_file_is_that_of_the_code(name: str) -> None:
+    stored = json.loads((REPOSITORY / "schemas" / name).read_text())
+    assert stored == schemas()[name], "run: python -m pipeline schema"
 
 
 @pytest.mark.parametrize(

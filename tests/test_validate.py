@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Callable, Mapping
 from contextlib import chdir
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -249,7 +250,7 @@ def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory])
 
     def found(sign: float) -> list[Fault]:
         commanded = action * np.array([1, 1, 1, 1, 1, 1, sign], np.float32)
-        copy = Copy("rlds", {"action": commanded, "state": state, "joint_state": joints}, [], {}, {}, {}, {}, {})
+        copy = Copy("rlds", replace(made, action=commanded), [], {}, {}, {})
         return list(CHECKS["gripper"](Case({}, made, trajectory, [copy], None)))
 
     assert found(1.0) == []

@@ -182,8 +182,3 @@ class Format(ABC, Generic[Options]):
             repository: of the dataset on the hub.
             kept: the manifest's rows of its episodes.
         """
-
-
-def column(name: str, values: pa.DataType, meaning: str) -> pa.Field:
-    """A column of the manifest."""
-    return pa.field(name, values, metadata={"meaning": meaning})

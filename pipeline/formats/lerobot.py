@@ -11,9 +11,10 @@ import pyarrow as pa
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig
-from pipeline.formats.base import Format, Row, column
+from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load
 from pipeline.formats.read_back import Copy, Fault
+from pipeline.tables import column
 
 
 class LeRobot(Format[LeRobotConfig]):

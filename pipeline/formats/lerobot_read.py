@@ -22,13 +22,13 @@ import torchvision
 from datasets.exceptions import DatasetsError
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
+from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import INSTANCES, OBJECT_POSES, camera_column, geometry_columns
 from pipeline.formats.lerobot_write import local_only, temporarily
 from pipeline.formats.read_back import Copy, Fault, sampled
-from pipeline.types import Extra, Geometry
+from pipeline.types import Episode, Extra, Geometry
 
 UNREADABLE = (
     AssertionError,
@@ -43,7 +43,6 @@ UNREADABLE = (
 )
 """What lerobot raises on files that are damaged, missing or do not belong together."""
 
-VECTORS = ("action", "state", "joint_state")
 MARKS = ("frame_index", "timestamp")
 """LeRobot's columns that tell steps apart."""
 
@@ -160,7 +159,7 @@ _TORCHVISION = SimpleNamespace(io=SimpleNamespace(VideoReader=_video), set_video
 @lru_cache(maxsize=1)
 def _steps(data: LeRobotDataset, extras: tuple[Extra, ...]) -> datasets.Dataset:
     """The rows of all steps, without the images where they are not videos."""
-    vectors = [getattr(SCHEMA, name).lerobot_key for name in VECTORS]
+    vectors = [getattr(SCHEMA, name).lerobot_key for name in MOTION]
     plain = [*vectors, "episode_index", "task_index", *MARKS, *geometry_columns(extras)]
     return data.hf_dataset.select_columns(plain).with_format("numpy")
 
@@ -174,24 +173,31 @@ def _copy(opened: LeRobotSet, episode_id: str, extras: tuple[Extra, ...]) -> Cop
     table = _steps(data, extras)[start:stop]
     if set(table["episode_index"].tolist()) != {index} or len(table["action"]) != rows["length"]:
         raise ValueError(f"rows {start} to {stop} are not the {rows['length']} steps of episode {index}")
-    frames = {}
+    decoded = {}
     for step in sampled(stop - start):
         item = data[start + step]
         for view, spec in SCHEMA.views.items():
             # lerobot hands out floats in [0, 1], channels first.
             pixels = np.rint(item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255)
-            frames[view, step] = np.ascontiguousarray(pixels, np.uint8)
-    return Copy(
-        dataset="lerobot",
-        motion={name: table[getattr(SCHEMA, name).lerobot_key] for name in VECTORS},
-        instructions=[str(data.meta.tasks.iloc[task].name) for task in table["task_index"].tolist()],
+            decoded[view, step] = np.ascontiguousarray(pixels, np.uint8)
+    instructions = [str(data.meta.tasks.iloc[task].name) for task in table["task_index"].tolist()]
+    episode = Episode(
+        episode_id=episode_id,
+        frames={},
+        **{name: table[getattr(SCHEMA, name).lerobot_key] for name in MOTION},
+        instruction=instructions[0],
         provenance=provenance,
-        frames=frames,
-        marks={name: table[name] for name in MARKS},
-        place={"lerobot_episode_index": index},
         geometry={view: _geometry(table, view, extras) for view in SCHEMA.views},
         object_poses=table[OBJECT_POSES].reshape(-1, *SCHEMA.object_poses.shape) if OBJECT_POSES in table else None,
         instances=json.loads(_constant(table, INSTANCES)) if named(extras) else (),
+    )
+    return Copy(
+        dataset="lerobot",
+        episode=episode,
+        instructions=instructions,
+        decoded=decoded,
+        marks={name: table[name] for name in MARKS},
+        place={"lerobot_episode_index": index},
     )
 
 

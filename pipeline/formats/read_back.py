@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from pipeline.files import checksum
-from pipeline.types import Frame, Geometry
+from pipeline.types import Episode, Frame
 
 
 @dataclass(frozen=True)
@@ -36,32 +36,23 @@ class Copy:
 
     Attributes:
         dataset: the format's name.
-        motion: ``action``, ``state`` and ``joint_state``, each (T, D).
+        episode: the record that its writer was given, as far as the dataset has it: of whatever shapes and types stand
+            there, with the instruction of the first step, and without frames where they are no image files.
         instructions: one for each step.
-        provenance: the columns of ``schemas/episode.json``.
-        frames: (view, step) to the decoded frame, for ``sampled`` steps.
+        decoded: (view, step) to the frame, for ``sampled`` steps.
         marks: what else stands at each step, by the dataset's own names, each (T,).
         place: where it lies, by the format's columns of the manifest.
-        geometry: view to where it is seen from.
-        object_poses: (T, 24, 7), None where the dataset has none.
-        instances: names of the things that segmentation and poses number.
-        encoded: view to the image file of every step; None where frames are stored otherwise.
     """
 
     dataset: str
-    motion: Mapping[str, NDArray[Any]]
+    episode: Episode
     instructions: Sequence[str]
-    provenance: Mapping[str, str]
-    frames: Mapping[tuple[str, int], Frame]
+    decoded: Mapping[tuple[str, int], Frame]
     marks: Mapping[str, NDArray[Any]]
     place: Mapping[str, Any]
-    geometry: Mapping[str, Geometry]
-    object_poses: NDArray[Any] | None = None
-    instances: Sequence[str] = ()
-    encoded: Mapping[str, Sequence[bytes]] | None = None
 
     def __len__(self) -> int:
-        return len(self.motion["action"])
+        return len(self.episode)
 
 
 @dataclass(frozen=True)

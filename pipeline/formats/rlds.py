@@ -10,10 +10,11 @@ import pyarrow as pa
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import RldsConfig
-from pipeline.formats.base import Format, Row, column
+from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, by_suite, dataset_of, shard_path
+from pipeline.tables import column
 
 
 class Rlds(Format[RldsConfig]):

@@ -18,7 +18,7 @@ from pipeline.formats.rlds_layout import VERSION, dataset_of
 from pipeline.formats.rlds_write import features
 from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans
 from pipeline.images.jpeg import decode
-from pipeline.types import Extra, Geometry
+from pipeline.types import Episode, Extra, Geometry
 
 MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")
 """Columns that tell steps apart."""
@@ -122,20 +122,25 @@ def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) ->
 
 def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> Copy:
     shard, index = place
-    return Copy(
-        dataset="rlds",
-        motion={"action": steps["action"]} | {name: steps[f"observation/{name}"] for name in ("state", "joint_state")},
-        instructions=[text.decode() for text in steps["language_instruction"]],
+    instructions = [text.decode() for text in steps["language_instruction"]]
+    frames = {view: steps[f"observation/{view}"].tolist() for view in SCHEMA.views}
+    episode = Episode(
+        episode_id=_id(steps),
+        frames=frames,
+        state=steps["observation/state"],
+        joint_state=steps["observation/joint_state"],
+        action=steps["action"],
+        instruction=instructions[0],
         provenance={name: steps[METADATA + name][0].decode() for name in SCHEMA.provenance},
-        frames={
-            (view, step): decode(steps[f"observation/{view}"][step])
-            for view in SCHEMA.views
-            for step in sampled(len(steps["action"]))
-        },
-        marks={name: steps[name] for name in MARKS},
-        place={"rlds_shard": shard.name, "rlds_index": index},
         geometry={view: _geometry(steps, view, extras) for view in SCHEMA.views},
         object_poses=steps["observation/object_poses"] if "object_poses" in extras else None,
         instances=json.loads(steps[f"{METADATA}instances"][0]) if named(extras) else (),
-        encoded={view: steps[f"observation/{view}"].tolist() for view in SCHEMA.views},
+    )
+    return Copy(
+        dataset="rlds",
+        episode=episode,
+        instructions=instructions,
+        decoded={(view, step): decode(frames[view][step]) for view in frames for step in sampled(len(episode))},
+        marks={name: steps[name] for name in MARKS},
+        place={"rlds_shard": shard.name, "rlds_index": index},
     )

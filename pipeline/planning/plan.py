@@ -9,6 +9,7 @@ from functools import lru_cache
 from itertools import count
 from math import ceil
 from pathlib import Path
+from typing import Annotated
 
 import pyarrow as pa
 
@@ -34,42 +35,28 @@ _ATTEMPTS = 100
 
 @dataclass(frozen=True)
 class Row:
-    """One candidate episode.
+    """One candidate episode: the columns of the plan, which are the first of the manifest's, with what they mean."""
 
-    Attributes:
-        episode_id: hash of the demonstration, the perturbations and the way it is replayed.
-        twin_id: the episode of the same demonstration without perturbations (its own id for a twin).
-        trajectory_id: the physics it is rendered from; episodes that differ in render, pixels or text share it.
-        role: ``twin`` or ``perturbed``.
-        axis, component: what is perturbed, several joined by +; ``clean`` for a twin.
-        level: how strongly, 1 to 5, several joined by + in the order of ``component``; ``0`` for a twin.
-        perturbations: canonical JSON with every parameter.
-        instruction: the text the policy is prompted with.
-        rank: place among the candidates of its (axis, task).
-        wanted: False for a reserve, used only where a candidate before it fails.
-        seed, variant: with axis and demonstration, the key that the parameters were drawn under.
-    """
-
-    episode_id: str
-    twin_id: str
-    trajectory_id: str
-    role: str
-    suite: str
-    task: str
-    demo_id: str
-    demo_sha256: str
-    demo_source: str
-    demo_origin: str
-    demo_steps: int
-    axis: str
-    component: str
-    level: str
-    perturbations: str
-    instruction: str
-    rank: int
-    wanted: bool
-    seed: int
-    variant: int
+    episode_id: Annotated[str, "hash of demonstration, perturbations and replay settings; joins RLDS, LeRobot and this"]
+    twin_id: Annotated[str, "episode of the same demonstration without perturbations; a twin's own id"]
+    trajectory_id: Annotated[str, "the physics rendered; shared by episodes that differ in render, pixels or text"]
+    role: Annotated[str, "twin or perturbed"]
+    suite: Annotated[str, "LIBERO suite"]
+    task: Annotated[str, "LIBERO task name"]
+    demo_id: Annotated[str, "suite/task/key of the source demonstration"]
+    demo_sha256: Annotated[str, "hash of the recorded content of the source demonstration"]
+    demo_source: Annotated[str, "where the demonstration was published"]
+    demo_origin: Annotated[str, "human, or expanded: made from a human demonstration by `demos expand`"]
+    demo_steps: Annotated[int, "recorded actions, no-ops included"]
+    axis: Annotated[str, "perturbed axis, several joined by +, or clean"]
+    component: Annotated[str, "component of the axis, several joined by +, or clean"]
+    level: Annotated[str, "strength, 1 to 5, several joined by + in the order of component; 0 for a twin"]
+    perturbations: Annotated[str, "JSON list with every parameter, deepest layer first"]
+    instruction: Annotated[str, "the text that the policy is prompted with"]
+    rank: Annotated[int, "place among the candidates of its axis and task"]
+    wanted: Annotated[bool, "false for a reserve, used only where a candidate before it fails"]
+    seed: Annotated[int, "the run's seed; with axis, demo_id and variant the key of the draw"]
+    variant: Annotated[int, "how many draws of this axis this demonstration had before"]
 
 
 def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, test: TestSet) -> list[Row]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -17,19 +16,37 @@ from rich.table import Table
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.files import schema_file
-from pipeline.identity import versions
+from pipeline.identity import VERSIONS, versions
+from pipeline.planning import plan
 from pipeline.run.outcome import Outcome
-from pipeline.tables import read_table, write_table
-
-SCHEMA_FILE = schema_file("manifest.json")
-"""Column names, types and meanings."""
+from pipeline.tables import column, columns_of, read_table, write_table
 
 OWN_VERSION = "pipeline_version"
 """The column for the version of this project, which is information: what is current, recipe numbers decide."""
 
-_TYPES = {"string": pa.string(), "int": pa.int64(), "bool": pa.bool_()}
 _SETTINGS = b"settings"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a planned episode: the columns after those of the plan, with what they mean."""
+
+    kept: Annotated[bool, "in the datasets"]
+    reason: Annotated[
+        str,
+        "kept, or why not: goal_not_reached, goal_lost, too_short, simulation_unstable, too_dark, blown_out, what a "
+        "physics perturbation was refused for, not_replayed, reserve_not_needed",
+    ]
+    replay_mode: Annotated[
+        str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"
+    ]
+    steps: Annotated[int | None, "executed actions (episode length), null when not replayed"]
+    resolved: Annotated[
+        str | None,
+        "JSON of what physics perturbations came to in the scene, by axis, or under fault why the demonstration could "
+        "not be simulated; null when not replayed",
+    ]
+    gl_device: Annotated[str | None, "what rendered the frames, as OpenGL names it; null when not rendered"]
 
 
 class Settings(Frozen):
@@ -62,15 +79,15 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
         verdict = run.verdicts[row.episode_id]
         replayed = run.trajectories.get(row.trajectory_id, {})
         rendered = run.frames.get(row.trajectory_id)
-        results: dict[str, Any] = {
-            "kept": verdict.kept,
-            "reason": verdict.reason,
-            "replay_mode": replayed.get("mode"),
-            "steps": replayed.get("steps"),
-            "resolved": replayed.get("resolved"),
-            "gl_device": rendered and rendered.device,
-        }
-        table.append({**asdict(row), **results, **places.get(row.episode_id, {}), **shared})
+        result = Result(
+            kept=verdict.kept,
+            reason=verdict.reason,
+            replay_mode=replayed.get("mode"),
+            steps=replayed.get("steps"),
+            resolved=replayed.get("resolved"),
+            gl_device=rendered.device if rendered else None,
+        )
+        table.append({**asdict(row), **asdict(result), **places.get(row.episode_id, {}), **shared})
     return pa.Table.from_pylist(table, schema=schema(columns))
 
 
@@ -80,11 +97,20 @@ def version_column(name: str) -> str:
 
 
 def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
-    """The manifest's columns, from ``schemas/manifest.json``, and before the versions those of the output formats."""
-    columns = json.loads(SCHEMA_FILE.read_text())["columns"]
-    fields = [pa.field(c["name"], _TYPES[c["type"]], metadata={"meaning": c["meaning"]}) for c in columns]
-    versions_from = next(k for k, field in enumerate(fields) if field.name.endswith("_version"))
-    return pa.schema([*fields[:versions_from], *places, *fields[versions_from:]])
+    """The manifest's columns: of the plan, of its result, where an episode lies in each dataset, and the versions."""
+    made_by = [column(version_column(name), pa.string(), meaning) for name, meaning in VERSIONS.items()]
+    return pa.schema([*columns_of(plan.Row), *columns_of(Result), *places, *made_by])
+
+
+def described() -> dict[str, Any]:
+    """``schemas/manifest.json``, for readers: every column but those of ``columns`` in ``pipeline/formats``."""
+    return {
+        "places": f"where an episode lies in each dataset stands before {OWN_VERSION}: `columns` in pipeline/formats/",
+        "columns": [
+            {"name": each.name, "type": str(each.type), "meaning": each.metadata[b"meaning"].decode()}
+            for each in schema()
+        ],
+    }
 
 
 def write(table: pa.Table, path: Path, settings: Settings) -> None:
@@ -163,8 +189,8 @@ def counts_table(manifest: Sequence[Mapping[str, Any]]) -> Table:
     table = Table(
         "axis", *(suite.removeprefix("libero_") for suite in suites), "all", title="planned/replayed/kept episodes"
     )
-    for column in table.columns[1:]:
-        column.justify, column.no_wrap = "right", True
+    for cells_of in table.columns[1:]:
+        cells_of.justify, cells_of.no_wrap = "right", True
     for axis, by_suite in cells.items():
         shown = [by_suite.get(suite, {}) for suite in suites]
         # A combination's name may break behind a +.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
-from pipeline.episode_schema import MATRICES, SCHEMA
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.images.jpeg import decode
 from pipeline.libero.tasks import find_task
@@ -64,7 +64,7 @@ class Case:
         return [
             copy
             for copy in self.copies
-            if all(values.shape == getattr(self.made, name).shape for name, values in copy.motion.items())
+            if all(getattr(copy.episode, name).shape == getattr(self.made, name).shape for name in MOTION)
         ]
 
     def finding(self, dataset: str, what: str, expected: object) -> Fault:
@@ -97,8 +97,8 @@ def motion(case: Case) -> Iterator[Fault]:
         yield case.finding("frames", "has other actions", "those that the replay executed")
     for copy in case.copies:
         # Of another length, nothing can be compared.
-        for name, found in copy.motion.items() if len(copy) == len(case.made) else ():
-            made = getattr(case.made, name)
+        for name in MOTION if len(copy) == len(case.made) else ():
+            found, made = getattr(copy.episode, name), getattr(case.made, name)
             if (found.shape, found.dtype) != (made.shape, made.dtype):
                 what, expected = f"{found.shape} of {found.dtype}", f"{made.shape} of {made.dtype}"
                 yield case.finding(copy.dataset, f"{name} is {what}", expected)
@@ -134,7 +134,7 @@ def provenance(case: Case) -> Iterator[Fault]:
     """The manifest's provenance, but for this project's version: a manifest is made anew where a dataset stays."""
     for copy in case.copies:
         for column in SCHEMA.provenance:
-            found, expected = copy.provenance.get(column), str(case.row[column])
+            found, expected = copy.episode.provenance.get(column), str(case.row[column])
             if found != expected and column != OWN_VERSION:
                 yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
 
@@ -150,7 +150,7 @@ def place(case: Case) -> Iterator[Fault]:
 def jpeg(case: Case) -> Iterator[Fault]:
     """The very bytes of every stored frame, where a dataset has image files."""
     for copy in case.copies:
-        for view, files in (copy.encoded or {}).items():
+        for view, files in copy.episode.frames.items():
             pairs = zip(files, case.made.frames[view], strict=False)
             if wrong := [step for step, (one, other) in enumerate(pairs) if one != other]:
                 what = f"{view} differs at {len(wrong)} steps, first at {wrong[0]}"
@@ -162,26 +162,26 @@ def geometry(case: Case) -> Iterator[Fault]:
     for copy in case.whole:
         for view, made in case.made.geometry.items():
             for name in MATRICES:
-                found, expected = getattr(copy.geometry[view], name), getattr(made, name)
+                found, expected = getattr(copy.episode.geometry[view], name), getattr(made, name)
                 if found.dtype != expected.dtype or not np.array_equal(found, expected):
                     yield case.finding(copy.dataset, f"{view}_{name} is {found.tolist()}", expected.tolist())
             for name, files in made.maps.items():
-                if list(copy.geometry[view].maps[name]) != list(files):
+                if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
         found, expected = (
-            None if poses is None else poses.tobytes() for poses in (copy.object_poses, case.made.object_poses)
+            None if poses is None else poses.tobytes() for poses in (copy.episode.object_poses, case.made.object_poses)
         )
         if found != expected:
             yield case.finding(copy.dataset, "object_poses differ", "the stored ones")
-        if list(copy.instances) != list(case.made.instances):
-            yield case.finding(copy.dataset, f"instances {list(copy.instances)}", list(case.made.instances))
+        if list(copy.episode.instances) != list(case.made.instances):
+            yield case.finding(copy.dataset, f"instances {list(copy.episode.instances)}", list(case.made.instances))
 
 
 def video(case: Case) -> Iterator[Fault]:
     """Frames within ``VIDEO_PSNR_DB`` of the stored ones, where a dataset has others than those image files."""
     for copy, view, step, shown in _shown(case):
-        reached = grey_psnr_db(copy.frames[view, step], shown[view])
-        if copy.encoded is None and reached < VIDEO_PSNR_DB:
+        reached = grey_psnr_db(copy.decoded[view, step], shown[view])
+        if not copy.episode.frames and reached < VIDEO_PSNR_DB:
             yield case.finding(copy.dataset, f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} or more")
 
 
@@ -189,7 +189,7 @@ def cameras(case: Case) -> Iterator[Fault]:
     """No view that shows what another camera saw."""
     for copy, view, step, shown in _shown(case):
         for other in shown.keys() - {view}:
-            if grey_psnr_db(copy.frames[view, step], shown[other]) > VIDEO_PSNR_DB:
+            if grey_psnr_db(copy.decoded[view, step], shown[other]) > VIDEO_PSNR_DB:
                 yield case.finding(copy.dataset, f"{view} of step {step} shows {other}", "its own camera")
 
 
@@ -197,7 +197,7 @@ def alive(case: Case) -> Iterator[Fault]:
     """No view that shows nothing, or the same all along."""
     for copy in case.whole:
         for view in SCHEMA.views:
-            frames = [copy.frames[view, step].astype(np.int16) for step in sampled(len(copy))]
+            frames = [copy.decoded[view, step].astype(np.int16) for step in sampled(len(copy))]
             if min(frame.std() for frame in frames) < BLANK_LEVELS:
                 yield case.finding(copy.dataset, f"{view} has a blank frame", f"more than {BLANK_LEVELS} grey levels")
             elif max(np.abs(frame - frames[0]).mean() for frame in frames) < STILL_LEVELS:
@@ -208,7 +208,7 @@ def gripper(case: Case) -> Iterator[Fault]:
     """Commands of -1 and +1, and fingers that part on the one and close on the other."""
     told = SCHEMA.action.gripper
     for copy in case.whole:
-        command, state = copy.motion["action"][:, 6], copy.motion["state"]
+        command, state = copy.episode.action[:, 6], copy.episode.state
         if other := set(np.unique(command).tolist()) - {told.open, told.close}:
             yield case.finding(copy.dataset, f"gripper command {min(other)}", f"{told.open} or {told.close}")
         gap = state[:, 6] - state[:, 7]
