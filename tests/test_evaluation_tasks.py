@@ -94,6 +94,13 @@ def test_instructions_are_clean_or_the_benchmarks() -> None:
     assert told("language", "libero_goal", "clean") == told("language", "libero_goal", "benchmark")
 
 
+def test_a_test_task_that_a_suite_does_not_have_is_refused() -> None:
+    (test, *_) = (test for (suite, _), test in libero_plus.by_name().items() if suite == "libero_goal")
+    assert libero_plus.find("libero_goal", test.name) is test
+    with pytest.raises(PipelineError, match="libero_10: LIBERO-Plus has no test task"):
+        libero_plus.find("libero_10", test.name)
+
+
 def test_postures_are_the_benchmarks_tables() -> None:
     postures = libero_plus.postures_rad()
     listed = np.array([postures[number] for number in range(1, 501)])
