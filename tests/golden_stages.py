@@ -15,9 +15,9 @@ from conftest import STOVE
 from synthetic import IDS, episode, files, write_lerobot, write_rlds
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import Settings, Wanted
-from pipeline.evaluation.tasks import Selection, select
 from pipeline.formats.read_back import Copy, sampled
 from pipeline.images.jpeg import decode
 from pipeline.publish import figures
