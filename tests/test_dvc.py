@@ -24,21 +24,21 @@ def sections(stage: str) -> set[str]:
     return {section for entry in STAGES[stage].get("params", []) for section in entry["configs/${run}.yaml"]}
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_what_a_stage_depends_on_is_there_or_made_by_one_stage_before_it(stage: str) -> None:
-    before = list(STAGES)[: list(STAGES).index(stage)]
+@pytest.mark.parametrize("name", STAGES)
+def test_what_a_stage_depends_on_is_there_or_made_by_one_stage_before_it(name: str) -> None:
+    before = list(STAGES)[: list(STAGES).index(name)]
     made = [output for earlier in before for output in outputs(earlier)]
-    for needed in STAGES[stage]["deps"]:
+    for needed in STAGES[name]["deps"]:
         if needed.startswith(DATA):
-            assert made.count(needed) == 1, f"{needed} of {stage}"
+            assert made.count(needed) == 1, f"{needed} of {name}"
         else:
-            assert (REPOSITORY / needed).exists(), f"{needed} of {stage}"
+            assert (REPOSITORY / needed).exists(), f"{needed} of {name}"
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_calls_its_script_and_depends_on_it_and_on_the_library(stage: str) -> None:
-    assert STAGES[stage]["cmd"] == f"python stages/{stage}.py configs/${{run}}.yaml"
-    assert {f"stages/{stage}.py", "pipeline"} <= set(STAGES[stage]["deps"])
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_calls_its_script_and_depends_on_it_and_on_the_library(name: str) -> None:
+    assert STAGES[name]["cmd"] == f"python stages/{name}.py configs/${{run}}.yaml"
+    assert {f"stages/{name}.py", "pipeline"} <= set(STAGES[name]["deps"])
 
 
 def test_every_script_has_a_stage_and_no_output_lies_in_another() -> None:
