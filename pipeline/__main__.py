@@ -15,8 +15,7 @@ from pipeline.arguments import positive
 from pipeline.axes import Axes
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
-from pipeline.evaluation import analyses
-from pipeline.evaluation import command as evaluation_command
+from pipeline.evaluation import commands as evaluation_commands
 from pipeline.exit_status import exit_status
 from pipeline.files import replaced
 from pipeline.formats.registry import FORMATS, formats_of
@@ -101,7 +100,7 @@ def _expand(arguments: argparse.Namespace) -> int:
 
 def _evaluation_report(arguments: argparse.Namespace) -> int:
     # The benchmark's code takes seconds to import, which the other commands can do without.
-    from pipeline.evaluation.merging import read
+    from pipeline.evaluation.results import read
     from pipeline.publish import evaluation_report
 
     print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
@@ -280,8 +279,7 @@ def parser() -> argparse.ArgumentParser:
     command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
     command.set_defaults(run=_expand)
 
-    evaluation_command.add_commands(commands)
-    analyses.add_commands(commands)
+    evaluation_commands.add_commands(commands)
 
     command = commands.add_parser(
         "evaluation-report",
