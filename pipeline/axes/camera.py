@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, RenderPerturbation, draw
+from pipeline.rotations import about, product, rotate
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -67,18 +68,16 @@ class CameraPerturbation(RenderPerturbation):
         "and the logarithm of the distance ratio (5 degrees: 1.091)"
     )
 
-    def pose(
-        self, pos_m: NDArray[np.float64], quat_wxyz: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pose(self, pos_m: Floats, quat_wxyz: Floats) -> tuple[Floats, Floats]:
         """The perturbed pose of a camera whose nominal world pose is ``pos_m`` (3,), ``quat_wxyz`` (4,)."""
-        lift = _about("y", -self.elevation_deg)
-        turn = _about("z", self.azimuth_deg)
-        pos = _rotate(lift, pos_m - ORBIT_CENTRE_M) + ORBIT_CENTRE_M
-        pos = _rotate(turn, pos)
+        lift = about("y", -self.elevation_deg)
+        turn = about("z", self.azimuth_deg)
+        pos = rotate(lift, pos_m - ORBIT_CENTRE_M) + ORBIT_CENTRE_M
+        pos = rotate(turn, pos)
         pos = ORBIT_CENTRE_M + self.distance_scale * (pos - ORBIT_CENTRE_M)
         quat = quat_wxyz
-        for step in (lift, turn, _about("z", self.yaw_deg), _about("y", -self.pitch_deg)):
-            quat = _product(step, quat)
+        for step in (lift, turn, about("z", self.yaw_deg), about("y", -self.pitch_deg)):
+            quat = product(step, quat)
         return pos, quat
 
     def apply(self, model: mujoco.MjModel) -> None:
@@ -274,22 +273,3 @@ class CameraAxis(Axis):
         asides = ASIDES[component]
         drawn |= self.aside.draw(rng, asides[rng.integers(len(asides))])
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
-
-
-def _about(axis: Literal["y", "z"], angle_deg: float) -> NDArray[np.float64]:
-    """Unit quaternion (w, x, y, z) of a right-handed rotation about a world axis."""
-    half = np.deg2rad(angle_deg) / 2
-    w, s = np.cos(half), np.sin(half)
-    return np.array([w, 0.0, s, 0.0] if axis == "y" else [w, 0.0, 0.0, s])
-
-
-def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Hamilton product of two quaternions (w, x, y, z): the rotation ``b`` followed by ``a``."""
-    scalar = a[0] * b[0] - a[1:] @ b[1:]
-    return np.concatenate([[scalar], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
-
-
-def _rotate(quat: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``vector`` (3,) turned by the unit quaternion ``quat`` (w, x, y, z)."""
-    turned: NDArray[np.float64] = vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector)
-    return turned
