@@ -64,8 +64,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
         compiled = CompiledScene(scene)
         data, model = compiled.data, compiled.model
-        robot = compiled.part("robot0_base")
-        before = compiled.touching(robot).keys()
+        before = compiled.touching().keys()
         joints = [model.joint(f"robot0_joint{n}") for n in range(1, 8)]
         arm = [joint.qposadr[0] for joint in joints]
         drawn = self.component == "controller_posture" and scene.posture_rad is not None
@@ -83,7 +82,7 @@ class RobotPerturbation(PhysicsPerturbation):
             hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
             drawn_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
             return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": drawn_to})
-        if compiled.touching(robot).keys() - before:
+        if compiled.touching().keys() - before:
             raise RefusedError("robot_in_collision")
         resolved = {**scene.resolved, "robot": {"joints_rad": posture.tolist()}}
         return replace(scene, state=state, posture_rad=None, resolved=resolved)

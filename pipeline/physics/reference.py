@@ -158,11 +158,9 @@ def _within(half_m: Floats, region: Floats, pose: Floats) -> bool:
 
 def _partners(compiled: CompiledScene) -> dict[int, set[int]]:
     """Root body to the root bodies that it touches."""
-    model = compiled.model
     partners: dict[int, set[int]] = {}
-    for contact in compiled.data.contact:
-        one, other = (int(model.body_rootid[model.geom_bodyid[geom]]) for geom in contact.geom)
-        if contact.dist <= 0 and one != other:
-            partners.setdefault(one, set()).add(other)
-            partners.setdefault(other, set()).add(one)
+    for pair in compiled.touching():
+        one, other = compiled.model.body_rootid[[*pair]].tolist()
+        partners.setdefault(one, set()).add(other)
+        partners.setdefault(other, set()).add(one)
     return partners
