@@ -142,7 +142,6 @@ class Trajectory:
         scene: where it started, before the arm and the objects settled; asset paths of this machine.
         states: (K+1, S) flattened states: before each executed action, and after the last. The first is the first look.
         actions: (K, 7) executed actions.
-        kept_mask: (T,) which of the demonstration's actions were executed.
         site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
         verdict: the judge's word after the last action.
     """
@@ -152,7 +151,6 @@ class Trajectory:
     scene: Scene
     states: Floats
     actions: Floats
-    kept_mask: NDArray[np.bool_]
     site_alpha: NDArray[np.float32]
     verdict: Verdict
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
@@ -43,12 +42,11 @@ def replay(
         reference: gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
             ``tracked``; the result says how its actions came about.
     """
-    mask = kept_actions(demo.actions, config.noops)
     try:
         scene, refused = _perturbed(environment, demo, config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
-        return _not_simulated(demo, trajectory_id, error, mask)
+        return _not_simulated(demo, trajectory_id, error)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         environment.restore(scene)
@@ -72,14 +70,13 @@ def replay(
             scene=scene,
             states=np.stack(states),
             actions=np.array(actions).reshape(-1, 7),
-            kept_mask=mask,
             site_alpha=np.stack(alphas),
             verdict=refusal or verdict(np.stack(states), np.array(succeeded, bool)),
         )
 
     followed = reference() if config.mode == "tracked" else None
     if followed is None:
-        opened = rollout("open_loop", lambda: iter(demo.actions[mask]))
+        opened = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
         if config.mode == "open_loop" or opened.verdict.kept or refused:
             return opened
         followed = reference()
@@ -114,14 +111,13 @@ def _perturbed(
     return scene, None
 
 
-def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError, mask: NDArray[np.bool_]) -> Trajectory:
+def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError) -> Trajectory:
     return Trajectory(
         trajectory_id=trajectory_id,
         mode="open_loop",
         scene=Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)}),
         states=demo.init_state[None],
         actions=np.empty((0, 7)),
-        kept_mask=mask,
         site_alpha=np.empty((1, 0), np.float32),
         verdict=Verdict(False, error.reason),
     )
