@@ -102,7 +102,7 @@ def check_names(selection: Selection) -> None:
         )
     offered: dict[str, Collection[object]] = {
         "libero": {"clean"},
-        "libero_plus": {axis for axis, _ in benchmark.COUNTS},
+        "libero_plus": benchmark.AXES,
         "own": OWN_AXES,
         "goals": {"goal"},
         "pairs": OWN_AXES,
