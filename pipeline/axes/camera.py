@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, RenderPerturbation, draw
+from pipeline.axes.base import Axis, ByLevel, Degrees, Frozen, Intervals, RenderPerturbation, draw, pick, point
 from pipeline.rotations import about, product, rotate
 from pipeline.types import Floats, Task
 
@@ -141,8 +141,6 @@ def _positive(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, 
 Scales = Annotated[Intervals[Annotated[float, Field(le=10.0)]], AfterValidator(_positive)]
 
 Angles = Intervals[Degrees]
-ByLevel = tuple[Angles, Angles, Angles, Angles, Angles]
-"""What to draw from at each level, weakest first."""
 
 
 def _both_ways(low: float, high: float) -> Angles:
@@ -152,7 +150,7 @@ def _both_ways(low: float, high: float) -> Angles:
 class DistanceRange(Frozen):
     """The test set's scales are 1.15 and 1.19 to 2.00."""
 
-    distance_scale: tuple[Scales, Scales, Scales, Scales, Scales] = (
+    distance_scale: ByLevel[Scales] = (
         ((1.08, 1.2),),
         ((1.2, 1.4),),
         ((1.4, 1.6),),
@@ -164,7 +162,7 @@ class DistanceRange(Frozen):
 class SphericalRange(Frozen):
     """The test set's azimuths are whole degrees in [-75, 75], its elevations 0 and 15. The level is the azimuth's."""
 
-    azimuth_deg: ByLevel = (
+    azimuth_deg: ByLevel[Angles] = (
         ((-15.0, 15.0),),
         _both_ways(15.0, 30.0),
         _both_ways(30.0, 45.0),
@@ -181,7 +179,7 @@ class OrientationRange(Frozen):
         turn_deg: yaw or pitch, each as often as the other; the other one is at most as large, either way.
     """
 
-    turn_deg: ByLevel = (
+    turn_deg: ByLevel[Angles] = (
         _both_ways(1.0, 3.0),
         _both_ways(3.0, 5.0),
         _both_ways(5.0, 7.0),
@@ -217,11 +215,8 @@ class AsideRange(Frozen):
             case "distance":
                 return {"distance_scale": draw(rng, self.distance_scale)}
             case "turn":
-                turn_deg, towards = draw(rng, self.turn_deg), rng.uniform(-np.pi, np.pi)
-                return {
-                    "yaw_deg": round(turn_deg * float(np.cos(towards)), 4),
-                    "pitch_deg": round(turn_deg * float(np.sin(towards)), 4),
-                }
+                yaw_deg, pitch_deg = point(rng, draw(rng, self.turn_deg))
+                return {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg}
 
 
 ASIDES: dict[Component, tuple[Aside, ...]] = {
@@ -251,8 +246,9 @@ class CameraAxis(Axis):
         return self
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        choices = [choice for choice in (self.distance, self.spherical, self.orientation) if choice is not None]
-        chosen = choices[rng.integers(len(choices))]
+        chosen = pick(
+            rng, [range_ for range_ in (self.distance, self.spherical, self.orientation) if range_ is not None]
+        )
         level = self.draw_level(rng)
         component: Component
         match chosen:
@@ -270,6 +266,5 @@ class CameraAxis(Axis):
                 large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
                 turn_deg = draw(rng, chosen.turn_deg[level - 1])
                 drawn = {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
-        asides = ASIDES[component]
-        drawn |= self.aside.draw(rng, asides[rng.integers(len(asides))])
+        drawn |= self.aside.draw(rng, pick(rng, ASIDES[component]))
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, PhysicsPerturbation, on_task
+from pipeline.axes.base import Axis, PhysicsPerturbation, on_task, pick, point
 from pipeline.axes.scene import ScenePerturbation, draw_scene
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
@@ -123,18 +123,17 @@ class PoseAxis(Axis):
                 expected="a task whose goal puts an object somewhere",
                 remedy="choose another task or another axis",
             )
-        component, moved = choices[rng.integers(len(choices))]
+        component, moved = pick(rng, choices)
         level = self.draw_level(rng)
         if component == "scene":
             return draw_scene(rng, level, task)
-        reach_m = self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2))
-        bearing_rad = rng.uniform(-math.pi, math.pi)
+        dx_m, dy_m = point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
         dyaw_deg = rng.uniform(-self.turn_deg, self.turn_deg)
         return PosePerturbation(
             level=level,
             component=component,
             moved=moved,
-            dx_m=round(reach_m * math.cos(bearing_rad), 4),
-            dy_m=round(reach_m * math.sin(bearing_rad), 4),
+            dx_m=dx_m,
+            dy_m=dy_m,
             dyaw_deg=round(dyaw_deg, 2),
         )

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation
+from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import HOME_RAD
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
@@ -124,17 +124,11 @@ class RobotAxis(Axis):
     """
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("controller_posture", "initial_joints")
-    norm_rad: tuple[Norm, Norm, Norm, Norm, Norm] = (
-        0.1,
-        0.2,
-        0.3,
-        0.4,
-        0.5,
-    )
+    norm_rad: ByLevel[Norm] = (0.1, 0.2, 0.3, 0.4, 0.5)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
         level = self.draw_level(rng)
-        component = self.components[rng.integers(len(self.components))]
+        component = pick(rng, self.components)
         direction = rng.standard_normal(7)
         offsets = direction * (self.norm_rad[level - 1] / np.linalg.norm(direction))
         return RobotPerturbation.model_validate(
