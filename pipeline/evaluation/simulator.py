@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import RefusedError
-from pipeline.physics.environment import Environment, control_env, seeded
+from pipeline.physics.control_env import control_env, seeded
+from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import proprioception
 from pipeline.testset.definitions import SceneFiles
