@@ -24,8 +24,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
-from pipeline.physics.replay import replay
-from pipeline.physics.success import verdict
+from pipeline.physics.replay import replay, verdict
 from pipeline.planning import plan
 from pipeline.run.replay import replay_plan
 from pipeline.scenes.noops import NOOP_NORM, kept_actions

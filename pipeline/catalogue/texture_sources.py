@@ -42,14 +42,12 @@ WHEELS = {
         version="3.1.1",
         sha256="99e25d9baf97f2f1a19ca89c0d2ca9c6a2b396d9a9be81729de64eedc683f0d3",
         content="metaworld's textures (37 MB)",
-        without="leave metaworld out of plan.axes.background.sources",
     ),
     "gymnasium-robotics": Wheel(
         name="gymnasium-robotics",
         version="1.4.2",
         sha256="a1743530431cb377e6b3b956d284bc96436fc68bac1648ef205054c178e7dc4b",
         content="gymnasium-robotics' textures (26 MB)",
-        without="leave gymnasium-robotics out of plan.axes.background.sources",
     ),
 }
 _LICENCES = {
@@ -132,7 +130,9 @@ def offered(source: Source) -> Iterator[Texture]:
             for file in _images(package_folder("robosuite") / "models" / "assets" / "textures"):
                 yield from_file(f"robosuite:{file.name}", file, _LICENCES[source])
         case "metaworld" | "gymnasium-robotics":
-            yield from _in_wheel(source, wheels.fetch(WHEELS[source], FOLDER))
+            yield from _in_wheel(
+                source, wheels.fetch(WHEELS[source], FOLDER, f"leave {source} out of plan.axes.background.sources")
+            )
 
 
 def from_file(name: str, file: Path, licence: str) -> Texture:

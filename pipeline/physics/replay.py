@@ -1,4 +1,4 @@
-"""Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory out."""
+"""Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory with a verdict out."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError
 from pipeline.physics.reference import Reference
 from pipeline.physics.roll_out import roll_out
-from pipeline.physics.success import verdict
 from pipeline.physics.tracking import Route, follow
 from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
@@ -121,3 +122,19 @@ def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError) ->
         site_alpha=np.empty((1, 0), np.float32),
         verdict=Verdict(False, error.reason),
     )
+
+
+def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
+    """Judge a replay: the task's goal must hold after the last executed action.
+
+    Args:
+        states: (K+1, S) states before each executed action and after the last.
+        succeeded: (K,) LIBERO's success check after each executed action.
+    """
+    if len(succeeded) < SCHEMA.min_steps:
+        return Verdict(False, "too_short")
+    if not np.isfinite(states).all():
+        return Verdict(False, "simulation_unstable")
+    if succeeded[-1]:
+        return Verdict(True, "kept")
+    return Verdict(False, "goal_lost" if succeeded.any() else "goal_not_reached")
