@@ -35,8 +35,8 @@ RECIPES: dict[Layer, int] = {"physics": 4, "pixels": 4, "encoding": 1}
 action, with the gripper's command and the controller's posture of a recording; added objects stand where the
 benchmark's do.
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
-lamps are changed from where changes show, and added objects that do not show are refused. 4: frames begin
-where the scene has settled."""
+lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
+are, and frames begin where the scene has settled."""
 
 PACKAGES: dict[Layer, tuple[str, ...]] = {
     "physics": (

@@ -212,15 +212,16 @@ def test_both_datasets_have_what_the_store_has(run: Path) -> None:
 def test_a_changed_matrix_file_or_pose_is_a_finding(run: Path) -> None:
     case = cases(run)[0]
     (copy, *_) = case.copies
-    seen = copy.geometry["image"]
-    assert copy.object_poses is not None
+    made = copy.episode
+    seen = made.geometry["image"]
+    assert made.object_poses is not None
     for spoilt, what in (
-        (replace(copy, geometry={**copy.geometry, "image": replace(seen, extrinsics=seen.extrinsics.T)}), "image_ext"),
-        (replace(copy, geometry={**copy.geometry, "image": copy.geometry["wrist_image"]}), "image_"),
-        (replace(copy, object_poses=copy.object_poses[::-1]), "object_poses"),
-        (replace(copy, instances=copy.instances[:-1]), "instances"),
+        (replace(made, geometry={**made.geometry, "image": replace(seen, extrinsics=seen.extrinsics.T)}), "image_ext"),
+        (replace(made, geometry={**made.geometry, "image": made.geometry["wrist_image"]}), "image_"),
+        (replace(made, object_poses=made.object_poses[::-1]), "object_poses"),
+        (replace(made, instances=made.instances[:-1]), "instances"),
     ):
-        findings = list(CHECKS["geometry"](replace(case, copies=[spoilt])))
+        findings = list(CHECKS["geometry"](replace(case, copies=[replace(copy, episode=spoilt)])))
         assert findings
         assert {finding.what.startswith(what) for finding in findings} == {True}
 

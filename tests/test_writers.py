@@ -400,10 +400,10 @@ def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
         source = with_extras(episode_id)
         for copy in (rlds.read(row, tmp_path / "cache"), lerobot_set.read(row, tmp_path / "cache")):
             assert copy is not None
-            assert copy.object_poses is not None
-            np.testing.assert_array_equal(copy.object_poses, source.object_poses)
-            assert tuple(copy.instances) == tuple(source.instances)
-            assert {view: seen.maps for view, seen in copy.geometry.items()} == {
+            assert copy.episode.object_poses is not None
+            np.testing.assert_array_equal(copy.episode.object_poses, source.object_poses)
+            assert tuple(copy.episode.instances) == tuple(source.instances)
+            assert {view: seen.maps for view, seen in copy.episode.geometry.items()} == {
                 view: seen.maps for view, seen in source.geometry.items()
             }
         shard, place = row["rlds_shard"], row["rlds_index"]
