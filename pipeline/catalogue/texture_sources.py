@@ -12,7 +12,7 @@ import io
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -187,15 +187,11 @@ def _procedural() -> Iterator[Texture]:
                 source="procedural",
                 licence=_LICENCES["procedural"],
                 sha256=seeding.digest("texture", procedural.RECIPE, family, index),
-                _read=lambda family=family, index=index: procedural.texture(family, index),  # type: ignore[misc]
+                _read=partial(procedural.texture, family, index),
             )
 
 
 def _in_wheel(source: Package, path: Path) -> Iterator[Texture]:
-    def read(member: str) -> bytes:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read(member)
-
     with zipfile.ZipFile(path) as archive:
         for member in sorted(name for name in archive.namelist() if name.lower().endswith(_IMAGES)):
             yield Texture(
@@ -203,8 +199,13 @@ def _in_wheel(source: Package, path: Path) -> Iterator[Texture]:
                 source=source,
                 licence=_LICENCES[source],
                 sha256=hashlib.sha256(archive.read(member)).hexdigest(),
-                _read=lambda member=member: _decode(read(member), member),  # type: ignore[misc]
+                _read=partial(_member, path, member),
             )
+
+
+def _member(wheel: Path, member: str) -> Frame:
+    with zipfile.ZipFile(wheel) as archive:
+        return _decode(archive.read(member), member)
 
 
 def _images(root: Path) -> tuple[Path, ...]:
