@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,30 +51,9 @@ def replay(
         return _not_simulated(demo, trajectory_id, error)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
-        environment.restore(scene)
-        # What has no first look is dropped with the state that it was put in.
-        refusal, states, alphas = refused, [environment.state], [environment.site_alpha]
-        actions, succeeded = [], []
-        try:
-            environment.settle(0 if refused else config.settle_steps)
-            states, alphas = [environment.state], [environment.site_alpha]
-            for action in policy() if not refused else ():
-                environment.step(action)
-                actions.append(action)
-                states.append(environment.state)
-                alphas.append(environment.site_alpha)
-                succeeded.append(environment.succeeded())
-        except RefusedError as error:
-            refusal = Verdict(False, error.reason)
-        return Trajectory(
-            trajectory_id=trajectory_id,
-            mode=mode,
-            scene=scene,
-            states=np.stack(states),
-            actions=np.array(actions).reshape(-1, 7),
-            site_alpha=np.stack(alphas),
-            verdict=refusal or verdict(np.stack(states), np.array(succeeded, bool)),
-        )
+        settle_steps, acting = (0, lambda: iter(())) if refused else (config.settle_steps, policy)
+        states, actions, alphas, judged = _execute(environment, scene, settle_steps, acting)
+        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused or judged)
 
     followed = reference() if config.mode == "tracked" else None
     if followed is None:
@@ -84,6 +64,39 @@ def replay(
         if followed is None:
             return opened
     return rollout("tracked", lambda: _tracking(environment, followed))
+
+
+class _Executed(NamedTuple):
+    """As in ``Trajectory``."""
+
+    states: Floats
+    actions: Floats
+    site_alpha: NDArray[np.float32]
+    verdict: Verdict
+
+
+def _execute(
+    environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
+) -> _Executed:
+    """Let a scene settle, and then take the actions that ``policy`` makes from there."""
+    environment.restore(scene)
+    # What has no first look is dropped with the state that it was put in.
+    states, alphas = [environment.state], [environment.site_alpha]
+    actions, succeeded = [], []
+    refused = None
+    try:
+        environment.settle(settle_steps)
+        states, alphas = [environment.state], [environment.site_alpha]
+        for action in policy():
+            environment.step(action)
+            actions.append(action)
+            states.append(environment.state)
+            alphas.append(environment.site_alpha)
+            succeeded.append(environment.succeeded())
+    except RefusedError as error:
+        refused = Verdict(False, error.reason)
+    judged = refused or verdict(np.stack(states), np.array(succeeded, bool))
+    return _Executed(np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged)
 
 
 def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
