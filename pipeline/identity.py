@@ -29,11 +29,11 @@ from pipeline.seeding import digest
 
 Layer = Literal["physics", "pixels", "encoding"]
 
-RECIPES: dict[Layer, int] = {"physics": 4, "pixels": 4, "encoding": 1}
+RECIPES: dict[Layer, int] = {"physics": 5, "pixels": 4, "encoding": 1}
 """2 of ``physics``: tracking keeps to a place until what is put there is let go; added objects show in the agent view.
 3: a stored scene names its files by package; states and actions are those of 2. 4: scenes settle before the first
 action, with the gripper's command and the controller's posture of a recording; added objects stand where the
-benchmark's do.
+benchmark's do. 5: the command and the posture are those of the recording among added objects, too.
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
 lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
 are, and frames begin where the scene has settled."""

@@ -6,6 +6,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -40,8 +41,9 @@ _DISTURBED_M = 1e-3
 def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, roll_out: RollOut) -> Scene:
     """Add objects to a scene: at rest on its working surface, seen, clear of the demonstration's path.
 
-    Everything that was in the scene keeps its recorded state exactly. The objects' joints come last: the state is
-    time, the old qpos, the new qpos (7 each), the old qvel, the new qvel (6 each).
+    Everything that was in the scene keeps its recorded state exactly, and the gripper and the controller what they were
+    at. The objects' joints come last: the state is time, the old qpos, the new qpos (7 each), the old qvel, the new
+    qvel (6 each).
 
     Args:
         seed: keys the places that are tried.
@@ -65,8 +67,12 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
             for model, pose, px in zip(objects, settled, placement.seen_px(settled), strict=True)
         ]
         resolved = {"objects": placed, "scenes": attempt + 1, "rejected": dict(sorted(rejected.items()))}
-        state = placement.state_with(scene.state, settled)
-        return Scene(placement.model_xml, state, {**scene.resolved, "layout": resolved})
+        return replace(
+            scene,
+            model_xml=placement.model_xml,
+            state=placement.state_with(scene.state, settled),
+            resolved={**scene.resolved, "layout": resolved},
+        )
     raise RefusedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
 
 
