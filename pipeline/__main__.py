@@ -20,8 +20,7 @@ from pipeline.arguments import positive
 from pipeline.axes import Axes
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
-from pipeline.evaluation import analyses
-from pipeline.evaluation import command as evaluation_command
+from pipeline.evaluation import commands as evaluation_commands
 from pipeline.exit_status import exit_status
 from pipeline.files import replaced
 from pipeline.formats.registry import FORMATS, formats_of
@@ -124,7 +123,7 @@ def _evaluation_report(arguments: argparse.Namespace) -> int:
     Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
     Two different results of one episode are an error. The last line is JSON.
     """
-    from pipeline.evaluation.merging import read
+    from pipeline.evaluation.results import read
     from pipeline.publish import evaluation_report
 
     print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
@@ -227,8 +226,7 @@ def parser() -> argparse.ArgumentParser:
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_before(commands)
-    evaluation_command.add_commands(commands)
-    analyses.add_commands(commands)
+    evaluation_commands.add_commands(commands)
     _add_after(commands)
     return top
 

@@ -38,8 +38,8 @@ from pipeline.axes.language import BANK_FILE, load_bank
 from pipeline.catalogue.texture_sources import from_file
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig, load
 from pipeline.errors import PipelineError
-from pipeline.evaluation.policies import checked_actions
 from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.settings import checked_actions
 from pipeline.files import read_json
 from pipeline.formats.tfrecord import records
 from pipeline.libero import bddl, hdf5

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes.robot import RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
 from pipeline.errors import RefusedError
-from pipeline.evaluation.initial_states import libero_states
+from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.assets import relocate
 from pipeline.libero.starts import HOME_RAD, recorded_start
 from pipeline.physics.control_env import seeded

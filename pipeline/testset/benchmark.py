@@ -28,7 +28,6 @@ PACKAGE = Wheel(
 WHEEL = PACKAGE.file
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
-AXES = ("camera", "robot", "language", "light", "background", "noise", "layout", "pose")
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,8 @@ class TestTask:
         suite: LIBERO suite.
         base: name of the LIBERO task that it perturbs.
         name: its own name.
-        axis: of ``AXES``; ``layout`` are confounding objects, ``pose`` are target object poses.
+        axis: ``camera``, ``robot``, ``language``, ``light``, ``background``, ``noise``, ``layout`` (confounding
+            objects) or ``pose`` (target object pose).
         component: as this project names components.
         parameters: what is known of the change, by name with unit.
     """
