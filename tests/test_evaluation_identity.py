@@ -16,6 +16,7 @@ import pytest
 from conftest import STOVE
 from model_server import running
 
+from pipeline import identity
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment, results
@@ -142,7 +143,7 @@ def test_results_of_other_versions_are_made_again(
 ) -> None:
     checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
     first = run(out, checkpoint)
-    monkeypatch.setattr(results, "RECIPE", results.RECIPE + 1)
+    monkeypatch.setitem(identity.RECIPES, "evaluation", identity.RECIPES["evaluation"] + 1)
     second = run(out, checkpoint)
     assert len(taken) == 2 * STEPS
     assert second == first

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
 from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
 from pipeline.errors import RefusedError
@@ -79,6 +78,8 @@ class RobotPerturbation(PhysicsPerturbation):
         state = compiled.state
         compiled.restore(state)
         if self.component == "controller_posture":
+            from scipy.spatial.transform import Rotation  # takes long, and every process of a run imports the axes
+
             hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
             drawn_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
             return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": drawn_to})

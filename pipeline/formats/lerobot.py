@@ -14,16 +14,15 @@ from pipeline.export_config import LeRobotConfig
 from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load
 from pipeline.formats.read_back import Copy, Fault
+from pipeline.identity import Step
 from pipeline.tables import column
 
 
 class LeRobot(Format[LeRobotConfig]):
     """Parts are datasets of their own, written in parallel; lerobot merges them."""
 
-    name: ClassVar = "lerobot"
+    name: ClassVar[Step] = "lerobot"
     title: ClassVar = "LeRobot"
-    recipe: ClassVar = 4
-    packages: ClassVar = ("lerobot", "datasets", "av", "pyarrow", "numpy", "opencv-python-headless")
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
