@@ -190,7 +190,7 @@ def _arrays(steps: int, *widths: int) -> list[np.ndarray[Any, np.dtype[np.float6
 def _trajectory() -> bytes:
     def write(folder: Path) -> Path:
         states, actions = _arrays(21, 79, 7)
-        mask, alpha = np.ones(20, np.bool_), np.zeros((21, 5), np.float32)
+        alpha = np.zeros((21, 5), np.float32)
         store = TrajectoryStore(folder)
         store.save(
             Trajectory(
@@ -199,7 +199,6 @@ def _trajectory() -> bytes:
                 Scene("<mujoco/>", states[0]),
                 states,
                 actions[:20],
-                mask,
                 alpha,
                 Verdict(True, "kept"),
             )

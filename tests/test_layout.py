@@ -26,7 +26,7 @@ from pipeline.physics.roll_out import roll_out
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import Sight
 from pipeline.scenes.placement import CLEARANCE_M, HIDDEN, SEEN_PX, enough_seen, place
-from pipeline.scenes.regions import Region, regions
+from pipeline.scenes.regions import REGIONS, Region
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Scene
@@ -99,8 +99,7 @@ def test_a_model_comes_twice_as_often_as_in_the_test_set() -> None:
 def test_regions_are_those_of_the_test_set() -> None:
     """Of the objects that it adds to an arena, 95 % stand in the regions, and as many of them in front."""
     world_m = {"study": -0.2}
-    for arena in ("tabletop", "floor", "kitchen", "living_room", "study"):
-        known = regions(f"libero_{arena}_manipulation")
+    for arena, known in REGIONS.items():
         places: Counter[tuple[float, float]] = Counter()
         for test in benchmark.load(REPOSITORY / benchmark.FOLDER).of("layout"):
             if test.parameters["arena"] == arena:
@@ -203,7 +202,7 @@ def test_objects_touch_the_table_only_and_the_demonstration_passes_them_by(
 
 
 def test_objects_stand_in_the_regions_of_the_arena(changed: Scene) -> None:
-    known = regions("libero_tabletop_manipulation")
+    known = REGIONS["tabletop"]
     for placed in changed.resolved["layout"]["objects"]:
         assert within(known.front, placed["position_m"][:2]) or within(known.back, placed["position_m"][:2])
 

@@ -19,7 +19,7 @@ import numpy as np
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, checksum_of, edition
 from pipeline.libero.assets import libero_assets
-from pipeline.physics.environment import control_env
+from pipeline.physics.control_env import control_env
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import Reader, SceneFiles

@@ -16,7 +16,8 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation.settings import VIEWS
 from pipeline.images.jpeg import to_policy
-from pipeline.physics.environment import Environment, control_env, seeded
+from pipeline.physics.control_env import control_env, seeded
+from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
 from pipeline.rendering.frames import noisy
 from pipeline.rendering.last_scene import LastScene

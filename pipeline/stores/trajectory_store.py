@@ -51,7 +51,6 @@ class TrajectoryStore(Store):
             file["start"] = trajectory.scene.state
             file["states"] = trajectory.states
             file["actions"] = trajectory.actions
-            file["kept_mask"] = trajectory.kept_mask
             file.create_dataset("site_alpha", data=trajectory.site_alpha, compression="gzip")
 
     def load(self, trajectory_id: str) -> Trajectory:
@@ -75,7 +74,6 @@ class TrajectoryStore(Store):
                 scene=scene,
                 states=file.array("states"),
                 actions=file.array("actions"),
-                kept_mask=file.array("kept_mask"),
                 site_alpha=file.array("site_alpha"),
                 verdict=Verdict(file.attributes["kept"], file.attributes["reason"]),
             )
