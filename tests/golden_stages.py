@@ -71,7 +71,7 @@ def checks() -> dict[str, Any]:
     states[3:, 0] += 0.01
     scene = Scene("", np.zeros(1))
     trajectory = Trajectory(
-        *("golden", "open_loop", scene, states, made.action.astype(float), np.ones(steps, bool)),
+        *("golden", "open_loop", scene, states, made.action.astype(float)),
         *(np.zeros((steps + 1, 0), np.float32), Verdict(True, "kept")),
     )
     row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
