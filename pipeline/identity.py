@@ -35,7 +35,7 @@ RECIPES: dict[Step, int] = {
     "rlds": 2,
     "lerobot": 4,
     "evaluation": 1,
-    "checks": 1,
+    "checks": 2,
     "pictures": 1,
 }
 """2 of ``physics``: tracking keeps to a place until what is put there is let go; added objects show in the agent view.
@@ -45,8 +45,9 @@ benchmark's do. 5: the command and the posture are those of the recording among 
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
 lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
+5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
-``pictures``: the contact sheets and previews of ``summary``, and the report."""
+2 of it: joint angles are held against the replay's. ``pictures``: the sheets and previews of ``summary``, the report."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),
@@ -142,7 +143,7 @@ def refuse_unasked(found: Counter[str], where: Path) -> None:
     if not found:
         return
     told = "; ".join(f"{number} {what}" for what, number in found.items())
-    if os.environ.get(REMAKE):
+    if os.environ.get(REMAKE, "0") != "0":
         print(f"made anew: {told}")
         return
     raise PipelineError(

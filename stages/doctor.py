@@ -1,5 +1,7 @@
 """Stage doctor: check the machine and the installation against what the run needs, and record what it begins with."""
 
+from importlib.metadata import PackageNotFoundError
+
 from pipeline import gl
 from pipeline.config import Config
 from pipeline.errors import PipelineError
@@ -9,8 +11,11 @@ from pipeline.validation import doctor
 
 
 def run(config: Config) -> None:
-    memory = finished.of_doctor(config, gl.choose().device)
-    tried = memory.holds()
+    try:
+        tried = finished.of_doctor(config, gl.choose().device).holds()
+    except (PipelineError, PackageNotFoundError):
+        # What is missing, the doctor's table says.
+        tried = False
     if doctor.run(config, tried=tried):
         raise PipelineError(
             "this machine cannot make the run",
@@ -20,7 +25,7 @@ def run(config: Config) -> None:
         )
     if not tried:
         machine.record(config.data, doctor.trial())
-        memory.keep()
+        finished.of_doctor(config, gl.choose().device).keep()
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from pipeline.run.stage import main
 def run(config: Config) -> None:
     file = config.data / "validation.json"
     if finished.of_validate(config).holds():
+        # `push` asks for checks that are no older than what they are about.
+        file.touch()
         print(f"nothing has changed since the checks of {file} found nothing off")
         return
     from pipeline import gl

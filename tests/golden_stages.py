@@ -69,6 +69,7 @@ def checks() -> dict[str, Any]:
     states = np.zeros((steps + 1, 10))
     states[:, 0] = np.arange(steps + 1) / SCHEMA.fps_hz
     states[3:, 0] += 0.01
+    states[:-1, 1:8] = made.joint_state
     scene = Scene("", np.zeros(1))
     trajectory = Trajectory(
         *("golden", "open_loop", scene, states, made.action.astype(float)),

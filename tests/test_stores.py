@@ -27,12 +27,13 @@ from pipeline.compute.pool import loop
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.render import render
 from pipeline.run import outcome
 from pipeline.run.remake import outdated
-from pipeline.run.render import STREAMS_OF_A_JOB, portions, render_plan
+from pipeline.run.render import STREAMS_OF_A_JOB, RenderJob, portions, render_plan
 from pipeline.run.replay import replay_plan
 from pipeline.seeding import rng
 from pipeline.stores.frame_store import FrameStore, shown_of
@@ -489,6 +490,23 @@ def test_a_rendering_that_is_given_up_is_dropped_with_its_reason_and_keeps_what_
     stored = shown_of(FrameStore(tmp_path / "later", config.render).rows())
     assert outcome.rejections(rows, stored) == dict.fromkeys((row.episode_id for row in lights), "worker_lost")
     assert len(stored[twin[0].trajectory_id].streams) == 2, "the twin's own frames stay"
+
+
+def test_states_are_those_of_the_replay_where_a_worker_was_lost_over_other_streams(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path
+) -> None:
+    """What is stored for a lost worker has no states, and is joined with what is rendered later."""
+    twin = rows[0]
+    task, streams = find_task(twin.suite, twin.task), tuple(streams_of(twin.perturbations).values())
+    device = gl.choose().device
+    parts = (twin.trajectory_id, task), (twin.demo_steps, replayed, tmp_path, config.render, device)
+    RenderJob(*parts[0], streams[:1], *parts[1]).lost()
+    RenderJob(*parts[0], streams, *parts[1])()
+    made = FrameStore(tmp_path, config.render).load(twin.trajectory_id, [streams[1].stream_id])
+    states = TrajectoryStore(replayed).load(twin.trajectory_id).states
+    # Of a state: the time, then seven joints of the arm, then the fingers.
+    np.testing.assert_array_equal(made.joint_state, states[:-1, 1:8].astype(np.float32))
+    np.testing.assert_array_equal(made.state[:, 6:], states[:-1, 8:10].astype(np.float32))
 
 
 def test_a_reserve_is_replayed_once_frames_before_it_are_refused(rows: list[plan.Row]) -> None:

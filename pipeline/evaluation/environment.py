@@ -96,7 +96,9 @@ class EpisodeEnvironment:
         Raises:
             PipelineError: when the action is not seven finite numbers, or no episode is running.
         """
-        (given,) = checked_actions(action, "action").copy()
+        given, *others = checked_actions(action, "action").copy()
+        if others:
+            raise PipelineError("several actions", expected="one action, (7,)")
         if self.progress.over:
             raise PipelineError("no episode is running", expected="reset before step, and no step after its end")
         given[6] = -1.0 if given[6] < 0 else 1.0

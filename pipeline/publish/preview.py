@@ -197,7 +197,8 @@ def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
 
 def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     tasks, config, folder, test = job
-    folder.mkdir(parents=True)
+    # It is there where another worker was lost over these.
+    folder.mkdir(parents=True, exist_ok=True)
     stage = staged(tasks, config)
     # Layout last: each of its draws opens a scene of its own, after which the demonstration's would be opened anew.
     for name in sorted(Axes.model_fields, key="layout".__eq__):

@@ -14,6 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from pipeline.axes.language import BANK_FILE
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
@@ -25,6 +26,8 @@ from pipeline.stores.store import TABLE
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 FOLDER = ".finished"
+SEEN = Path(__file__).parents[1] / "testset" / "seen.json"
+"""What the report shows beside what the run shows."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ def of_validate(config: Config) -> Memory:
         *(one.record_file for one in formats),
     ]
     whole = all(store.untouched() for store in stores) and all(untouched(one) for one in formats)
-    settings = [_settings(config.render), _settings(config.export), _settings(config.plan.axes)]
+    settings = [_settings(config.render), _settings(config.export), _settings(config.plan.axes), checksum(BANK_FILE)]
     made_by = fingerprint("checks", *settings, _contents(files, config.data)) if whole else None
     return Memory(config.data, "validate", made_by, ["validation.json"])
 
@@ -105,8 +108,8 @@ def of_report(config: Config) -> Memory:
     names = ("plan.parquet", "manifest.parquet", "leakage.json", "inputs.json")
     pictures = [file for name in ("sheets", "previews") for file in _files(config.data / name)]
     files = [*(config.data / name for name in names), frames.root / TABLE, *pictures]
-    settings = _settings(config, {"compute"})
-    made_by = fingerprint("pictures", settings, _contents(files, config.data)) if frames.untouched() else None
+    settings = [_settings(config, {"compute"}), checksum(SEEN)]
+    made_by = fingerprint("pictures", *settings, _contents(files, config.data)) if frames.untouched() else None
     return Memory(config.data, "report", made_by, ["report.html"])
 
 

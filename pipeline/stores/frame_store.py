@@ -208,9 +208,13 @@ def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
 
 
 def joined(parts: Sequence[Rendered]) -> Rendered:
-    """Streams of one trajectory that were rendered or stored apart; one part at least."""
+    """Streams of one trajectory that were rendered or stored apart; one part at least.
+
+    What all streams share comes from a part that was rendered, where there is one: who stored that a worker was lost
+    had no states to store.
+    """
     return replace(
-        parts[0],
+        next((part for part in parts if part.streams), parts[0]),
         streams={name: frames for part in parts for name, frames in part.streams.items()},
         rejected={name: why for part in parts for name, why in part.rejected.items()},
         geometry={name: view for part in parts for name, view in part.geometry.items()},
