@@ -27,16 +27,17 @@ from pipeline import gl
 CHOICE = gl.choose()
 
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402, F401 - imported with its renderer
+from model_server import replaying  # noqa: E402
 from robosuite.utils.binding_utils import MjSim  # noqa: E402
 from vla_eval.benchmarks.libero.benchmark import LIBEROBenchmark  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
-from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
-from pipeline.evaluation.policies import Server, checked_actions  # noqa: E402
-from pipeline.evaluation.replay_server import replaying  # noqa: E402
-from pipeline.evaluation.settings import Wanted  # noqa: E402
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select  # noqa: E402
+from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
+from pipeline.evaluation.policies import Server  # noqa: E402
+from pipeline.evaluation.selection import Selection, select  # noqa: E402
+from pipeline.evaluation.settings import Wanted, checked_actions  # noqa: E402
+from pipeline.evaluation.tasks import EvaluationTask  # noqa: E402
 
 TASKS = ("turn_on_the_stove", "pick_up_the_milk_and_place_it_in_the_basket")
 CHUNK = 8

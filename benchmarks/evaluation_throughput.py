@@ -23,7 +23,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation.replay_server import replaying
+from model_server import replaying
+
 from pipeline.libero.tasks import find_task
 
 TASKS = (

@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 
 from pipeline import gl
 from pipeline.axes.noise import NoisePerturbation
-from pipeline.evaluation.episode import EpisodeEnvironment
+from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import RUNNABLE, by_name
-from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, select
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import EvaluationTask, balanced
 from pipeline.images.jpeg import to_policy
 from pipeline.machine_code import machine_code
 from pipeline.seeding import rng
@@ -153,12 +154,13 @@ def compare(environment: EpisodeEnvironment, task: EvaluationTask, folder: Path)
     with np.load(folder / f"{task.suite}-{task.name}.npz") as theirs:
         states, views = theirs["states"], {view: theirs[view] for view in ("agentview", "wrist")}
     environment.reset(task)
-    environment._perturbations = tuple(
+    perturbations = tuple(
         BenchmarkNoise(component=change.component, effect=change.effect, level=change.level, seed=change.seed)
         if isinstance(change, NoisePerturbation)
         else change
         for change in environment.perturbations
     )
+    environment._picture.show(environment._opened.model, perturbations)
     state_error, grey, differing = 0.0, dict.fromkeys(views, 0), dict.fromkeys(views, 0)
     for step, state in enumerate(states):
         if step:

@@ -59,7 +59,6 @@ def replay(
         scene=Scene(model_xml, demo.init_state),
         states=states,
         actions=actions,
-        kept_mask=np.ones(STEPS, bool),
         site_alpha=np.zeros((STEPS + 1, model_xml.count("<site ")), np.float32),
         verdict=Verdict(kept, "" if kept else "goal_not_reached"),
     )

@@ -28,7 +28,7 @@ from rich.table import Table
 from pipeline.axes import from_json
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
-from pipeline.evaluation.results import wilson
+from pipeline.evaluation.statistics import wilson
 from pipeline.libero.tasks import SUITES
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan

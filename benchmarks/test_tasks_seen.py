@@ -24,8 +24,8 @@ gl.prepare()
 
 from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.evaluation import libero_plus  # noqa: E402
-from pipeline.evaluation.initial_states import libero_states  # noqa: E402
 from pipeline.evaluation.simulator import Simulator  # noqa: E402
+from pipeline.evaluation.tasks import libero_states  # noqa: E402
 from pipeline.libero import bddl  # noqa: E402
 from pipeline.libero.tasks import tasks  # noqa: E402
 from pipeline.publish.seen import Look, spread  # noqa: E402

@@ -1,12 +1,17 @@
-"""Command line: what a person does around a run. The run itself is `dvc repro`."""
+"""Command line: what a person does around a run. The run itself is `dvc repro`.
+
+Each command is a function here, whose docstring is what ``--help`` says of it. What takes seconds to import, such as
+the simulator, it imports itself, so that the others need not wait.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from rich.console import Console
@@ -15,8 +20,7 @@ from pipeline.arguments import positive
 from pipeline.axes import Axes
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
-from pipeline.evaluation import analyses
-from pipeline.evaluation import command as evaluation_command
+from pipeline.evaluation import commands as evaluation_commands
 from pipeline.exit_status import exit_status
 from pipeline.files import replaced
 from pipeline.formats.registry import FORMATS, formats_of
@@ -44,6 +48,7 @@ def config_schema() -> dict[str, Any]:
 
 
 def _doctor(arguments: argparse.Namespace) -> int:
+    """check versions, OpenGL, disk, memory and demonstrations for a configuration; changes nothing"""
     return doctor.run(load(arguments.config or _chosen()))
 
 
@@ -55,13 +60,14 @@ def _chosen() -> Path:
 
 
 def _fetch(arguments: argparse.Namespace) -> int:
+    """download LIBERO's demonstrations (HDF5) from the hub, or go on with a download that was cut short"""
     files = fetch(arguments.out, arguments.suites, arguments.endpoint)
     print(f"{len(files)} files are in {arguments.out}: set demos.source: hdf5 and demos.root: {arguments.out}")
     return 0
 
 
 def _preview(arguments: argparse.Namespace) -> int:
-    # The simulator takes seconds to import, which the other commands can do without.
+    """draw what an axis does to a task: its first frame, and eleven draws over the components and levels"""
     from pipeline.publish import preview
 
     config = load(arguments.config)
@@ -75,18 +81,30 @@ def _preview(arguments: argparse.Namespace) -> int:
 
 
 def _rewrite(arguments: argparse.Namespace) -> int:
+    """have a language model reword a task's instruction, lint what it says, and add it to a bank of rewrites
+
+    Asks an OpenAI-compatible endpoint for rewrites of each class (distraction, common sense, reasoning chain,
+    paraphrase) until the bank has enough of each. The same lint as of the shipped bank decides what is let in. Run
+    again, it goes on where it was stopped. A key is read from OPENAI_API_KEY.
+    """
     extend(arguments.bddl_file, arguments.out, arguments.per_class, LanguageModel(arguments.endpoint, arguments.model))
     print(f"{arguments.out} holds {arguments.per_class} rewrites of each class for {arguments.bddl_file.stem}")
     return 0
 
 
 def _sources(arguments: argparse.Namespace) -> int:
+    """fetch and convert the textures and objects that a configuration names, as its plan would, and count them"""
     print(json.dumps(attribution.counts(load(arguments.config).plan.axes)))
     return 0
 
 
 def _expand(arguments: argparse.Namespace) -> int:
-    # The simulator takes seconds to import, which the other commands can do without.
+    """make many demonstrations of each task from the starter set's one, where the hub cannot be reached
+
+    Replays each human demonstration from other starts of the arm, with the target elsewhere, and writes those that
+    reach the goal in LIBERO's own HDF5 layout (states, actions and scenes; no images). They are marked as expanded in
+    the files and in every dataset made from them.
+    """
     from pipeline.run.expand import expand
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
@@ -100,8 +118,12 @@ def _expand(arguments: argparse.Namespace) -> int:
 
 
 def _evaluation_report(arguments: argparse.Namespace) -> int:
-    # The benchmark's code takes seconds to import, which the other commands can do without.
-    from pipeline.evaluation.merging import read
+    """write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures
+
+    Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
+    Two different results of one episode are an error. The last line is JSON.
+    """
+    from pipeline.evaluation.results import read
     from pipeline.publish import evaluation_report
 
     print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
@@ -109,7 +131,7 @@ def _evaluation_report(arguments: argparse.Namespace) -> int:
 
 
 def _check_oft(arguments: argparse.Namespace) -> int:
-    # TFDS takes seconds to import, which the other commands can do without.
+    """read a run's RLDS as OpenVLA-OFT's loader does, and print what it would train on as one line of JSON"""
     from pipeline.validation import oft_check
 
     found = oft_check.check_run(arguments.data)
@@ -118,7 +140,11 @@ def _check_oft(arguments: argparse.Namespace) -> int:
 
 
 def _coverage(arguments: argparse.Namespace) -> int:
-    # The simulator takes seconds to import, which the other commands can do without.
+    """set what a policy sees in a finished run beside what it sees in the benchmark's test tasks
+
+    First looks, how far the hand and the targets are moved, where objects are added, how much of a view changes, grey
+    levels and words, axis by axis. The last line is JSON: number, tenth, fiftieth and ninetieth percentile of each.
+    """
     from pipeline.publish import seen
 
     measures = seen.measure(owned(arguments.config or _chosen()), benchmark.load())
@@ -128,6 +154,11 @@ def _coverage(arguments: argparse.Namespace) -> int:
 
 
 def _verify(arguments: argparse.Namespace) -> int:
+    """read every stored file of a run, and say which are not what was written
+
+    Compares trajectories, frames and both datasets with the checksums that they were stored with. The last line is
+    JSON. Ends with 1 where a file is damaged: delete it, and `dvc repro` makes it anew.
+    """
     from pipeline.validation.verify import verify
 
     config = owned(arguments.config)
@@ -141,7 +172,12 @@ def _verify(arguments: argparse.Namespace) -> int:
 
 
 def _regenerate(arguments: argparse.Namespace) -> int:
-    # As does what reads the dataset back.
+    """rebuild one episode from the manifest and its demonstration, and say whether it is the dataset's, byte for byte
+
+    Replays, renders and serialises one kept episode again. The last line is JSON: whether it equals the record in the
+    RLDS set beside the manifest, which columns differ, and which versions and OpenGL device are not those of the
+    manifest. Ends with 1 when it is not identical.
+    """
     from pipeline.validation.regenerate import regenerate
 
     found = regenerate(arguments.episode_id, arguments.manifest, arguments.out, arguments.demos)
@@ -150,8 +186,12 @@ def _regenerate(arguments: argparse.Namespace) -> int:
 
 
 def _push(arguments: argparse.Namespace) -> int:
+    """upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go
+
+    Sends one of the datasets of a finished and validated run: its files, the card, the manifest and the recipe, in
+    one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`.
+    """
     config = owned(arguments.config)
-    # What it needs takes seconds to import, which the other commands can do without.
     from pipeline.publish import push
 
     (target,) = (
@@ -167,6 +207,7 @@ def _push(arguments: argparse.Namespace) -> int:
 
 
 def _schema(arguments: argparse.Namespace) -> int:
+    """write the files of schemas/ that follow from the code"""
     for name, content in schemas().items():
         with replaced(SCHEMAS / name) as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n")
@@ -184,32 +225,38 @@ def parser() -> argparse.ArgumentParser:
         "'libero_goal/turn_on*' camera` to look at what an axis does.",
     )
     commands = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_before(commands)
+    evaluation_commands.add_commands(commands)
+    _add_after(commands)
+    return top
 
-    command = commands.add_parser(
-        "doctor", help="check versions, OpenGL, disk, memory and demonstrations for a configuration; changes nothing"
-    )
-    command.add_argument(
-        "config",
-        type=Path,
-        nargs="?",
-        metavar="CONFIG",
-        help="of the run to come, such as configs/full.yaml (default: the one that params.yaml names)",
-    )
-    command.set_defaults(run=_doctor)
 
-    command = commands.add_parser(
-        "fetch",
-        help="download LIBERO's demonstrations (HDF5) from the hub, or go on with a download that was cut short",
-    )
+def _command(commands: Any, run: Callable[[argparse.Namespace], int]) -> argparse.ArgumentParser:
+    """Add a command that is named as its function."""
+    described, _, details = (run.__doc__ or "").partition("\n\n")
+    name = run.__name__.removeprefix("_").replace("_", "-")
+    command: argparse.ArgumentParser = commands.add_parser(name, help=described, description=details or None)
+    command.set_defaults(run=run)
+    return command
+
+
+def _add_config(command: argparse.ArgumentParser, nargs: Literal["?"] | None = None) -> None:
+    default = " (default: the one that params.yaml names)" if nargs else ""
+    described = f"of the run, such as configs/starter.yaml{default}"
+    command.add_argument("config", type=Path, nargs=nargs, metavar="CONFIG", help=described)
+
+
+def _add_before(commands: Any) -> None:
+    """The commands for what comes before a run."""
+    command = _command(commands, _doctor)
+    _add_config(command, nargs="?")
+
+    command = _command(commands, _fetch)
     command.add_argument("out", type=Path, help="folder to use as demos.root afterwards")
     command.add_argument("suites", nargs="+", choices=SUITES, metavar="SUITE", help=f"any of {', '.join(SUITES)}")
     command.add_argument("--endpoint", help="address of a mirror of the hub")
-    command.set_defaults(run=_fetch)
 
-    command = commands.add_parser(
-        "preview",
-        help="draw what an axis does to a task: its first frame, and eleven draws over the components and levels",
-    )
+    command = _command(commands, _preview)
     command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
     command.add_argument(
         "axis", choices=Axes.model_fields, metavar="AXIS", help=f"any of {', '.join(Axes.model_fields)}"
@@ -222,15 +269,8 @@ def parser() -> argparse.ArgumentParser:
         "name has its default ranges",
     )
     command.add_argument("--out", type=Path, default=Path("sheet.png"), help="picture to write (default: sheet.png)")
-    command.set_defaults(run=_preview)
 
-    command = commands.add_parser(
-        "rewrite",
-        help="have a language model reword a task's instruction, lint what it says, and add it to a bank of rewrites",
-        description="Asks an OpenAI-compatible endpoint for rewrites of each class (distraction, common sense, "
-        "reasoning chain, paraphrase) until the bank has enough of each. The same lint as of the shipped bank decides "
-        "what is let in. Run again, it goes on where it was stopped. A key is read from OPENAI_API_KEY.",
-    )
+    command = _command(commands, _rewrite)
     command.add_argument("bddl_file", type=Path, metavar="BDDL_FILE", help="the task, <suite>/<task>.bddl")
     command.add_argument("--out", type=Path, required=True, help="bank to extend or to begin, such as bank.yaml")
     command.add_argument(
@@ -243,29 +283,18 @@ def parser() -> argparse.ArgumentParser:
         help="what /chat/completions is appended to: http://localhost:8000/v1",
     )
     command.add_argument("--model", required=True, metavar="NAME", help="name of the model at the endpoint")
-    command.set_defaults(run=_rewrite)
 
-    command = commands.add_parser(
-        "sources",
-        help="fetch and convert the textures and objects that a configuration names, as its plan would, and count them",
-    )
+    command = _command(commands, _sources)
     command.add_argument(
         "--config",
         type=Path,
         default=Path("configs/paper.yaml"),
         help="whose sources (default: configs/paper.yaml)",
     )
-    command.set_defaults(run=_sources)
 
-    command = commands.add_parser("demos", help="make demonstrations")
-    made = command.add_subparsers(dest="verb", required=True, metavar="VERB")
-    command = made.add_parser(
-        "expand",
-        help="make many demonstrations of each task from the starter set's one, where the hub cannot be reached",
-        description="Replays each human demonstration from other starts of the arm, with the target elsewhere, and "
-        "writes those that reach the goal in LIBERO's own HDF5 layout (states, actions and scenes; no images). They "
-        "are marked as expanded in the files and in every dataset made from them.",
-    )
+    demos = commands.add_parser("demos", help="make demonstrations")
+    made = demos.add_subparsers(dest="verb", required=True, metavar="VERB")
+    command = _command(made, _expand)
     command.add_argument("out", type=Path, help="folder to use as demos.root afterwards")
     command.add_argument(
         "--per-task", type=positive, default=10, metavar="N", help="demonstrations of each task (default: 10)"
@@ -278,17 +307,11 @@ def parser() -> argparse.ArgumentParser:
         help="patterns of <suite>/<task> (default: the four suites)",
     )
     command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
-    command.set_defaults(run=_expand)
 
-    evaluation_command.add_commands(commands)
-    analyses.add_commands(commands)
 
-    command = commands.add_parser(
-        "evaluation-report",
-        help="write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures",
-        description="Reads the folders that `evaluate` wrote, on one machine or on several, and sets different "
-        "policies side by side. Two different results of one episode are an error. The last line is JSON.",
-    )
+def _add_after(commands: Any) -> None:
+    """The commands for a finished run and for evaluations."""
+    command = _command(commands, _evaluation_report)
     command.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="folder of results")
     command.add_argument(
         "--out",
@@ -297,75 +320,34 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="page to write, with a JSON file of the same name beside it (default: report.html)",
     )
-    command.set_defaults(run=_evaluation_report)
 
-    command = commands.add_parser(
-        "check-oft",
-        help="read a run's RLDS as OpenVLA-OFT's loader does, and print what it would train on as one line of JSON",
-    )
+    command = _command(commands, _check_oft)
     command.add_argument("data", type=Path, metavar="DIR", help="the run's data folder, such as data/starter")
-    command.set_defaults(run=_check_oft)
 
-    command = commands.add_parser(
-        "coverage",
-        help="set what a policy sees in a finished run beside what it sees in the benchmark's test tasks",
-        description="First looks, how far the hand and the targets are moved, where objects are added, how much of a "
-        "view changes, grey levels and words, axis by axis. The last line is JSON: number, tenth, fiftieth and "
-        "ninetieth percentile of each.",
-    )
-    command.add_argument(
-        "config",
-        type=Path,
-        nargs="?",
-        metavar="CONFIG",
-        help="of the run, such as configs/starter.yaml (default: the one that params.yaml names)",
-    )
-    command.set_defaults(run=_coverage)
+    command = _command(commands, _coverage)
+    _add_config(command, nargs="?")
 
-    command = commands.add_parser(
-        "verify",
-        help="read every stored file of a run, and say which are not what was written",
-        description="Compares trajectories, frames and both datasets with the checksums that they were stored "
-        "with. The last line is JSON. Ends with 1 where a file is damaged: delete it, and `dvc repro` makes it anew.",
-    )
-    command.add_argument("config", type=Path, metavar="CONFIG", help="of the run, such as configs/starter.yaml")
-    command.set_defaults(run=_verify)
+    command = _command(commands, _verify)
+    _add_config(command)
 
-    command = commands.add_parser(
-        "regenerate",
-        help="rebuild one episode from the manifest and its demonstration, and say whether it is the dataset's, byte "
-        "for byte",
-        description="Replays, renders and serialises one kept episode again. The last line is JSON: whether it equals "
-        "the record in the RLDS set beside the manifest, which columns differ, and which versions and OpenGL device "
-        "are not those of the manifest. Ends with 1 when it is not identical.",
-    )
+    command = _command(commands, _regenerate)
     command.add_argument("episode_id", metavar="EPISODE_ID", help="as in the manifest and in both datasets")
     command.add_argument("--manifest", type=Path, required=True, metavar="FILE", help="data/<run>/manifest.parquet")
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for what is rebuilt")
     command.add_argument(
         "--demos", type=Path, metavar="DIR", help="folder of the HDF5 demonstrations, where the run was made from those"
     )
-    command.set_defaults(run=_regenerate)
 
-    command = commands.add_parser(
-        "push",
-        help="upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go",
-        description="Sends one of the datasets of a finished and validated run: its files, the card, the manifest "
-        "and the recipe, in one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or "
-        "`hf auth login`.",
-    )
-    command.add_argument("config", type=Path, metavar="CONFIG", help="of the run, such as configs/starter.yaml")
+    command = _command(commands, _push)
+    _add_config(command)
     names = [kind.name for kind in FORMATS]
     command.add_argument("format", choices=names, metavar="FORMAT", help=" or ".join(names))
     command.add_argument("repository", metavar="REPOSITORY", help="owner/name on the hub")
     command.add_argument("--really", action="store_true", help="send it")
     command.add_argument("--private", action="store_true", help="make a new repository private")
     command.add_argument("--endpoint", metavar="URL", help="address of the hub, when not the usual one")
-    command.set_defaults(run=_push)
 
-    command = commands.add_parser("schema", help="write the files of schemas/ that follow from the code")
-    command.set_defaults(run=_schema)
-    return top
+    command = _command(commands, _schema)
 
 
 def main() -> int:

@@ -8,6 +8,7 @@ import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from hashlib import file_digest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,6 +50,12 @@ def checksum(file: Path) -> str:
     """
     with file.open("rb") as content:
         return file_digest(content, "sha256").hexdigest()
+
+
+@cache
+def checksum_of(version: Edition) -> str:
+    """``checksum`` of a file as it lay there, computed once a process."""
+    return checksum(version.path)
 
 
 def read_json(file: Path, remedy: str = "dvc repro") -> dict[str, Any]:

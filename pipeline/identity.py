@@ -1,44 +1,62 @@
-"""What decides whether a stored result is current: recipe numbers, package versions, machine code and settings.
+"""What decides whether finished work is current; DVC decides only which stages start.
 
-A run is made in layers, each from the one before it: ``physics`` (trajectories), ``pixels`` (rendered frames) and
-``encoding`` (those frames as files). A layer's ``fingerprint`` is written into every file of it; a file with another
-fingerprint counts as missing. Four things go into it, and into those of all layers after it:
-
-* ``RECIPES``, a number for each layer. Raise it in the commit that changes what a trajectory or a frame would be. An
-  edit that changes neither, such as a new comment, leaves it alone, and no finished work is thrown away. The golden
-  episodes of ``tests/golden.json`` fail when results change and the number does not.
-* ``PACKAGES``, the versions of what computes the layer.
-* the machine code that NumPy and OpenBLAS chose (see ``pipeline.machine_code``), and the OpenGL device, which frames
-  are stored with. Where it is not the fixed one, nothing has a fingerprint: every file of a run would count as another
-  version's, and what was stored would for all others.
-* the settings that the caller names, such as the quality of a JPEG.
-
-DVC asks for less: it runs a stage again when any file that the stage imports or reads has changed, even in a comment.
-The stage then asks its store what is current, and makes only the rest.
+1. A step makes files from inputs: physics makes trajectories, pixels makes frames, encoding makes files of frames.
+2. What a file was made with has three parts: recipe numbers, package versions, and the processor's machine code.
+3. A recipe is a number in ``RECIPES``. Raise it in the commit that changes what the step makes, and only then.
+4. ``tests/golden.json`` has what each number makes of a few short inputs; a test fails when only one of both changes.
+5. ``PACKAGES`` names the packages that compute a step. This project's own version is not among them.
+6. A step that builds on others (``AFTER``) has their recipes and packages too.
+7. The fingerprint of a file is a digest of all this and of the settings that its bytes depend on.
+8. A file is named after its inputs, and current when it has today's fingerprint. Else it counts as missing.
+9. A stage whose outputs are few (an export, ``validate``, ``summary``) has one fingerprint, of all its inputs.
+10. Before finished files of today's plan are made anew, a person must have allowed it (``refuse_unasked``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.metadata import version
+from pathlib import Path
 from typing import Literal
 
+from pipeline.errors import PipelineError
 from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
 
-Layer = Literal["physics", "pixels", "encoding"]
+Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "evaluation", "checks", "pictures"]
 
-RECIPES: dict[Layer, int] = {"physics": 4, "pixels": 4, "encoding": 1}
+RECIPES: dict[Step, int] = {
+    "physics": 5,
+    "pixels": 5,
+    "encoding": 1,
+    "rlds": 2,
+    "lerobot": 5,
+    "evaluation": 1,
+    "checks": 1,
+    "pictures": 1,
+}
 """2 of ``physics``: tracking keeps to a place until what is put there is let go; added objects show in the agent view.
 3: a stored scene names its files by package; states and actions are those of 2. 4: scenes settle before the first
 action, with the gripper's command and the controller's posture of a recording; added objects stand where the
-benchmark's do.
+benchmark's do. 5: the command and the posture are those of the recording among added objects, too.
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
-lamps are changed from where changes show, and added objects that do not show are refused. 4: frames begin
-where the scene has settled."""
+lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
+are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
+``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
+``pictures``: the contact sheets and previews of ``summary``, and the report."""
 
-PACKAGES: dict[Layer, tuple[str, ...]] = {
+AFTER: dict[Step, tuple[Step, ...]] = {
+    "pixels": ("physics",),
+    "encoding": ("physics", "pixels"),
+    "checks": ("physics", "pixels", "encoding"),
+    "pictures": ("physics", "pixels", "encoding"),
+}
+"""The steps that a step computes again or reads the files of; an export has its episodes' fingerprints as inputs."""
+
+PACKAGES: dict[Step, tuple[str, ...]] = {
     "physics": (
         "mujoco",
         "robosuite",
@@ -49,8 +67,15 @@ PACKAGES: dict[Layer, tuple[str, ...]] = {
     ),
     "pixels": ("numba", "pillow"),
     "encoding": ("opencv-python-headless",),
+    "rlds": ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy"),
+    "lerobot": ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless"),
+    "checks": ("tensorflow-datasets", "lerobot", "datasets", "av", "pyarrow"),
+    "pictures": ("robouse",),
 }
 
+
+REMAKE = "REMAKE"
+"""Variable of the environment that allows to make finished files anew: ``REMAKE=1 dvc repro``."""
 
 VERSIONS = {
     "pipeline": "this project",
@@ -70,40 +95,71 @@ def versions() -> dict[str, str]:
     return _versions(VERSIONS)
 
 
-def fingerprint(layer: Layer, *settings: object) -> str:
-    """A short name for what makes the files of a layer, 16 hex digits.
+def made_with(step: Step) -> dict[str, str]:
+    """What files of a step are made with, by name, for people: recipes, package versions and machine code.
+
+    Raises:
+        PipelineError: when NumPy computes with other machine code than is fixed.
+    """
+    recipes, packages, machine_code = _parts(step)
+    named = {f"recipe of {each}": str(number) for each, number in recipes.items()}
+    return {**named, **packages, "machine code": machine_code}
+
+
+def fingerprint(step: Step, *settings: object) -> str:
+    """A short name for what makes the files of a step, 16 hex digits.
 
     Args:
-        layer: the last layer of the file; those before it count as well.
+        step: the last step of the file; those that it builds on count as well.
         settings: JSON-serialisable, what else the bytes depend on.
 
     Raises:
         PipelineError: when NumPy computes with other machine code than is fixed.
     """
-    return digest(_recipe(layer), *settings)[:16]
+    return digest(_parts(step), *settings)[:16]
+
+
+def differences(then: Mapping[str, str], now: Mapping[str, str]) -> str:
+    """In words, what differs of two ``made_with``; empty where nothing does."""
+    names = dict.fromkeys([*then, *now])
+    return ", ".join(
+        f"{name} {then.get(name, 'none')}, here {now.get(name, 'none')}"
+        for name in names
+        if then.get(name) != now.get(name)
+    )
+
+
+def refuse_unasked(found: Counter[str], where: Path) -> None:
+    """Say what is made anew, and stop unless that was asked for.
+
+    Args:
+        found: what and why, to the number of files.
+        where: they lie.
+
+    Raises:
+        PipelineError: when there is any, and the environment does not allow it. Nothing was changed.
+    """
+    if not found:
+        return
+    told = "; ".join(f"{number} {what}" for what, number in found.items())
+    if os.environ.get(REMAKE):
+        print(f"made anew: {told}")
+        return
+    raise PipelineError(
+        f"finished work would be made anew: {told}",
+        where=where,
+        expected="the recipes, packages, machine code and OpenGL device that it was made with",
+        remedy="go on with the version and the machine that made it, or allow it: `REMAKE=1 dvc repro`, or --remake "
+        "behind one stage's command",
+    )
 
 
 @cache
-def _recipe(layer: Layer) -> list[object]:
-    layers = list(RECIPES)[: list(RECIPES).index(layer) + 1]
-    packages = [name for each in layers for name in PACKAGES[each]]
-    return [
-        {each: RECIPES[each] for each in layers},
-        _versions(packages),
-        fixed_machine_code(),
-    ]
+def _parts(step: Step) -> tuple[dict[str, int], dict[str, str], str]:
+    steps = (*AFTER.get(step, ()), step)
+    packages = [name for each in steps for name in PACKAGES.get(each, ())]
+    return {each: RECIPES[each] for each in steps}, _versions(packages), fixed_machine_code()
 
 
 def _versions(packages: Iterable[str]) -> dict[str, str]:
     return {name: version(name) for name in packages}
-
-
-@cache
-def machine() -> dict[str, str]:
-    """What a run should keep to from start to end, but for the recipes: package versions and machine code, by name.
-
-    Raises:
-        PipelineError: when NumPy computes with other machine code than is fixed.
-    """
-    names = [name for packages in PACKAGES.values() for name in packages]
-    return {**_versions(names), "machine code": fixed_machine_code()}

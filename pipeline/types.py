@@ -6,16 +6,46 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import mujoco
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 """(H, W, 3) RGB."""
 Extra = Literal["depth", "segmentation", "object_poses"]
 """What the render stage makes beside the frames when it is asked to."""
+
+
+class State(NamedTuple):
+    """A flattened MuJoCo state (S,), taken apart.
+
+    Attributes:
+        time: in s.
+        qpos: (nq,) positions and rotations of the joints.
+        qvel: (nv,) their velocities.
+    """
+
+    time: float
+    qpos: Floats
+    qvel: Floats
+
+    @classmethod
+    def of(cls, flat: Floats, nq: int) -> State:
+        """The parts of a state (S,); what is written into them is written into it."""
+        return cls(flat[0], flat[1 : 1 + nq], flat[1 + nq :])
+
+    @property
+    def flat(self) -> Floats:
+        return np.concatenate([[self.time], self.qpos, self.qvel])
+
+    def put_into(self, data: mujoco.MjData) -> None:
+        """Nothing that follows from it is computed."""
+        data.time, data.qpos[:], data.qvel[:] = self
 
 
 @dataclass(frozen=True)
@@ -112,7 +142,6 @@ class Trajectory:
         scene: where it started, before the arm and the objects settled; asset paths of this machine.
         states: (K+1, S) flattened states: before each executed action, and after the last. The first is the first look.
         actions: (K, 7) executed actions.
-        kept_mask: (T,) which of the demonstration's actions were executed.
         site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
         verdict: the judge's word after the last action.
     """
@@ -122,7 +151,6 @@ class Trajectory:
     scene: Scene
     states: Floats
     actions: Floats
-    kept_mask: NDArray[np.bool_]
     site_alpha: NDArray[np.float32]
     verdict: Verdict
 

@@ -7,9 +7,10 @@ from pipeline import gl
 from pipeline.compute.pool import runner
 from pipeline.config import Config
 from pipeline.files import read_json
+from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
-from pipeline.run.machine import same_machine
 from pipeline.run.outcome import rejections
+from pipeline.run.remake import outdated
 from pipeline.run.render import render_plan
 from pipeline.run.replay import replay_plan
 from pipeline.run.stage import main
@@ -19,8 +20,8 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 def run(config: Config) -> None:
     print(gl.choose())
-    same_machine(config.data, {"OpenGL device": gl.choose().device})
     rows = plan.read(config.data / "plan.parquet")
+    refuse_unasked(outdated(rows, config, gl.choose().device), config.data)
     # The configuration may be another one since the plan was made.
     config.export.refuse_too_few(plan.demonstrations(rows))
     replayed = int(read_json(config.data / "replay.json")["replayed"])

@@ -3,16 +3,17 @@
 from pipeline.compute.pool import runner
 from pipeline.config import Config
 from pipeline.files import write_json
+from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
-from pipeline.run.machine import same_machine
+from pipeline.run.remake import outdated
 from pipeline.run.replay import replay_plan
 from pipeline.run.stage import main
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:
-    same_machine(config.data)
     rows = plan.read(config.data / "plan.parquet")
+    refuse_unasked(outdated(rows, config), config.data)
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:
         verdicts = replay_plan(rows, config.demos, config.replay, folder, workers)

@@ -1,34 +1,46 @@
 """Stage summary: draw contact sheets, of the run and of one task per suite, and print what the run made."""
 
-from rich.console import Console
+from collections.abc import Sequence
+from typing import Any
 
-from pipeline import gl
-from pipeline.compute.pool import runner
 from pipeline.config import Config
-from pipeline.publish import preview, sheets
-from pipeline.run import manifest
-from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run import finished, manifest
 from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
     rows = manifest.read(config.data / "manifest.parquet")
-    load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
-    drawn = sheets.draw(rows, load, config.data / "sheets")
-    with runner(config.compute, config.data, gl.Shared) as workers:
-        previews = preview.for_run(config, config.data / "previews", workers)
+    memory = finished.of_summary(config)
+    if not memory.holds():
+        _draw(rows, config)
+        memory.keep()
+    from rich.console import Console
+
     console = Console()
     console.print(manifest.counts_table(rows))
+    sheets, previews = sorted((config.data / "sheets").iterdir()), sorted((config.data / "previews").iterdir())
     made = {
         "RLDS": config.data / "rlds",
         "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
         "manifest": config.data / "manifest.parquet",
-        **{f"{axis} sheet": path for axis, path in drawn.items()},
-        **{f"{suite} previews": path for suite, path in previews.items()},
+        **{f"{file.stem} sheet": file for file in sheets},
+        **{f"{folder.name} previews": folder for folder in previews},
     }
     width = max(map(len, made))
     for name, path in made.items():
         console.print(f"{name:>{width}}  {path}", soft_wrap=True, highlight=False)
+
+
+def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
+    from pipeline import gl
+    from pipeline.compute.pool import runner
+    from pipeline.publish import preview, sheets
+    from pipeline.run.episode_loader import EpisodeLoader
+
+    load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
+    sheets.draw(rows, load, config.data / "sheets")
+    with runner(config.compute, config.data, gl.Shared) as workers:
+        preview.for_run(config, config.data / "previews", workers)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,23 @@
 """Stage validate: reopen the datasets and the manifest, and stop where anything is off."""
 
-from pipeline import gl
-from pipeline.compute.pool import runner
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
+from pipeline.run import finished
 from pipeline.run.stage import main
-from pipeline.validation.validate import validate
 
 
 def run(config: Config) -> None:
+    file = config.data / "validation.json"
+    if finished.of_validate(config).holds():
+        print(f"nothing has changed since the checks of {file} found nothing off")
+        return
+    from pipeline import gl
+    from pipeline.compute.pool import runner
+    from pipeline.validation.validate import validate
+
     with runner(config.compute, config.data, gl.Shared) as workers:
         report = validate(config, workers)
-    file = config.data / "validation.json"
     write_json(file, report)
     off = {check: found["findings"] for check, found in report.items() if found["findings"]}
     if off:
@@ -23,6 +28,7 @@ def run(config: Config) -> None:
             expected=first["expected"],
             remedy=f"read {file}, correct the cause, and run `dvc repro` again",
         )
+    finished.of_validate(config).keep()
     print(f"{len(report)} checks found nothing off, see {file}")
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from functools import cache
 
 import numpy as np
@@ -11,7 +12,9 @@ from conftest import MILK, STOVE, starter_demo
 
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
+from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.drawing import SoftwareDrawing
 from pipeline.types import Floats, Frame
 
 VIEWS = ("agentview", "robot0_eye_in_hand")
@@ -35,6 +38,15 @@ def scene(arena: str) -> tuple[str, Floats]:
         return environment.place_fixtures(4), starter_demo(TASKS[arena]).init_state
     finally:
         environment.close()
+
+
+@contextmanager
+def both_ways(opened: Renderer) -> Iterator[tuple[SoftwareDrawing, PlainDrawing]]:
+    """How a renderer draws, with savings, and MuJoCo's own drawing of the same model in a context of its own."""
+    with closing(opened):
+        assert isinstance(opened.drawing, SoftwareDrawing)
+        with closing(PlainDrawing(opened.model)) as plain:
+            yield opened.drawing, plain
 
 
 def renderer(arena: str) -> Renderer:

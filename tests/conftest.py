@@ -62,7 +62,7 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 
 LONG = (
-    *("test_dependencies", "test_evaluation", "test_effect", "test_run", "test_kills", "test_evaluation_policies"),
+    *("test_finished", "test_evaluation", "test_effect", "test_run", "test_kills", "test_evaluation_policies"),
     "test_reserves",
     *("test_preview", "test_writers", "test_exports", "test_cluster", "test_validate", "test_render", "test_pose"),
     *("test_light", "test_background", "test_bad_demonstrations", "test_tracking"),

@@ -12,7 +12,7 @@ import anyio
 from vla_eval.model_servers.base import SessionContext
 from vla_eval.model_servers.serve import run_server
 
-from pipeline.evaluation.replay_server import ReplayServer
+from pipeline.evaluation.harness import ReplayServer
 
 
 class FaultyServer(ReplayServer):

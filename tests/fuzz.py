@@ -38,8 +38,8 @@ from pipeline.axes.language import BANK_FILE, load_bank
 from pipeline.catalogue.texture_sources import from_file
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig, load
 from pipeline.errors import PipelineError
-from pipeline.evaluation.policies import checked_actions
 from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.settings import checked_actions
 from pipeline.files import read_json
 from pipeline.formats.tfrecord import records
 from pipeline.libero import bddl, hdf5
@@ -190,7 +190,7 @@ def _arrays(steps: int, *widths: int) -> list[np.ndarray[Any, np.dtype[np.float6
 def _trajectory() -> bytes:
     def write(folder: Path) -> Path:
         states, actions = _arrays(21, 79, 7)
-        mask, alpha = np.ones(20, np.bool_), np.zeros((21, 5), np.float32)
+        alpha = np.zeros((21, 5), np.float32)
         store = TrajectoryStore(folder)
         store.save(
             Trajectory(
@@ -199,7 +199,6 @@ def _trajectory() -> bytes:
                 Scene("<mujoco/>", states[0]),
                 states,
                 actions[:20],
-                mask,
                 alpha,
                 Verdict(True, "kept"),
             )

@@ -1,7 +1,7 @@
 """A few short real episodes whose results are written down: `python tests/golden.py` adds what is not yet there.
 
-Numbers that are there are never written over. Where a result has changed, raise its layer's number in
-``pipeline.identity.RECIPES`` in the same commit and run this again: then every stored file of that layer is made anew.
+Numbers that are there are never written over. Where a result has changed, raise its step's number in
+``pipeline.identity.RECIPES`` in the same commit and run this again: then every stored file of that step is made anew.
 """
 
 from __future__ import annotations
@@ -127,21 +127,24 @@ def _digest(trajectory: Trajectory) -> str:
 
 
 def recorded() -> dict[str, Any]:
-    """The file: cases, and for each layer its recipe number to the results."""
+    """The file: cases, and for each step its recipe number to the results."""
     content: dict[str, Any] = json.loads(FILE.read_text())
     return content
 
 
 def main() -> None:
+    import golden_stages  # which needs no renderer, and imports much
+
     gl.choose()
     content = recorded()
     golden, device = Golden(content["cases"]), gl.choose().device
-    number = {layer: str(recipe) for layer, recipe in identity.RECIPES.items()}
+    number = {step: str(recipe) for step, recipe in identity.RECIPES.items()}
     pixels = content["pixels"].setdefault(number["pixels"], {"thumbnails": golden.thumbnails(), "devices": {}})
     for known, key, result, layer in (
         (content["physics"], number["physics"], golden.physics(), "physics"),
         (pixels["devices"], device, golden.pixels(), "pixels"),
         (content["encoding"], number["encoding"], golden.encoding(), "encoding"),
+        *((content.setdefault(step, {}), number[step], make(), step) for step, make in golden_stages.STEPS.items()),
     ):
         if known.setdefault(key, result) != result:
             sys.exit(f"{layer} has changed and its number has not: raise pipeline.identity.RECIPES[{layer!r}]")

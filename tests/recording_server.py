@@ -15,7 +15,7 @@ from vla_eval.model_servers.base import SessionContext
 from vla_eval.model_servers.predict import PredictModelServer
 from vla_eval.model_servers.serve import run_server
 
-from pipeline.evaluation.replays import Replay
+from pipeline.evaluation.reference_policies import Replay
 from pipeline.evaluation.tasks import EvaluationTask
 
 

@@ -18,9 +18,10 @@ from libero.libero import get_libero_path
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation import asset_archive, libero_plus
-from pipeline.evaluation.episode import EpisodeEnvironment
-from pipeline.evaluation.initial_states import moved_state
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.libero_plus import moved_state
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.testset.benchmark import TestTask

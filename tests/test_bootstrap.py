@@ -10,11 +10,10 @@ import pytest
 import scipy.stats
 from numpy.typing import NDArray
 
-from pipeline.evaluation import bootstrap, composition
-from pipeline.evaluation.bootstrap import Interval, interval
-from pipeline.evaluation.comparison import compare, difference, mcnemar
+from pipeline.evaluation import composition, statistics
 from pipeline.evaluation.composition import Pair, gap
 from pipeline.evaluation.results import Row
+from pipeline.evaluation.statistics import Interval, compare, difference, interval, mcnemar
 from pipeline.seeding import rng
 
 SIMULATIONS = 300
@@ -28,7 +27,7 @@ class Simulated(NamedTuple):
     base_tasks: NDArray[np.int64]
     outcomes: NDArray[np.float64]
 
-    def interval(self, statistic: bootstrap.Statistic) -> Interval:
+    def interval(self, statistic: statistics.Statistic) -> Interval:
         bases = self.base_tasks.tolist()
         return interval(bases, list(enumerate(bases)), self.outcomes, statistic)
 
@@ -56,7 +55,7 @@ def rejected(intervals: Sequence[Interval]) -> int:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bootstrap, "RESAMPLES", 1_000)
+    monkeypatch.setattr(statistics, "RESAMPLES", 1_000)
 
 
 @pytest.mark.usefixtures("quick")
@@ -100,7 +99,7 @@ def gaps(joint_loss: float, base_tasks: int, trials: int, simulations: int) -> t
     rates = np.array([0.95, 0.9, 0.9, 0.9 * 0.9 / 0.95 - joint_loss])
     pairs = []
     for _ in range(simulations):
-        harder = draws.choice([-0.04, 0.04], (base_tasks, 1)) if base_tasks >= bootstrap.SAMPLE else 0
+        harder = draws.choice([-0.04, 0.04], (base_tasks, 1)) if base_tasks >= statistics.SAMPLE else 0
         found = simulated(draws, rates + harder + np.zeros((base_tasks, 4)), [trials] * base_tasks)
         neither, one, other, both = found.outcomes.sum(axis=0).astype(int).tolist()
         interval_of_gap = found.interval(gap)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import platform
 import runpy
 import shutil
 import sys
@@ -17,10 +18,9 @@ from pipeline import gl
 from pipeline.catalogue import wheels
 from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig, load
 from pipeline.errors import PipelineError
-from pipeline.identity import machine as machine_here
+from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import machine
-from pipeline.run.machine import same_machine
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Extra
@@ -255,7 +255,8 @@ def test_the_command_writes_nothing_and_a_run_begins_on_another_machine(
     trial["OpenGL device"] = "two"
     run_stage(load(REPOSITORY / "configs" / "starter.yaml"))
     recorded = json.loads((tmp_path / "data" / "starter" / machine.FILE).read_text())
-    assert recorded == machine_here() | trial
+    assert recorded["made with"] == made_with("encoding") | {"OpenGL device": "two"}
+    assert sorted(recorded["trials"].values()) == ["0123", "4567"]
 
 
 def test_a_run_goes_on_where_steps_and_frames_are_the_same(
@@ -271,7 +272,9 @@ def test_a_run_goes_on_where_steps_and_frames_are_the_same(
     assert run_doctor("starter", monkeypatch, free_gb=1) == 1
     shown = capsys.readouterr().err
     assert "fail  same machine" in shown
-    assert "one frame 4567" in shown
+    assert "4567" in shown
+    run_stage(config)  # This machine was tried, and is the same.
+    monkeypatch.setattr(platform, "uname", lambda: ("Linux", "another"))
     with pytest.raises(PipelineError, match="this machine cannot make the run"):
         run_stage(config)
 
@@ -281,32 +284,35 @@ def test_ten_steps_and_a_frame_are_the_same_twice() -> None:
     assert REAL_TRIAL.__wrapped__() == REAL_TRIAL.__wrapped__()
 
 
-def test_a_run_is_not_gone_on_with_by_other_versions(tmp_path: Path) -> None:
-    """Else hours of work would be made again, and nobody had asked for it."""
+TRIAL = {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"}
+
+
+def test_a_run_is_not_gone_on_with_where_the_same_versions_compute_otherwise(tmp_path: Path) -> None:
+    """Its files would count as current, and be of two kinds."""
     folder = stored(tmp_path / "run", "trajectories", "frames")
-    same_machine(folder)
-    same_machine(folder, {"OpenGL device": "one"})
-    recorded = json.loads((folder / machine.FILE).read_text())
-    assert recorded == machine_here() | {"OpenGL device": "one"}
-    with pytest.raises(PipelineError, match=r"begun with OpenGL device one, here two") as caught:
-        same_machine(folder, {"OpenGL device": "two"})
-    assert f"delete {folder / machine.FILE}" in str(caught.value)
-    (folder / machine.FILE).write_text(json.dumps(recorded | {"mujoco": "3.0.0"}))
-    with pytest.raises(PipelineError, match=r"begun with mujoco 3\.0\.0, here 3"):
-        same_machine(folder)
-    (folder / machine.FILE).unlink()
-    same_machine(folder, {"OpenGL device": "two"})
+    machine.record(folder, TRIAL)
+    cases = {"ten steps": "its trajectories and its frames", "one frame": "its frames"}
+    for name, store in cases.items():
+        with pytest.raises(PipelineError, match=f"the run was begun where {name}, made by") as caught:
+            machine.record(folder, TRIAL | {name: "other"})
+        assert str(caught.value).endswith(f"delete {store}")
+    machine.record(folder, TRIAL | {"OpenGL device": "two", "one frame": "cdef"})
+    machine.record(folder, TRIAL)
 
 
 def test_what_nothing_was_made_with_yet_may_change(tmp_path: Path) -> None:
     """A login node may plan, nodes without OpenGL replay, and others render."""
     folder = tmp_path / "run"
-    same_machine(folder, {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"})
-    same_machine(folder, {"OpenGL device": "two", "ten steps": "89ab", "one frame": "4567"})
+    machine.record(folder, TRIAL)
+    machine.record(folder, TRIAL | {"ten steps": "89ab"})
     stored(folder, "trajectories")
-    same_machine(folder, {"OpenGL device": "three", "one frame": "cdef"})
-    with pytest.raises(PipelineError, match="begun with ten steps 89ab, here 0123"):
-        same_machine(folder, {"ten steps": "0123"})
-    stored(folder, "frames")
-    with pytest.raises(PipelineError, match="begun with OpenGL device three, here one; one frame cdef, here 4567"):
-        same_machine(folder, {"OpenGL device": "one", "one frame": "4567"})
+    machine.record(folder, TRIAL | {"ten steps": "89ab", "one frame": "cdef"})
+    with pytest.raises(PipelineError, match=r"ten steps, made by .* came to 89ab, here it is 0123"):
+        machine.record(folder, TRIAL | {"one frame": "cdef"})
+
+
+def test_an_older_record_says_nothing_of_trials(tmp_path: Path) -> None:
+    folder = stored(tmp_path / "run", "trajectories")
+    (folder / machine.FILE).write_text(json.dumps({"mujoco": "3.2.7", "ten steps": "89ab"}))
+    machine.record(folder, TRIAL)
+    assert machine.trials(folder)

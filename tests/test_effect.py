@@ -15,7 +15,7 @@ import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation import merging
+from pipeline.evaluation import results
 
 EFFECT = REPOSITORY / "benchmarks" / "effect"
 sys.path.append(str(EFFECT))
@@ -140,7 +140,7 @@ def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path) -> 
     assert found["episodes_by_axis"] == {"perturbed": {"noise": 1}}
     (line,) = found["table"]
     assert (line["source"], line["axis"], line["arms"]["perturbed"]["episodes"]) == ("libero", "clean", 1)
-    (row,) = merging.read([*(tmp_path / "out" / "evaluations").iterdir()])[0].rows
+    (row,) = results.read([*(tmp_path / "out" / "evaluations").iterdir()])[0].rows
     assert (row["reason"], row["steps"], row["looks"]) == ("step_limit", 300, 8), "it looks once in its chunk"
     assert {*found["hours"]} == {"data", "training", "evaluation"}
 

@@ -23,17 +23,17 @@ gl.choose()
 
 import robosuite.utils.transform_utils as transform  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
+from model_server import replaying  # noqa: E402
 
 from pipeline.axes.camera import CameraPerturbation  # noqa: E402
 from pipeline.axes.corruptions import Gaussian  # noqa: E402
 from pipeline.axes.noise import NoisePerturbation  # noqa: E402
 from pipeline.errors import PipelineError  # noqa: E402
 from pipeline.evaluation import libero_plus  # noqa: E402
-from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
-from pipeline.evaluation.initial_states import libero_states  # noqa: E402
-from pipeline.evaluation.replay_server import replaying  # noqa: E402
+from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
+from pipeline.evaluation.selection import Selection, select  # noqa: E402
 from pipeline.evaluation.settings import Wanted  # noqa: E402
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select  # noqa: E402
+from pipeline.evaluation.tasks import EvaluationTask, libero_states  # noqa: E402
 from pipeline.images.jpeg import to_policy  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
 
@@ -163,7 +163,8 @@ def test_noise_changes_the_views_that_it_names(evaluated: EpisodeEnvironment) ->
     clean = evaluated.observation(Wanted())["images"]
     for kind, noisy in ((NoisePerturbation, "agentview"), (WristNoise, "wrist")):
         evaluated.reset(FIRST)
-        evaluated._perturbations = (kind(component="gaussian", effect=Gaussian(sigma_px=3), level=1, seed=0),)
+        noise = kind(component="gaussian", effect=Gaussian(sigma_px=3), level=1, seed=0)
+        evaluated._picture.show(evaluated._opened.model, (noise,))
         seen = evaluated.observation(Wanted())["images"]
         assert {view for view in clean if not np.array_equal(seen[view], clean[view])} == {noisy}
 
@@ -178,7 +179,7 @@ def test_a_scene_whose_first_draw_has_no_place_for_an_object_is_drawn_again(eval
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("action", "message"),
-    [(np.zeros(6), "shape"), (np.full(7, np.nan), "NaN"), (["left"] * 7, "not numbers"), (np.zeros((1, 7)), "shape")],
+    [(np.zeros(6), "shape"), (np.full(7, np.nan), "NaN"), (["left"] * 7, "not numbers")],
 )
 def test_bad_actions_are_refused(evaluated: EpisodeEnvironment, action: Any, message: str) -> None:
     evaluated.reset(FIRST)
@@ -234,7 +235,7 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
             "selection": {"suites": ["libero_goal"], "tasks": ["turn_on*"]},
             "settings": {"initial_states": "demonstration"},
         }
-        benchmark = {"benchmark": "pipeline.evaluation.vla_eval_benchmark:PerturbedLibero", "params": params}
+        benchmark = {"benchmark": "pipeline.evaluation.harness:PerturbedLibero", "params": params}
         # YAML holds JSON.
         config.write_text(
             json.dumps({"server": {"url": address}, "output_dir": str(tmp_path / "theirs"), "benchmarks": [benchmark]})

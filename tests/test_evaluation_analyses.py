@@ -17,15 +17,15 @@ from pipeline.__main__ import parser
 from pipeline.axes import AnyPerturbation, to_json
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.errors import PipelineError
-from pipeline.evaluation import composition, construction, disjoint, goals
+from pipeline.evaluation import composition, goals, own_draws, tasks
 from pipeline.evaluation.composition import Pair
 from pipeline.evaluation.construction import candidates, construct, difficulty
-from pipeline.evaluation.disjoint import PlannedDraws
-from pipeline.evaluation.episode import EpisodeEnvironment
-from pipeline.evaluation.held_out import OWN_AXES
+from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw
 from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import Settings, Wanted
-from pipeline.evaluation.tasks import EvaluationTask, Selection, draw, select
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
@@ -143,17 +143,17 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     }
     assert len(set(drawn)) == len(drawn)
     refused = [task for task in drawn if task.axis == "layout"][:5]
-    benchmark = construct(drawn, 3, 210, [result(task, False, "refused") for task in refused])
-    assert (benchmark.candidates, benchmark.refused, benchmark.overlapping) == (560, 5, 0)
-    assert set(Counter(task.axis for task in benchmark.tasks).values()) == {30}
-    assert not set(refused) & set(benchmark.tasks)
-    assert set(benchmark.tasks) < set(drawn)
+    chosen, counts = construct(drawn, 3, 210, [result(task, False, "refused") for task in refused])
+    assert (counts["candidates"], counts["refused"], counts["overlapping"]) == (560, 5, 0)
+    assert set(Counter(task.axis for task in chosen).values()) == {30}
+    assert not set(refused) & set(chosen)
+    assert set(chosen) < set(drawn)
     file = tmp_path / "tasks.json"
-    construction.write(benchmark.tasks, 3, file)
-    assert select(Selection(file=file, seed=3)) == benchmark.tasks
-    chosen = select(Selection(file=file, seed=3, axes=("light",), subset=10))
-    assert len(chosen) == 10
-    assert {task.axis for task in chosen} == {"light"}
+    tasks.write_tasks(chosen, 3, file)
+    assert select(Selection(file=file, seed=3)) == chosen
+    lights = select(Selection(file=file, seed=3, axes=("light",), subset=10))
+    assert len(lights) == 10
+    assert {task.axis for task in lights} == {"light"}
     with pytest.raises(PipelineError, match="--seed 3"):
         select(Selection(file=file))
     file.write_text("[]")
@@ -173,14 +173,14 @@ def test_a_planted_copy_of_a_held_out_draw_is_found(axis: str) -> None:
     tasks = select(Selection(source="own", suites=(STOVE.suite,), tasks=("put_the_bowl_on_the_plate",), axes=(axis,)))
     base = find_task(tasks[0].suite, tasks[0].base)
     drawn = [(task.name, draw(task, 0), base) for task in tasks]
-    (found,) = disjoint.compare(drawn, PlannedDraws([planned_row(tasks[2], drawn[2][1])])).values()
-    assert found.overlaps >= 1
-    assert found.smallest == 0
-    assert found.closest == (tasks[2].name, "planted")
-    other = disjoint.compare(drawn, PlannedDraws([planned_row(tasks[2], draw(tasks[2], 1))]))[axis]
-    assert other.draws == 5
-    assert other.planned == 1
-    assert disjoint.compare(drawn, PlannedDraws([]))[axis].smallest is None
+    (found,) = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], drawn[2][1])])).values()
+    assert found["overlaps"] >= 1
+    assert found["smallest"] == 0
+    assert found["closest"] == (tasks[2].name, "planted")
+    other = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], draw(tasks[2], 1))]))[axis]
+    assert other["draws"] == 5
+    assert other["planned"] == 1
+    assert own_draws.compare(drawn, PlannedDraws([]))[axis]["smallest"] is None
 
 
 def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
@@ -189,10 +189,10 @@ def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
     trained = [NoisePerturbation(component=effect.component, effect=effect, level=1, seed=0) for effect in effects]
     tasks = select(Selection(source="own", axes=("noise",), episodes=2))
     planned = PlannedDraws([planned_row(tasks[0], one) for one in trained])
-    found = disjoint.compare(((task.name, draw(task, 0), STOVE) for task in tasks), planned)["noise"]
-    assert found.overlaps == 0
-    assert found.smallest is not None
-    assert found.smallest >= found.clearance
+    found = own_draws.compare(((task.name, draw(task, 0), STOVE) for task in tasks), planned)["noise"]
+    assert found["overlaps"] == 0
+    assert found["smallest"] is not None
+    assert found["smallest"] >= found["clearance"]
 
 
 def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -334,7 +334,7 @@ def test_draws_that_a_plan_has_are_drawn_anew(tmp_path: Path) -> None:
     file = tmp_path / "plan.parquet"
     plan.write([planned_row(task, draw(task, 0))], file)
     settings = Settings(plan=file)
-    assert settings.model_dump()["plan"] == disjoint.sha256_of(file)
+    assert settings.model_dump()["plan"] == own_draws.sha256_of(file)
     assert "plan" not in Settings().model_dump()
     environment = EpisodeEnvironment(settings)
     environment.reset(task)

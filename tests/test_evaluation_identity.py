@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +14,21 @@ import checkpoints
 import numpy as np
 import pytest
 from conftest import STOVE
+from model_server import running
 
+from pipeline import identity
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
-from pipeline.evaluation import episode, merging, results
-from pipeline.evaluation.episode import EpisodeEnvironment
+from pipeline.evaluation import environment, results
+from pipeline.evaluation.checkpoint import Checkpoint
+from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.job import EvaluationJob, _environment, episode_id
-from pipeline.evaluation.policies import Checkpoint
-from pipeline.evaluation.policy_config import PolicyConfig
-from pipeline.evaluation.replay_server import running
+from pipeline.evaluation.policies import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.rollout import Evaluation, EvaluationJob, _environment
+from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import Settings
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.evaluation.tasks import EvaluationTask
 
 STEPS = 4
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
@@ -36,7 +39,7 @@ SETTINGS = Settings()
 def short() -> Iterator[None]:
     """Episodes of a few steps; afterwards the process gives back the environment that it keeps."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(episode.STEP_LIMITS, STOVE.suite, STEPS)
+        patch.setitem(environment.STEP_LIMITS, STOVE.suite, STEPS)
         yield
     _environment(SETTINGS, None).close()
 
@@ -55,9 +58,13 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return actions
 
 
+def evaluation(policy: PolicyConfig, out: Path, settings: Settings = SETTINGS) -> Evaluation:
+    return Evaluation(settings, policy, policy.identity(), out)
+
+
 def run(out: Path, checkpoint: Path, label: str = "", settings: Settings = SETTINGS) -> dict[str, Any]:
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoint), label=label)
-    return evaluate(CHOSEN, settings, policy, out, loop)
+    return evaluate(evaluation(policy, out, settings), CHOSEN, loop)
 
 
 def rescale(folder: Path) -> None:
@@ -94,7 +101,7 @@ def test_a_checkpoint_that_changes_where_it_is_is_evaluated_anew(
     assert taken == actions
     assert second["all"]["episodes"] == 1
     assert second["policy"] != first["policy"]
-    both = merging.read([out])
+    both = results.read([out])
     assert [policy.rows[0]["looks"] for policy in sorted(both, key=lambda one: one.rows[0]["looks"])] == sorted(
         [STEPS // checkpoints.CHUNK, looks]
     )
@@ -111,7 +118,7 @@ def test_a_copy_is_the_same_policy(tmp_path: Path, taken: list[float]) -> None:
     run(out, copy)
     assert len(taken) == STEPS
     run(tmp_path / "other_out", copy)
-    (policy,) = merging.read([out, tmp_path / "other_out"])
+    (policy,) = results.read([out, tmp_path / "other_out"])
     assert len(policy.rows) == 1
 
 
@@ -125,7 +132,7 @@ def test_one_name_is_not_given_to_two_policies(tmp_path: Path, taken: list[float
     assert len(taken) == STEPS, "it says so before anything is run"
     run(tmp_path / "two", two, "act")
     with pytest.raises(PipelineError, match="two policies have the name 'act'") as caught:
-        merging.read([tmp_path / "one", tmp_path / "two"])
+        results.read([tmp_path / "one", tmp_path / "two"])
     assert str(tmp_path / "one") in str(caught.value)
     assert str(tmp_path / "two") in str(caught.value)
 
@@ -136,7 +143,7 @@ def test_results_of_other_versions_are_made_again(
 ) -> None:
     checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
     first = run(out, checkpoint)
-    monkeypatch.setattr(results, "RECIPE", results.RECIPE + 1)
+    monkeypatch.setitem(identity.RECIPES, "evaluation", identity.RECIPES["evaluation"] + 1)
     second = run(out, checkpoint)
     assert len(taken) == 2 * STEPS
     assert second == first
@@ -153,7 +160,7 @@ def test_a_checkpoint_that_changes_during_the_run_stops_it(tmp_path: Path, monke
 
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoint))
     with pytest.raises(PipelineError, match="has changed since the evaluation began"):
-        evaluate(CHOSEN, SETTINGS, policy, tmp_path / "out", retrained_first)
+        evaluate(evaluation(policy, tmp_path / "out"), CHOSEN, retrained_first)
     assert not list(EpisodeFiles(tmp_path / "out").rows())
 
 
@@ -161,9 +168,9 @@ def test_a_checkpoint_that_changes_during_the_run_stops_it(tmp_path: Path, monke
 def test_a_video_shows_what_the_policy_does_not_look_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(episode.STEP_LIMITS, STOVE.suite, 20)
+    monkeypatch.setitem(environment.STEP_LIMITS, STOVE.suite, 20)
     chosen = CHOSEN.model_copy(update={"episodes": 2})
-    evaluate(chosen, SETTINGS, PolicyConfig(kind="open_loop"), tmp_path, loop, videos="all")
+    evaluate(replace(evaluation(PolicyConfig(kind="open_loop"), tmp_path), videos="all"), chosen, loop)
     assert "evaluate, episodes: 2/2, " in capsys.readouterr().err, "progress is counted in episodes"
     for row in EpisodeFiles(tmp_path).rows():
         assert row["looks"] == 0
@@ -193,13 +200,13 @@ def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Pat
 
 def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     tasks = tuple(select(CHOSEN.model_copy(update={"episodes": 2})))
-    policy = PolicyConfig(kind="open_loop")
-    job = EvaluationJob(tasks, SETTINGS, policy, policy.identity(), tmp_path, "", "none")
+    replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
+    job = EvaluationJob(replayed, tasks, "")
     assert job.episodes() == 2
     assert job.limit_s() > 3600
     assert job.lost() == [f"worker_lost ({task})" for task in tasks]
-    name = {"episode": episode_id(tasks[0], SETTINGS, policy.identity()), "policy": "replay", "settings": {}}
-    EpisodeFiles(tmp_path).save({**name, "identity": policy.identity(), "made_by": results.made_by(False, [])})
+    name = {"episode": replayed.episode(tasks[0]), "policy": "replay", "settings": {}}
+    EpisodeFiles(tmp_path).save({**name, "identity": replayed.identity, "made_by": results.made_by(False, [])})
     assert job.lost() == [f"worker_lost ({tasks[1]})"]
 
 
@@ -207,7 +214,7 @@ def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
     """As the versions before wrote them."""
     old = {"episode": "a", "source": "libero", "policy": "policy", "settings": {}, "success": True, "reason": "success"}
     EpisodeFiles(tmp_path).save(old)
-    for use in (lambda: merging.read([tmp_path]), lambda: run(tmp_path, checkpoints.save(tmp_path / "policy", 0.1))):
+    for use in (lambda: results.read([tmp_path]), lambda: run(tmp_path, checkpoints.save(tmp_path / "policy", 0.1))):
         with pytest.raises(PipelineError, match="does not say which policy") as caught:
             use()
         assert "a.json" in str(caught.value)
@@ -216,35 +223,35 @@ def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
 def test_a_server_needs_a_label(tmp_path: Path) -> None:
     policy = PolicyConfig(kind="server", address="ws://localhost:1")
     with pytest.raises(PipelineError, match="no label") as caught:
-        evaluate(CHOSEN, SETTINGS, policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path), CHOSEN, loop)
     assert "--label" in str(caught.value)
 
 
 @pytest.mark.slow
 def test_a_server_that_is_shown_something_else_is_not_counted_as_the_same(tmp_path: Path) -> None:
     """One label for two servers, of which the second looks at the state too."""
-    server = ("-m", "pipeline.evaluation.replay_server", "--args.tracked")
+    server = ("-m", "pipeline.evaluation.harness", "--args.tracked")
     with running(*server, "false") as address:
         policy = PolicyConfig(kind="server", address=address, label="act")
-        found = evaluate(CHOSEN, SETTINGS, policy, tmp_path, loop)
+        found = evaluate(evaluation(policy, tmp_path), CHOSEN, loop)
     assert found["settings"] | {"state": False, "images": True} == found["settings"]
     assert found["policy"] == {"name": "act", "identity": "claimed:act"}
     more = CHOSEN.model_copy(update={"episodes": 2})
     with running(*server, "true") as address, pytest.raises(PipelineError, match="seen in different ways: state"):
-        evaluate(more, SETTINGS, PolicyConfig(kind="server", address=address, label="act"), tmp_path, loop)
+        evaluate(evaluation(PolicyConfig(kind="server", address=address, label="act"), tmp_path), more, loop)
     assert json.loads((tmp_path / "summary.json").read_text()) == found, "no summary of both together"
-    assert {policy.name for policy in merging.read([tmp_path])} == {"act, state False", "act, state True"}
+    assert {policy.name for policy in results.read([tmp_path])} == {"act, state False", "act, state True"}
 
 
 def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path) -> None:
     policy = PolicyConfig(kind="open_loop")
     with pytest.raises(PipelineError, match="look_every"):
-        evaluate(CHOSEN, Settings(look_every=8), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(look_every=8)), CHOSEN, loop)
     plan = tmp_path / "plan.parquet"
     with pytest.raises(PipelineError, match="cannot be read"):
-        evaluate(CHOSEN, Settings(plan=plan), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(plan=plan)), CHOSEN, loop)
     plan.touch()
     with pytest.raises(PipelineError, match="plan"):
-        evaluate(CHOSEN, Settings(plan=plan), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(plan=plan)), CHOSEN, loop)
     with pytest.raises(PipelineError, match="seed"):
-        evaluate(CHOSEN, Settings(seed=1), policy, tmp_path, loop)
+        evaluate(evaluation(policy, tmp_path, Settings(seed=1)), CHOSEN, loop)

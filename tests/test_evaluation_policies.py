@@ -11,17 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import REPOSITORY
+from model_server import running
 
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.job import _environment
-from pipeline.evaluation.policies import PolicyError, checked_actions
-from pipeline.evaluation.policy_config import PolicyConfig
-from pipeline.evaluation.replay_server import running
+from pipeline.evaluation.policies import PolicyConfig
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.settings import Settings
-from pipeline.evaluation.tasks import Selection
+from pipeline.evaluation.rollout import Evaluation, _environment
+from pipeline.evaluation.selection import Selection
+from pipeline.evaluation.settings import PolicyError, Settings, checked_actions
 
 FAULTY_AND_STOVE = Selection(
     suites=("libero_object", "libero_goal"), tasks=("pick_up_the_milk*", "push_the_plate*", "turn_on*")
@@ -50,7 +49,7 @@ def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
     with running(FAULTY_SERVER) as address:
         policy = PolicyConfig(kind="server", address=address, label="faulty", timeout_s=10)
         with pytest.raises(PipelineError, match="2 episodes have no result") as raised:
-            evaluate(FAULTY_AND_STOVE, RECORDED, policy, tmp_path, loop)
+            evaluate(Evaluation(RECORDED, policy, policy.identity(), tmp_path), FAULTY_AND_STOVE, loop)
     for told in ("within 10 s", "pick_up_the_milk", "no such camera", "push_the_plate"):
         assert told in str(raised.value)
     (row,) = EpisodeFiles(tmp_path).rows()

@@ -14,12 +14,11 @@ from html_page import Page, needs_nothing_beside_itself, screenshot
 from scipy.stats import binomtest
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.comparison import compare, mcnemar, paired
-from pipeline.evaluation.findings import FAILURES
-from pipeline.evaluation.merging import read
-from pipeline.evaluation.paper_table import paper_table
-from pipeline.evaluation.results import EpisodeFiles, Row
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.evaluation.findings import FAILURES, paper_table
+from pipeline.evaluation.results import EpisodeFiles, Row, read
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.statistics import compare, mcnemar, paired
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.publish import evaluation_report
 from pipeline.seeding import digest
@@ -50,40 +49,40 @@ def result(task: EvaluationTask, policy: str, success: bool, prompt: str = "clea
 
 def test_the_published_rows_are_whole_and_add_up() -> None:
     table = paper_table({})
-    assert sum(table.tasks.values()) == 10_030
-    assert len(table.published) == 11
-    for row in table.published:
+    assert sum(table["tasks"].values()) == 10_030
+    assert len(table["published"]) == 11
+    for row in table["published"]:
         # Each total is the mean over tasks of the columns, all of them rounded to a tenth.
-        assert row.shared == pytest.approx(row.total, abs=0.1), row.name
+        assert row["shared"] == pytest.approx(row["total"], abs=0.1), row["name"]
 
 
 def test_an_episode_counts_for_the_test_tasks_that_it_stands_for() -> None:
     robot = {task.level: task for task in select(Selection(source="libero_plus", axes=("robot",)))}
-    line = paper_table({"mine": [result(robot[1], "mine", True), result(robot[5], "mine", False)]}).evaluated[0]
+    line = paper_table({"mine": [result(robot[1], "mine", True), result(robot[5], "mine", False)]})["evaluated"][0]
     # 156 tasks of level 1 and 371 of level 5: 156 / 527, and 527^2 / (156^2 + 371^2) episodes' worth.
-    assert line.cells["robot"].rate == pytest.approx(0.29602, abs=1e-5)
-    assert line.cells["robot"].effective == pytest.approx(1.71462, abs=1e-5)
-    assert line.cells.keys() == {"robot"}
-    assert line.total is None
-    assert line.shared is not None
-    assert line.shared.rate == line.cells["robot"].rate
-    assert "level 2" in line.cells["robot"].absent
+    assert line["cells"]["robot"]["rate"] == pytest.approx(0.29602, abs=1e-5)
+    assert line["cells"]["robot"]["effective"] == pytest.approx(1.71462, abs=1e-5)
+    assert line["cells"].keys() == {"robot"}
+    assert line["total"] is None
+    assert line["shared"] is not None
+    assert line["shared"]["rate"] == line["cells"]["robot"]["rate"]
+    assert "level 2" in line["cells"]["robot"]["absent"]
 
 
 def test_all_tasks_of_a_column_weigh_the_same() -> None:
     rows = [result(task, "mine", task.level == 1) for task in select(Selection(source="libero_plus", axes=("camera",)))]
-    (line,) = paper_table({"mine": rows}).evaluated
+    (line,) = paper_table({"mine": rows})["evaluated"]
     # Of level 1: 10 by distance, 6 by orientation, 117 by spherical position.
-    assert line.cells["camera"].rate == pytest.approx(133 / 1599)
-    assert line.cells["camera"].effective == pytest.approx(1599)
-    assert line.cells["camera"].absent == ""
+    assert line["cells"]["camera"]["rate"] == pytest.approx(133 / 1599)
+    assert line["cells"]["camera"]["effective"] == pytest.approx(1599)
+    assert line["cells"]["camera"]["absent"] == ""
 
 
 def test_a_column_says_what_it_does_not_rest_on() -> None:
     rows = [result(task, "mine", True) for task in select(Selection(source="libero_plus", axes=("pose",)))]
-    (line,) = paper_table({"mine": rows}).evaluated
-    assert line.cells["layout"].episodes == 696
-    assert line.cells["layout"].absent == "confounding objects (829 tasks)"
+    (line,) = paper_table({"mine": rows})["evaluated"]
+    assert line["cells"]["layout"]["episodes"] == 696
+    assert line["cells"]["layout"]["absent"] == "confounding objects (829 tasks)"
 
 
 def test_mcnemars_test_is_exact() -> None:

@@ -5,22 +5,24 @@ from __future__ import annotations
 import io
 import json
 import pickle
-import zipfile
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from conftest import STOVE
 
 from pipeline import seeding
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
-from pipeline.evaluation.initial_states import libero_states, moved_state, pickled_array
-from pipeline.evaluation.results import summary, wilson
-from pipeline.evaluation.tasks import EvaluationTask, Selection, balanced, draw, select
+from pipeline.evaluation.libero_plus import moved_state, saved_array
+from pipeline.evaluation.own_draws import draw
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.statistics import summary, wilson
+from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
 from pipeline.libero.starts import HOME_RAD
 
 
@@ -92,6 +94,13 @@ def test_instructions_are_clean_or_the_benchmarks() -> None:
     assert told("language", "libero_goal", "clean") == told("language", "libero_goal", "benchmark")
 
 
+def test_a_test_task_that_a_suite_does_not_have_is_refused() -> None:
+    (test, *_) = (test for (suite, _), test in libero_plus.by_name().items() if suite == "libero_goal")
+    assert libero_plus.find("libero_goal", test.name) is test
+    with pytest.raises(PipelineError, match="libero_10: LIBERO-Plus has no test task"):
+        libero_plus.find("libero_10", test.name)
+
+
 def test_postures_are_the_benchmarks_tables() -> None:
     postures = libero_plus.postures_rad()
     listed = np.array([postures[number] for number in range(1, 501)])
@@ -109,10 +118,9 @@ def test_states_of_moved_scenes_are_read_without_running_a_pickle() -> None:
             return print, ("run",)
 
     packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        archive.writestr("archive/data.pkl", pickle.dumps(Hostile(), protocol=2))
-    with pytest.raises(PipelineError, match="print"):
-        pickled_array(packed.getvalue(), "hostile")
+    torch.save(Hostile(), packed)
+    with pytest.raises(pickle.UnpicklingError, match="print"):
+        saved_array(packed.getvalue())
 
 
 def test_intervals_are_wilsons() -> None:

@@ -12,7 +12,8 @@ from conftest import BOWL, MILK, STOVE, starter_demo
 from scipy.spatial.transform import Rotation
 
 from pipeline.libero.starts import recorded_start
-from pipeline.physics.environment import Environment, seeded
+from pipeline.physics.control_env import seeded
+from pipeline.physics.environment import Environment
 from pipeline.types import Floats, Task, Trajectory
 
 

@@ -131,13 +131,14 @@ def test_extras_change_no_frame_and_need_asking_for(rendered: Rendered, middle: 
 def test_depth_is_mujocos_own(middle: Trajectory) -> None:
     renderer = Renderer(middle.model_xml)
     renderer.restore(middle.states[0], middle.site_alpha[0])
+    option = mujoco.MjvOption()
+    option.geomgroup[0] = 0
     for view in SCHEMA.views.values():
         mine = renderer.surfaces(view.camera).depth_m
-        theirs = renderer._renderer
-        theirs.enable_depth_rendering()
-        theirs.update_scene(renderer.data, view.camera, renderer._option)
-        assert np.abs(theirs.render()[::-1] - mine).max() < SCHEMA.depth.unit_m / 2
-        theirs.disable_depth_rendering()
+        with mujoco.Renderer(renderer.model, *mine.shape) as theirs:
+            theirs.enable_depth_rendering()
+            theirs.update_scene(renderer.data, view.camera, option)
+            assert np.abs(theirs.render()[::-1] - mine).max() < SCHEMA.depth.unit_m / 2
     renderer.close()
 
 

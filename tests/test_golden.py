@@ -1,14 +1,15 @@
-"""What a trajectory or a frame is does not change unless its layer's recipe number does."""
+"""What a step makes does not change unless its recipe number does."""
 
 from __future__ import annotations
 
+import golden_stages
 import numpy as np
 import pytest
 from golden import Golden, recorded
 
 from pipeline import gl, identity
 
-REMEDY = "raise the layer's number in pipeline.identity.RECIPES and run `python tests/golden.py`"
+REMEDY = "raise the step's number in pipeline.identity.RECIPES and run `python tests/golden.py`"
 GREY_LEVELS = 3.0
 """How far a cell of a thumbnail may be off on a renderer that is not recorded."""
 
@@ -35,6 +36,17 @@ def test_pixels(golden: Golden) -> None:
 
 def test_encoding(golden: Golden) -> None:
     assert golden.encoding() == recorded()["encoding"][str(identity.RECIPES["encoding"])], REMEDY
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", golden_stages.STEPS)
+def test_stages_behind_the_frames(step: identity.Step) -> None:
+    assert golden_stages.STEPS[step]() == recorded()[step][str(identity.RECIPES[step])], REMEDY
+
+
+def test_every_recipe_has_golden_results() -> None:
+    lacking = [step for step, number in identity.RECIPES.items() if str(number) not in recorded()[step]]
+    assert lacking == [], "run `python tests/golden.py`"
 
 
 def test_a_changed_pixel_is_noticed(golden: Golden) -> None:

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import arenas
 import mujoco
 import numpy as np
 import pytest
-from arenas import TASKS
+from arenas import TASKS, both_ways
 from numpy.typing import NDArray
-from test_culling import plain
 
 from pipeline import seeding
 from pipeline.axes.background import BackgroundAxis
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.culling import Picture
+from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.drawing import Shot, SoftwareDrawing
 
 BODIES = 12
 CAMERAS = ("fixed", "moving")
@@ -58,67 +59,73 @@ def scene(shadows: bool) -> str:
     </mujoco>"""
 
 
+@dataclass
+class Pair:
+    """A scene drawn with savings and plainly.
+
+    Attributes:
+        drawn: how many bodies' geoms each call to OpenGL had to draw.
+    """
+
+    opened: Renderer
+    ours: SoftwareDrawing
+    plain: PlainDrawing
+    drawn: list[int]
+
+    def same(self, *cameras: str) -> bool:
+        mujoco.mj_forward(self.opened.model, self.opened.data)
+        return all(
+            np.array_equal(self.opened.frame(camera), self.plain.frame(self.opened.data, camera)) for camera in cameras
+        )
+
+
 @pytest.fixture
-def renderer(request: pytest.FixtureRequest) -> Iterator[Renderer]:
+def pair(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pair]:
     opened = Renderer(scene(shadows=getattr(request, "param", False)))
-    yield opened
-    opened.close()
+    with both_ways(opened) as (ours, plain):
+        draw, made = ours._draw, Pair(opened, ours, plain, [])
+
+        def counted(shot: Shot, opaque: NDArray[np.bool_], *how: Any, **more: Any) -> None:
+            made.drawn.append(int(opaque[-BODIES:].sum()))
+            draw(shot, opaque, *how, **more)
+
+        monkeypatch.setattr(ours, "_draw", counted)
+        yield made
 
 
-@pytest.fixture
-def drawn(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many bodies' geoms each call to OpenGL had to draw."""
-    counts: list[int] = []
-    draw = renderer._draw
-
-    def counted(picture: Picture, opaque: NDArray[np.bool_], *how: Any, **more: Any) -> None:
-        counts.append(int(opaque[-BODIES:].sum()))
-        draw(picture, opaque, *how, **more)
-
-    monkeypatch.setattr(renderer, "_draw", counted)
-    return counts
-
-
-def assert_as_plain(renderer: Renderer, *cameras: str) -> None:
-    mujoco.mj_forward(renderer.model, renderer.data)
-    for camera in cameras:
-        assert np.array_equal(renderer.frame(camera), plain(renderer, camera)), camera
-
-
-@pytest.mark.parametrize("renderer", [False, True], ids=["lights", "shadows"], indirect=True)
-def test_the_same_pixels_whatever_moves(renderer: Renderer) -> None:
-    rng = seeding.rng("test_layers", "moves")
+@pytest.mark.parametrize("pair", [False, True], ids=["lights", "shadows"], indirect=True)
+def test_the_same_pixels_whatever_moves(pair: Pair) -> None:
+    rng, data = seeding.rng("test_layers", "moves"), pair.opened.data
     for step in range(80):
         # Now one of them moves, now several, now none; the last is the camera's body.
         for body in rng.choice(BODIES, rng.integers(0, 3), replace=False):
-            renderer.data.mocap_pos[body] += rng.normal(0, 0.05, 3)
+            data.mocap_pos[body] += rng.normal(0, 0.05, 3)
         if step % 10 > 5:
-            renderer.data.mocap_pos[-1] += rng.normal(0, 0.05, 3)
+            data.mocap_pos[-1] += rng.normal(0, 0.05, 3)
         if step % 20 == 19:
-            renderer.model.site_rgba[2, :3] = rng.random(3)
-        assert_as_plain(renderer, *CAMERAS)
+            pair.opened.model.site_rgba[2, :3] = rng.random(3)
+        assert pair.same(*CAMERAS)
 
 
-@pytest.mark.parametrize("renderer", [False, True], ids=["lights", "shadows"], indirect=True)
-def test_what_stands_still_is_drawn_once(renderer: Renderer, drawn: list[int]) -> None:
+def test_what_stands_still_is_drawn_once(pair: Pair) -> None:
     for step in range(30):
-        renderer.data.mocap_pos[0, 2] = 0.01 * step
-        mujoco.mj_forward(renderer.model, renderer.data)
+        pair.opened.data.mocap_pos[0, 2] = 0.01 * step
+        mujoco.mj_forward(pair.opened.model, pair.opened.data)
         if step == 10:
-            drawn.clear()
-        renderer.frame("fixed")
-    assert len(renderer._layers) == 1
-    assert sum(drawn) < 20 * BODIES
+            pair.drawn.clear()
+        pair.opened.frame("fixed")
+    assert len(pair.ours._layers) == 1
+    assert sum(pair.drawn) < 20 * BODIES
 
 
-def test_what_trembles_is_left_out_of_the_layer(renderer: Renderer, drawn: list[int]) -> None:
+def test_what_trembles_is_left_out_of_the_layer(pair: Pair) -> None:
     for step in range(90):
-        renderer.data.mocap_pos[:3, 2] += 1e-5 * (step % 5 == 0)
-        mujoco.mj_forward(renderer.model, renderer.data)
+        pair.opened.data.mocap_pos[:3, 2] += 1e-5 * (step % 5 == 0)
+        mujoco.mj_forward(pair.opened.model, pair.opened.data)
         if step == 40:
-            drawn.clear()
-        renderer.frame("fixed")
-    assert max(drawn) < BODIES, "the layer of those that stand still is as it was"
+            pair.drawn.clear()
+        pair.opened.frame("fixed")
+    assert max(pair.drawn) < BODIES, "the layer of those that stand still is as it was"
 
 
 @pytest.mark.parametrize(
@@ -132,14 +139,14 @@ def test_what_trembles_is_left_out_of_the_layer(renderer: Renderer, drawn: list[
         ("geom_matid", 1),
     ],
 )
-def test_a_changed_look_is_seen(renderer: Renderer, field: str, value: float) -> None:
+def test_a_changed_look_is_seen(pair: Pair, field: str, value: float) -> None:
     for _ in range(4):
-        mujoco.mj_forward(renderer.model, renderer.data)
-        before = renderer.frame("fixed")
-    array = getattr(renderer.model, field)
+        mujoco.mj_forward(pair.opened.model, pair.opened.data)
+        before = pair.opened.frame("fixed")
+    array = getattr(pair.opened.model, field)
     array[..., -1 if field == "geom_rgba" else slice(None)] = value
-    assert_as_plain(renderer, "fixed")
-    assert not np.array_equal(renderer.frame("fixed"), before)
+    assert pair.same("fixed")
+    assert not np.array_equal(pair.opened.frame("fixed"), before)
 
 
 @pytest.mark.slow
@@ -154,9 +161,9 @@ def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(aren
     site_alpha = opened.model.site_rgba[:, 3].astype(np.float32)
     for step, state in enumerate(states):
         state[1:8] += 0.1 * step
-    try:
+    with both_ways(opened) as (ours, plain):
         with opened.painted(choices) as shows:
-            assert opened._painted.any()
+            assert ours._painted.any()
             made = []
             for state in states:
                 opened.restore(state, site_alpha)
@@ -164,10 +171,9 @@ def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(aren
                     show()
                     made.append([opened.frame(camera) for camera in cameras])
         for number, choice in enumerate(choices):
-            with opened.perturbed(choice):
+            beside = Renderer(opened.model, plain)
+            with beside.perturbed(choice):
                 for step, state in enumerate(states):
-                    opened.restore(state, site_alpha)
-                    expected = [plain(opened, camera) for camera in cameras]
+                    beside.restore(state, site_alpha)
+                    expected = [beside.frame(camera) for camera in cameras]
                     assert np.array_equal(made[step * len(choices) + number], expected), (number, step)
-    finally:
-        opened.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 from collections.abc import Iterator
 from statistics import mean
 from typing import get_args
@@ -12,7 +13,7 @@ from arenas import TASKS, change, changed, checksums, frames, renderer
 from conftest import MILK
 
 from pipeline.axes.base import Level
-from pipeline.axes.light import Component, LightAxis, LightPerturbation, exposure
+from pipeline.axes.light import TILT_AZIMUTH_DEG, Component, LightAxis, LightPerturbation, exposure
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Frame, Task
@@ -31,15 +32,26 @@ def drawn(component: Component, level: Level, key: str | int, task: Task = MILK)
 
 
 def weakest_and_strongest(task: Task) -> Iterator[LightPerturbation]:
-    """A draw of each component at levels 1 and 5; of ``diffuse`` a darker, a brighter and a tinted one, where drawn."""
+    """A draw of each component at levels 1 and 5.
+
+    Of ``diffuse`` it is a darker, a brighter and a tinted one, where drawn; of ``combined`` one with shadows and one
+    without; of ``direction`` one for each edge of the range of the azimuth, where a tilt changes least. Last comes the
+    weakest tint in yellow, a hue that changes least in the study.
+    """
     for component in COMPONENTS:
         levels: tuple[Level, ...] = (1, 5)
         for level in levels:
             kinds: dict[object, LightPerturbation] = {}
-            for key in range(20 if component == "diffuse" else 1):
+            for key in range(20 if component in ("diffuse", "combined") else 1):
                 one = drawn(component, level, key, task)
-                kinds["tinted" if len({*one.diffuse_scale_rgb}) > 1 else one.diffuse_scale_rgb[0] > 1] = one
+                tint = "tinted" if len({*one.diffuse_scale_rgb}) > 1 else one.diffuse_scale_rgb[0] > 1
+                kinds[tint if component == "diffuse" else one.shadows] = one
+            if component == "direction":
+                (edges,) = TILT_AZIMUTH_DEG
+                kinds = {edge: one.model_copy(update={"tilt_azimuth_deg": edge}) for edge in edges}
             yield from kinds.values()
+    ((weakest, _),) = LightAxis().ranges[0].saturation
+    yield NEUTRAL.model_copy(update={"diffuse_scale_rgb": colorsys.hsv_to_rgb(1 / 6, weakest, 1.0)})
 
 
 def share_changed(before: Frame, after: Frame) -> float:
@@ -49,22 +61,47 @@ def share_changed(before: Frame, after: Frame) -> float:
 def test_draws_are_keyed_recorded_and_touch_their_property_alone() -> None:
     properties = {
         "diffuse": {"diffuse_scale_rgb"},
-        "direction": {"orbit_deg", "tilt_deg", "tilt_azimuth_deg"},
+        "direction": {"tilt_deg", "tilt_azimuth_deg"},
         "specular": {"specular_scale"},
-        "shadows": {"shadows", "fill_scale", "orbit_deg"},
+        "shadows": {"shadows", "fill_scale", "tilt_deg", "tilt_azimuth_deg"},
     }
-    properties["combined"] = set().union(*properties.values())
+    everything = set().union(*properties.values())
     for key in range(100):
         one = LightAxis().sample(rng("key", key), MILK, 0)
         assert one == LightAxis().sample(rng("key", key), MILK, 5)
         assert LightPerturbation.model_validate_json(one.model_dump_json()) == one
         different = {name for name, value in one if value != getattr(NEUTRAL, name)} - {"component", "level"}
+        properties["combined"] = everything - (set() if one.shadows else {"shadows", "fill_scale"})
         assert different == properties[one.component]
-    assert {LightAxis().sample(rng("key", key), MILK, 0).component for key in range(100)} == set(COMPONENTS)
+
+
+def test_the_four_properties_mostly_change_together() -> None:
+    draws = [LightAxis().sample(rng("key", key), MILK, 0) for key in range(1000)]
+    combined = [one for one in draws if one.component == "combined"]
+    assert len(combined) == pytest.approx(600, abs=50)
+    assert sum(one.shadows for one in combined) == pytest.approx(len(combined) / 2, abs=50)
+    for component in ("diffuse", "direction", "specular", "shadows"):
+        assert sum(one.component == component for one in draws) == pytest.approx(100, abs=30)
+
+
+@pytest.mark.parametrize(
+    ("components", "share", "expected"),
+    [
+        (("combined",), 0.0, {"combined"}),
+        (("diffuse", "specular"), 1.0, {"diffuse", "specular"}),
+        (("diffuse", "combined"), 0.0, {"diffuse"}),
+        (("diffuse", "combined"), 1.0, {"combined"}),
+    ],
+)
+def test_the_share_of_combined_draws_is_among_the_components(
+    components: tuple[Component, ...], share: float, expected: set[Component]
+) -> None:
+    axis = LightAxis(components=components, combined_share=share)
+    assert {axis.sample(rng("key", key), MILK, 0).component for key in range(30)} == expected
 
 
 def test_ranges_grow_with_the_level() -> None:
-    for component, name in (("direction", "tilt_deg"), ("specular", "specular_scale"), ("shadows", "orbit_deg")):
+    for component, name in (("direction", "tilt_deg"), ("specular", "specular_scale"), ("shadows", "tilt_deg")):
         values = [abs(getattr(drawn(component, level, 0), name)) for level in (1, 2, 3, 4, 5)]  # type: ignore[arg-type]
         assert values == sorted(set(values))
     fills = [drawn("shadows", level, 0).fill_scale for level in (1, 2, 3, 4, 5)]
@@ -78,8 +115,11 @@ def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
     try:
         before, clean = checksums(shown), frames(shown)
         directions, colours = shown.model.light_dir.copy(), shown.model.light_diffuse.copy()
-        with shown.perturbed([drawn("combined", 5, arena)]):
+        places = shown.model.light_pos.copy()
+        everything = next(one for key in range(20) if (one := drawn("combined", 5, key)).shadows)
+        with shown.perturbed([everything]):
             assert changed(before, checksums(shown)) <= set(LightPerturbation.fields)
+            assert np.array_equal(shown.model.light_pos, places)
             assert shown.model.light_castshadow.all()
             assert (shown.model.light_diffuse != colours).any(axis=1).all()
             assert np.allclose(np.linalg.norm(shown.model.light_dir, axis=1), 1)
@@ -99,7 +139,8 @@ def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
         assert [exposure(frame) for frame in clean.values()] == [None, None]
         dimmest = {"diffuse_scale_rgb": (0.0, 0.0, 0.0), "tilt_deg": 32.0}
         brightest = {"diffuse_scale_rgb": (2.0, 2.0, 2.0), "specular_scale": 30.0}
-        lit = {"shadows": True, "orbit_deg": 180.0, "fill_scale": 0.5}
+        # The table and the floor below the wrist's camera are brightest with lamps turned so.
+        lit = {"shadows": True, "tilt_deg": 20.0, "tilt_azimuth_deg": 200.0}
         for corner in (dimmest, brightest | lit):
             with shown.perturbed([NEUTRAL.model_copy(update=corner)]):
                 assert [exposure(frame) for frame in frames(shown).values()] == [None, None], corner
@@ -131,13 +172,12 @@ def test_light_comes_from_where_the_parameters_say() -> None:
     shown = renderer("tabletop")
     try:
         lamp = shown.model.light("light1")
-        with shown.perturbed([NEUTRAL.model_copy(update={"orbit_deg": 90.0})]):
-            assert np.allclose(lamp.pos, [-1, 1, 4])
         nominal = lamp.dir.copy()
         for azimuth, towards in ((0.0, [1, 0]), (90.0, [0, 1])):
             tilted = NEUTRAL.model_copy(update={"tilt_deg": 20.0, "tilt_azimuth_deg": azimuth})
             with shown.perturbed([tilted]):
                 assert (lamp.dir[:2] - nominal[:2]) @ towards > 0.3
+                assert np.array_equal(lamp.pos, [1, 1, 4])
     finally:
         shown.close()
 
@@ -147,10 +187,9 @@ def test_shadows_are_there_and_soften() -> None:
     shown = renderer("floor")
     darkest = []
     try:
-        for fill in (0.0, 0.5):
+        for fill in (0.0, 0.3):
             light, dark = (
-                NEUTRAL.model_copy(update={"shadows": shadows, "fill_scale": fill, "orbit_deg": 180.0})
-                for shadows in (False, True)
+                NEUTRAL.model_copy(update={"shadows": shadows, "fill_scale": fill}) for shadows in (False, True)
             )
             with shown.perturbed([light]):
                 unshadowed = frames(shown, ["agentview"])["agentview"].astype(int)

@@ -17,16 +17,16 @@ from pipeline import gl
 # The harness's classes import robosuite, which renders with what MUJOCO_GL says then.
 gl.choose()
 
+from model_server import running  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
-from pipeline.evaluation import episode  # noqa: E402
-from pipeline.evaluation.episode import EpisodeEnvironment  # noqa: E402
+from pipeline.evaluation import environment  # noqa: E402
+from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
+from pipeline.evaluation.harness import PerturbedLibero  # noqa: E402
 from pipeline.evaluation.policies import Server  # noqa: E402
-from pipeline.evaluation.replay_server import running  # noqa: E402
 from pipeline.evaluation.rollout import roll_out_policy  # noqa: E402
-from pipeline.evaluation.tasks import Selection, select  # noqa: E402
-from pipeline.evaluation.vla_eval_benchmark import PerturbedLibero  # noqa: E402
+from pipeline.evaluation.selection import Selection, select  # noqa: E402
 
 STEPS, LOOK_EVERY = 17, 8
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
@@ -81,7 +81,7 @@ def shown(run: Run, out: Path, chunk: int, keeps: bool, look_every: int) -> tupl
 @pytest.fixture(scope="module", autouse=True)
 def short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(episode.STEP_LIMITS, STOVE.suite, STEPS)
+        patch.setitem(environment.STEP_LIMITS, STOVE.suite, STEPS)
         yield
 
 

@@ -81,7 +81,7 @@ def test_numpy_before_this_project_is_told_of_and_how_to_mend_it() -> None:
     assert "import pipeline first" in done.stderr
     # The other remedy of the message.
     settings = dict(re.findall(r'(\w+)="([^"]*)"', done.stderr))
-    script = "import numpy; from pipeline import identity; print(identity.machine()['machine code'])"
+    script = "import numpy; from pipeline.identity import made_with; print(made_with('physics')['machine code'])"
     assert settings.keys() == SETTINGS.keys()
     done = python(script, **settings)
     assert (done.stdout.strip(), done.stderr) == (FIXED, "")
@@ -92,11 +92,11 @@ def test_nothing_is_stored_or_taken_for_old_with_other_machine_code(tmp_path: Pa
 import numpy
 from pathlib import Path
 from pipeline.errors import PipelineError
-from pipeline.run.machine import same_machine
+from pipeline.identity import made_with
 from pipeline.stores.trajectory_store import TrajectoryStore
-for use in (TrajectoryStore, same_machine):
+for use in (lambda: TrajectoryStore(Path("none")), lambda: made_with("physics")):
     try:
-        use(Path("none"))
+        use()
     except PipelineError as error:
         print(error)
 """

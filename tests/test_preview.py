@@ -201,7 +201,6 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
         scene=stage.scene,
         states=np.stack([environment.state] * 2),
         actions=np.zeros((1, 7)),
-        kept_mask=np.ones(1, bool),
         site_alpha=np.stack([environment.site_alpha] * 2),
         verdict=Verdict(True, "kept"),
     )

@@ -149,7 +149,7 @@ def test_render_layers_in_order(whole: dict[Task, Trajectory], short_demos: Path
     source = whole[MILK]
     steps = 8
     trajectory = Trajectory("t", "open_loop", source.scene, source.states[: steps + 1], source.actions[:steps],
-                            source.kept_mask, source.site_alpha[: steps + 1], source.verdict)  # fmt: skip
+                            source.site_alpha[: steps + 1], source.verdict)  # fmt: skip
     noise = NoiseAxis().sample(rng("order"), MILK, 0)
     streams = [
         Stream("image", ()),

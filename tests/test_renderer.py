@@ -16,9 +16,11 @@ from arenas import TASKS, frames
 
 from pipeline.axes.light import LightPerturbation
 from pipeline.physics.environment import Environment
+from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.drawing import SoftwareDrawing
 from pipeline.types import Floats, Frame
 
 SHADOWS = LightPerturbation(component="shadows", level=5, shadows=True)
@@ -51,19 +53,20 @@ def test_one_context_shows_one_scene_after_the_other_as_contexts_of_their_own() 
     scenes = {arena: arenas.scene(arena) for arena in TASKS} | {"elsewhere": elsewhere()}
     expected = {}
     for name, (model_xml, state) in scenes.items():
-        with closing(Renderer(model_xml)) as alone:
+        model = mujoco.MjModel.from_xml_string(model_xml)
+        with closing(Renderer(model, PlainDrawing(model))) as alone:
             expected[name] = shown(alone, state)
     assert any((expected["elsewhere"][view] != frame).any() for view, frame in expected["tabletop"].items())
 
     with closing(LastScene()) as opened:
-        first = opened.renderer(scenes["tabletop"][0])
+        first = opened.renderer(scenes["tabletop"][0]).drawing
         for turn, name in enumerate(
             ("tabletop", "elsewhere", "kitchen", "tabletop", "living_room", "floor", "study", "tabletop", "elsewhere")
         ):
             model_xml, state = scenes[name]
             # A model has its images; of MJCF, those are read that the scene before does not have.
             renderer = opened.renderer(model_xml if turn % 4 else mujoco.MjModel.from_xml_string(model_xml))
-            assert renderer is first
+            assert renderer.drawing is first
             for view, frame in shown(renderer, state).items():
                 assert np.array_equal(frame, expected[name][view]), (name, view)
 
@@ -76,10 +79,11 @@ def test_a_scene_drawn_with_other_buffers_gets_a_context_of_its_own() -> None:
         before = shown(first, state)
         coarse = mujoco.MjModel.from_xml_string(model_xml)
         coarse.vis.quality.offsamples = 0
-        assert not first.adopted(coarse)
+        assert not first.drawing.adopt(coarse)
         assert all(np.array_equal(frame, before[view]) for view, frame in shown(first, state).items())
         second = opened.renderer(coarse)
-        assert second is not first
+        assert isinstance(second.drawing, PlainDrawing)
+        assert not isinstance(second.drawing, SoftwareDrawing)
         assert any((frame != before[view]).any() for view, frame in shown(second, state).items())
 
 
@@ -128,7 +132,6 @@ def test_a_scene_after_one_that_failed_half_way_is_shown_as_it_is(tmp_path: Path
         expected = alone.frame("agentview")
     with closing(LastScene()) as opened:
         opened.renderer(scene)
-        # Its image is read when its geoms have taken the place of the others.
         with pytest.raises(ValueError, match=r"broken\.png"):
             opened.renderer(painted("sphere", broken))
         renderer = opened.renderer(scene)

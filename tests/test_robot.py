@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 from pipeline.axes.robot import RobotAxis, RobotPerturbation, benchmark_offsets_rad
 from pipeline.config import ReplayConfig
 from pipeline.errors import RefusedError
-from pipeline.evaluation.initial_states import libero_states
+from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.assets import relocate
 from pipeline.libero.starts import HOME_RAD, recorded_start
-from pipeline.physics.environment import Environment, seeded
+from pipeline.physics.control_env import seeded
+from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
 from pipeline.physics.roll_out import roll_out
 from pipeline.scenes.compiled import CompiledScene

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
+from conftest import MILK, REPOSITORY
 
 from pipeline.axes import AnyAxis, AnyPerturbation, Axes
 from pipeline.axes.background import BackgroundAxis
@@ -16,14 +17,16 @@ from pipeline.axes.layout import LayoutAxis
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
-from pipeline.config import load
+from pipeline.config import DemosConfig, PlanConfig, ReplayConfig, load
 from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.planning import plan
 from pipeline.publish import seen
 from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset import benchmark
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.types import Floats
 
 KINDS = {("robot", "initial_joints"): "controller_posture", ("pose", "pose"): "scene"}
 """What this project calls what the benchmark's test tasks do, where the names differ."""
@@ -51,11 +54,10 @@ def draws(name: str, axis: AnyAxis) -> list[AnyPerturbation]:
 @pytest.mark.parametrize(("name", "axis"), AXES, ids=[name for name, _ in AXES])
 def test_the_defaults_draw_every_kind_of_test_at_every_level(name: str, axis: AnyAxis, test: TestSet) -> None:
     drawn = draws(name, axis)
-    tested = {KINDS.get((name, component), component) for of, component in benchmark.COUNTS if of == name}
+    tested = {KINDS.get((name, task.component), task.component) for task in test.of(name)}
     assert tested <= {one.component for one in drawn}
     for component in tested:
         assert {one.level for one in drawn if one.component == component} == {1, 2, 3, 4, 5}, component
-    assert {task.component for task in test.of(name)} == {of for axis, of in benchmark.COUNTS if axis == name}
 
 
 def test_light_and_language_are_drawn_too() -> None:
@@ -65,6 +67,34 @@ def test_light_and_language_are_drawn_too() -> None:
 def test_a_spread_is_its_percentiles() -> None:
     assert seen.spread(np.arange(101.0)) == (101, 10.0, 50.0, 90.0)
     assert str(seen.spread([2.0])) == "2 (2 to 2)"
+
+
+def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
+    entries = DemosConfig(tasks=(f"{MILK.suite}/{MILK.name}",)).index().entries
+    drawing = PlanConfig.model_validate({"seed": 3, "axes": {"pose": {}}, "episodes": {"pose": 2}, "reserve": 0.0})
+    rows = plan.make(entries, drawing, ReplayConfig(), TestSet(()))
+    listed = [json.loads(row.perturbations)[0]["moves"] for row in rows if row.role == "perturbed"]
+    draws = [{move["name"]: np.array([move["dx_m"], move["dy_m"]]) for move in moves} for moves in listed]
+    assert np.linalg.norm(draws[0]["milk_1"] - draws[1]["milk_1"]) > 0.03
+
+    def moved(task: str, number: int, milk: Floats) -> TestTask:
+        (milk_x, milk_y), (basket_x, basket_y) = milk, draws[0]["basket_1"]
+        moves = f"milk_1:{milk_x},{milk_y};basket_1:{basket_x},{basket_y};ketchup_1:1,1"
+        return TestTask(MILK.suite, task, f"{task}_{number}", "pose", "pose", {"moves": moves})
+
+    away = np.array([0.006, 0.008])
+    test = TestSet(
+        (
+            moved(MILK.name, 1, draws[0]["milk_1"] + away),
+            moved(MILK.name, 2, draws[1]["milk_1"] + 2 * away),
+            moved(MILK.name, 3, draws[1]["milk_1"]),
+            moved("pick_up_the_ketchup_and_place_it_in_the_basket", 1, away),
+        )
+    )
+    # The milk and the basket of each in turn, and nothing else.
+    assert [cm for _, cm in seen.to_nearest_draw(test, rows)] == pytest.approx([1, 0, 2, 0, 0, 0])
+    between_cm = 100 * np.linalg.norm(draws[0]["milk_1"] + away - draws[1]["milk_1"] - [[0, 0], 2 * away], axis=1)
+    assert [cm for _, cm in seen.to_nearest_test(test)] == pytest.approx([between_cm.min(), 0, 2, 0, 2, 0])
 
 
 def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,9 +110,9 @@ def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: 
         if row["role"] == "twin"
     ]
     gripper = measures["clean", "gripper at the first look (mm)"]
-    assert gripper.ours is not None
+    assert isinstance(gripper.ours, seen.Spread)
     assert gripper.ours.middle == pytest.approx(float(np.median(widths_mm)), abs=0.01)
-    assert gripper.tested is not None
+    assert isinstance(gripper.tested, seen.Spread)
     assert gripper.tested.number == 40
     assert 77 < gripper.tested.middle < 78
     noisy = {row["component"] for row in rows if row["axis"] == "noise"}
@@ -92,4 +122,8 @@ def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: 
     assert words.ours.number == sum(row["axis"] == "language" for row in rows)
     assert words.tested is not None
     assert words.tested.number == 1537
-    assert measures["layout", "objects on the camera's side (share)"].ours is None
+    assert measures["layout", "object on the camera's side"].ours is None
+    assert measures["layout", "scenes with 5 added"].tested == seen.Share(829, round(207 / 829, 4))
+    assert measures["layout", "scenes with 2 added that repeat a model"].tested == seen.Share(151, round(9 / 151, 4))
+    for suite in SUITES[:4]:
+        assert measures["pose", f"test's thing of interest in {suite} to the nearest other (cm)"].tested

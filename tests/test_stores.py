@@ -7,7 +7,7 @@ import json
 import os
 import resource
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.render import render
 from pipeline.run import outcome
+from pipeline.run.remake import outdated
 from pipeline.run.render import STREAMS_OF_A_JOB, portions, render_plan
 from pipeline.run.replay import replay_plan
 from pipeline.seeding import rng
@@ -149,7 +150,7 @@ def test_a_table_that_does_not_fit_into_memory_is_not_called_damaged(
         raise pa.ArrowMemoryError("malloc of size 64 failed")
 
     # In place of a limit, under which PyArrow may wait for ever for a thread that it cannot start.
-    monkeypatch.setattr(pq, "read_table", short_of_memory)
+    monkeypatch.setattr(pq, "ParquetFile", short_of_memory)
     with pytest.raises(MemoryError):
         read_table(replayed / TABLE, [], "")
 
@@ -165,11 +166,11 @@ def test_files_that_the_system_does_not_open_are_not_called_missing(trajectories
     assert caught.value.errno == errno.EMFILE
 
 
-@pytest.mark.parametrize(("name", "place"), [("states", (3, 1)), ("actions", (2, 0)), ("kept_mask", 0)])
+@pytest.mark.parametrize(("name", "place"), [("states", (3, 1)), ("actions", (2, 0))])
 def test_a_changed_number_is_not_read(trajectories: Path, name: str, place: Any) -> None:
     file = next(trajectories.glob("*.h5"))
     with h5py.File(file, "r+") as opened:
-        opened[name][place] = np.logical_not(opened[name][place]) if name == "kept_mask" else -opened[name][place]
+        opened[name][place] = -opened[name][place]
     with pytest.raises(PipelineError, match=rf"damaged .*{name}(?s:.*)delete the file"):
         TrajectoryStore(trajectories).load(file.stem)
 
@@ -188,17 +189,105 @@ def test_no_flipped_bit_is_read(trajectories: Path) -> None:
     assert len(places) - len(results) > len(places) / 2
 
 
-@pytest.mark.parametrize("layer", identity.RECIPES)
-def test_another_recipe_makes_its_layer_and_all_after_it_anew(
-    layer: identity.Layer, monkeypatch: pytest.MonkeyPatch
+@pytest.fixture
+def next_recipe(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[identity.Step], None]]:
+    """Raises the recipe number of a step, until the test is over."""
+
+    def raised(step: identity.Step) -> None:
+        identity._parts.cache_clear()
+        monkeypatch.setitem(identity.RECIPES, step, identity.RECIPES[step] + 1)
+
+    yield raised
+    identity._parts.cache_clear()
+
+
+@pytest.mark.parametrize("step", identity.RECIPES)
+def test_another_recipe_makes_its_step_and_all_that_build_on_it_anew(
+    step: identity.Step, next_recipe: Callable[[identity.Step], None]
 ) -> None:
-    layers = list(identity.RECIPES)
-    before = {each: identity.fingerprint(each) for each in layers}
-    identity._recipe.cache_clear()
-    monkeypatch.setitem(identity.RECIPES, layer, identity.RECIPES[layer] + 1)
-    changed = {each for each in layers if identity.fingerprint(each) != before[each]}
-    identity._recipe.cache_clear()
-    assert changed == set(layers[layers.index(layer) :])
+    before = {each: identity.fingerprint(each) for each in identity.RECIPES}
+    next_recipe(step)
+    changed = {each for each in identity.RECIPES if identity.fingerprint(each) != before[each]}
+    chain: list[identity.Step] = ["physics", "pixels", "encoding"]
+    behind = {"checks", "pictures", *chain[chain.index(step) :]} if step in chain else {step}
+    assert changed == behind
+
+
+@pytest.mark.parametrize("step", ["physics", "pixels"])
+def test_finished_work_is_made_anew_only_where_that_was_allowed(
+    step: identity.Step,
+    config: Config,
+    rows: list[plan.Row],
+    replayed: Path,
+    next_recipe: Callable[[identity.Step], None],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(Config, "data", tmp_path)
+    monkeypatch.delenv(identity.REMAKE, raising=False)
+    shutil.copytree(replayed, tmp_path / "trajectories")
+    store = FrameStore(tmp_path / "frames", config.render)
+    store.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
+    assert not outdated(rows, config, gl.choose().device)
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+
+    next_recipe(step)
+    number = f"recipe of {step} {identity.RECIPES[step] - 1}, here {identity.RECIPES[step]}"
+    found = outdated(rows, config)
+    told = {f"files of frames, made with {number}": 1}
+    assert found == told | ({f"trajectories, made with {number}": 1} if step == "physics" else {})
+    with pytest.raises(PipelineError, match=rf"1 files of frames, made with {number}(?s:.*)REMAKE=1 dvc repro"):
+        identity.refuse_unasked(found, tmp_path)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+    monkeypatch.setenv(identity.REMAKE, "1")
+    identity.refuse_unasked(found, tmp_path)
+    assert number in capsys.readouterr().out
+    if step == "pixels":
+        monkeypatch.delenv(identity.REMAKE)
+        again = FrameStore(tmp_path / "frames", config.render)
+        again.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
+        assert not outdated(rows, config, gl.choose().device), "a remake is asked for once"
+        assert again._known().keys() == {again.made_by}
+
+
+def test_what_the_user_changed_is_made_without_a_question(
+    config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Config, "data", tmp_path)
+    shutil.copytree(replayed, tmp_path / "trajectories")
+    store = FrameStore(tmp_path / "frames", config.render)
+    store.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
+    other = config.model_copy(update={"render": config.render.model_copy(update={"jpeg_quality": 80})})
+    assert not FrameStore(tmp_path / "frames", other.render).rows()
+    assert not outdated(rows, other, gl.choose().device)
+    device = outdated(rows, config, "another device")
+    assert device == {f"files of frames, made with OpenGL device {gl.choose().device}, here another device": 1}
+    assert not outdated([], config), "a file that no episode of today's plan needs"
+
+
+def test_files_that_nobody_wrote_down_what_they_were_made_with_are_not_replaced_unasked(
+    config: Config, rows: list[plan.Row], trajectories: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of the versions before."""
+    monkeypatch.setattr(Config, "data", trajectories.parent)
+    _make_foreign(next(trajectories.glob("*.h5")))
+    assert outdated(rows, config) == {"trajectories, made with something that was not written down": 1}
+    _shorten(next(trajectories.glob("*.h5")))
+    assert not outdated(rows, config), "a damaged file is made again anyway"
+
+
+@pytest.mark.parametrize("change", [_shorten, _remove])
+def test_the_table_no_longer_tells_of_files_that_are_gone_or_changed(trajectories: Path, change: Any) -> None:
+    """DVC looks at the table alone, and starts the stage that makes the file again."""
+    store, table = TrajectoryStore(trajectories), trajectories / TABLE
+    before = table.read_bytes()
+    store.settle()
+    assert table.read_bytes() == before
+    change(next(trajectories.glob("*.h5")))
+    store.settle()
+    assert table.read_bytes() != before
+    assert not store.rows()
 
 
 def test_another_quality_and_another_shape_of_frames_are_other_frames(

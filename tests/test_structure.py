@@ -37,6 +37,7 @@ FLOORS = (
     "jit",
     "tables",
     "files",
+    "rotations",
     "types",
     "arguments",
     "exit_status",

@@ -23,9 +23,9 @@ from arms import provenance
 
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
-from pipeline.evaluation.episode import EpisodeEnvironment
+from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import VIEWS, Settings, Wanted
-from pipeline.evaluation.tasks import Selection, select
 from pipeline.images.jpeg import decode
 from pipeline.types import Floats
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from arms import provenance
 
-from pipeline.evaluation import merging
-from pipeline.evaluation.comparison import compare, paired
-from pipeline.evaluation.results import Row, success_rate
+from pipeline.evaluation.results import Row
+from pipeline.evaluation.results import read as read_results
+from pipeline.evaluation.statistics import compare, paired, success_rate
 
 SOURCES = {"libero": "LIBERO's own tasks", "libero_plus": "LIBERO-Plus test tasks", "own": "own draws"}
 
@@ -78,7 +78,7 @@ def read(evaluations: Path, policies: Mapping[str, Sequence[str]]) -> Results:
         PipelineError: when a policy has none.
     """
     return {
-        arm: [[row for policy in merging.read([evaluations / name]) for row in policy.rows] for name in names]
+        arm: [[row for policy in read_results([evaluations / name]) for row in policy.rows] for name in names]
         for arm, names in policies.items()
     }
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, RenderPerturbation, Share
+from pipeline.axes.base import Axis, ByLevel, Frozen, RenderPerturbation, Share, pick
 from pipeline.catalogue import textures
 from pipeline.catalogue.data_maps import DATA_MAPS
 from pipeline.catalogue.procedural import COLOUR_MAPS
@@ -139,10 +139,10 @@ class BackgroundAxis(Axis):
     own_colours: Share = 0.5
     map_share: Share = 0.7
     image_share: Share = 0.3
-    colour_scale: tuple[Share, Share, Share, Share, Share] = (0.2, 0.4, 0.6, 0.8, 1.0)
+    colour_scale: ByLevel[Share] = (0.2, 0.4, 0.6, 0.8, 1.0)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> BackgroundPerturbation:
-        component = self.components[rng.integers(len(self.components))]
+        component = pick(rng, self.components)
         level = self.draw_level(rng)
         own_colours = rng.random() < self.own_colours
         return BackgroundPerturbation(
@@ -155,12 +155,11 @@ class BackgroundAxis(Axis):
     def _draw_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
         kinds = _offered(self.sources)
         if part == "surface" and own_colours and kinds.data_maps and rng.random() < self.map_share:
-            choices = kinds.data_maps
+            texture = pick(rng, kinds.data_maps)
         elif kinds.images and (rng.random() < self.image_share or not kinds.colour_maps):
-            choices = kinds.images
+            texture = pick(rng, kinds.images)
         else:
-            choices = kinds.colour_maps
-        texture = choices[rng.integers(len(choices))]
+            texture = pick(rng, kinds.colour_maps)
         keep(texture)
         return Covering(
             part=part,

@@ -10,6 +10,8 @@ An axis comes as a pair of small frozen models in one file:
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from enum import IntEnum
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, TypeVar
@@ -63,7 +65,7 @@ class Axis(Frozen):
         return True
 
     def draw_level(self, rng: np.random.Generator) -> Level:
-        return self.levels[rng.integers(len(self.levels))]
+        return pick(rng, self.levels)
 
 
 class Nearest(NamedTuple):
@@ -216,6 +218,7 @@ class PhysicsPerturbation(Perturbation):
         raise NotImplementedError
 
 
+T = TypeVar("T")
 Number = TypeVar("Number", bound=float)
 
 
@@ -229,6 +232,8 @@ Intervals = Annotated[tuple[tuple[Number, Number], ...], AfterValidator(_ordered
 """A union of closed intervals, written ``[[low, high], ...]``: ranges with the test set's values cut out."""
 
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
+ByLevel = tuple[T, T, T, T, T]
+"""One value for each level, weakest first."""
 Degrees = Annotated[float, Field(ge=-180.0, le=180.0)]
 
 
@@ -241,3 +246,14 @@ def draw(rng: np.random.Generator, intervals: Intervals[float]) -> float:
             return round(low + at, 4)
         at -= length
     return round(intervals[-1][1], 4)
+
+
+def pick(rng: np.random.Generator, choices: Sequence[T]) -> T:
+    """One of ``choices``, each as often as the others."""
+    return choices[int(rng.integers(len(choices)))]
+
+
+def point(rng: np.random.Generator, distance: float) -> tuple[float, float]:
+    """A point (x, y) so far from the origin, in any direction, rounded as ``draw`` does."""
+    bearing_rad = rng.uniform(-math.pi, math.pi)
+    return round(distance * math.cos(bearing_rad), 4), round(distance * math.sin(bearing_rad), 4)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, RenderPerturbation, draw
+from pipeline.axes.base import Axis, ByLevel, Degrees, Frozen, Intervals, RenderPerturbation, draw, pick, point
+from pipeline.rotations import about, product, rotate
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -67,18 +68,16 @@ class CameraPerturbation(RenderPerturbation):
         "and the logarithm of the distance ratio (5 degrees: 1.091)"
     )
 
-    def pose(
-        self, pos_m: NDArray[np.float64], quat_wxyz: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def pose(self, pos_m: Floats, quat_wxyz: Floats) -> tuple[Floats, Floats]:
         """The perturbed pose of a camera whose nominal world pose is ``pos_m`` (3,), ``quat_wxyz`` (4,)."""
-        lift = _about("y", -self.elevation_deg)
-        turn = _about("z", self.azimuth_deg)
-        pos = _rotate(lift, pos_m - ORBIT_CENTRE_M) + ORBIT_CENTRE_M
-        pos = _rotate(turn, pos)
+        lift = about("y", -self.elevation_deg)
+        turn = about("z", self.azimuth_deg)
+        pos = rotate(lift, pos_m - ORBIT_CENTRE_M) + ORBIT_CENTRE_M
+        pos = rotate(turn, pos)
         pos = ORBIT_CENTRE_M + self.distance_scale * (pos - ORBIT_CENTRE_M)
         quat = quat_wxyz
-        for step in (lift, turn, _about("z", self.yaw_deg), _about("y", -self.pitch_deg)):
-            quat = _product(step, quat)
+        for step in (lift, turn, about("z", self.yaw_deg), about("y", -self.pitch_deg)):
+            quat = product(step, quat)
         return pos, quat
 
     def apply(self, model: mujoco.MjModel) -> None:
@@ -142,8 +141,6 @@ def _positive(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, 
 Scales = Annotated[Intervals[Annotated[float, Field(le=10.0)]], AfterValidator(_positive)]
 
 Angles = Intervals[Degrees]
-ByLevel = tuple[Angles, Angles, Angles, Angles, Angles]
-"""What to draw from at each level, weakest first."""
 
 
 def _both_ways(low: float, high: float) -> Angles:
@@ -153,7 +150,7 @@ def _both_ways(low: float, high: float) -> Angles:
 class DistanceRange(Frozen):
     """The test set's scales are 1.15 and 1.19 to 2.00."""
 
-    distance_scale: tuple[Scales, Scales, Scales, Scales, Scales] = (
+    distance_scale: ByLevel[Scales] = (
         ((1.08, 1.2),),
         ((1.2, 1.4),),
         ((1.4, 1.6),),
@@ -165,7 +162,7 @@ class DistanceRange(Frozen):
 class SphericalRange(Frozen):
     """The test set's azimuths are whole degrees in [-75, 75], its elevations 0 and 15. The level is the azimuth's."""
 
-    azimuth_deg: ByLevel = (
+    azimuth_deg: ByLevel[Angles] = (
         ((-15.0, 15.0),),
         _both_ways(15.0, 30.0),
         _both_ways(30.0, 45.0),
@@ -182,7 +179,7 @@ class OrientationRange(Frozen):
         turn_deg: yaw or pitch, each as often as the other; the other one is at most as large, either way.
     """
 
-    turn_deg: ByLevel = (
+    turn_deg: ByLevel[Angles] = (
         _both_ways(1.0, 3.0),
         _both_ways(3.0, 5.0),
         _both_ways(5.0, 7.0),
@@ -218,11 +215,8 @@ class AsideRange(Frozen):
             case "distance":
                 return {"distance_scale": draw(rng, self.distance_scale)}
             case "turn":
-                turn_deg, towards = draw(rng, self.turn_deg), rng.uniform(-np.pi, np.pi)
-                return {
-                    "yaw_deg": round(turn_deg * float(np.cos(towards)), 4),
-                    "pitch_deg": round(turn_deg * float(np.sin(towards)), 4),
-                }
+                yaw_deg, pitch_deg = point(rng, draw(rng, self.turn_deg))
+                return {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg}
 
 
 ASIDES: dict[Component, tuple[Aside, ...]] = {
@@ -252,8 +246,9 @@ class CameraAxis(Axis):
         return self
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        choices = [choice for choice in (self.distance, self.spherical, self.orientation) if choice is not None]
-        chosen = choices[rng.integers(len(choices))]
+        chosen = pick(
+            rng, [range_ for range_ in (self.distance, self.spherical, self.orientation) if range_ is not None]
+        )
         level = self.draw_level(rng)
         component: Component
         match chosen:
@@ -271,25 +266,5 @@ class CameraAxis(Axis):
                 large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")
                 turn_deg = draw(rng, chosen.turn_deg[level - 1])
                 drawn = {large: turn_deg, small: round(turn_deg * rng.uniform(-1.0, 1.0), 4)}
-        asides = ASIDES[component]
-        drawn |= self.aside.draw(rng, asides[rng.integers(len(asides))])
+        drawn |= self.aside.draw(rng, pick(rng, ASIDES[component]))
         return CameraPerturbation.model_validate({"component": component, "level": level, **drawn})
-
-
-def _about(axis: Literal["y", "z"], angle_deg: float) -> NDArray[np.float64]:
-    """Unit quaternion (w, x, y, z) of a right-handed rotation about a world axis."""
-    half = np.deg2rad(angle_deg) / 2
-    w, s = np.cos(half), np.sin(half)
-    return np.array([w, 0.0, s, 0.0] if axis == "y" else [w, 0.0, 0.0, s])
-
-
-def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Hamilton product of two quaternions (w, x, y, z): the rotation ``b`` followed by ``a``."""
-    scalar = a[0] * b[0] - a[1:] @ b[1:]
-    return np.concatenate([[scalar], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
-
-
-def _rotate(quat: NDArray[np.float64], vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``vector`` (3,) turned by the unit quaternion ``quat`` (w, x, y, z)."""
-    turned: NDArray[np.float64] = vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector)
-    return turned

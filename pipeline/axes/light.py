@@ -1,8 +1,8 @@
 """Light: colour, direction, gloss and shadows of the scene's lamps. Render layer; both views change.
 
 Every lamp of the model changes in the same way (the kitchen has three, the other arenas two), relative to what it is
-in the scene. The head light that MuJoCo fixes to each camera stays, so no draw makes a frame black. LIBERO-Plus
-changes the same four properties; its values are not published outside its asset archive.
+in the scene, and stays where it is. The head light that MuJoCo fixes to each camera stays too, so no draw makes a frame
+black. What is known of LIBERO-Plus's light, and what is not, is in docs/axes.md.
 """
 
 from __future__ import annotations
@@ -39,6 +39,11 @@ lamp beside its two, and of their sum a half could go without a trace, because t
 FLOOR_SHININESS = 0.1
 """Of LIBERO's floors, which have no gloss, once they have: at 0, a highlight would be spread over all of the floor."""
 
+TILT_AZIMUTH_DEG = ((135.0, 270.0),)
+"""Towards where lamps are turned. LIBERO's two stand at (1, 1, 4) and (-3, -3, 4) m and light 45 degrees about where
+they point: the first lights the scene, the second misses it. Turned by 20 degrees to the other side, from 315 to 90,
+they leave much of the scene to the head light: of their shadows nothing shows, and of their colour little."""
+
 DARK_LEVEL, DARK_SHARE = 10, 0.6
 BRIGHT_LEVEL, BRIGHT_SHARE = 250, 0.25
 
@@ -49,7 +54,6 @@ class LightPerturbation(RenderPerturbation):
     Attributes:
         diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel.
         specular_scale: multiple of each lamp's specular colour; above 1 it polishes the surfaces too.
-        orbit_deg: every lamp is moved around the world's z axis, counter-clockwise, and turned with that.
         tilt_deg: every lamp is turned in place by so much,
         tilt_azimuth_deg: towards this horizontal direction (0 is the world's x axis, 90 its y axis).
         shadows: whether lamps cast shadows.
@@ -60,7 +64,6 @@ class LightPerturbation(RenderPerturbation):
     component: Component
     diffuse_scale_rgb: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (1.0, 1.0, 1.0)
     specular_scale: NonNegativeFloat = 1.0
-    orbit_deg: float = 0.0
     tilt_deg: float = 0.0
     tilt_azimuth_deg: float = 0.0
     shadows: bool = False
@@ -68,7 +71,7 @@ class LightPerturbation(RenderPerturbation):
 
     views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
     fields: ClassVar[tuple[str, ...]] = (
-        *("light_diffuse", "light_specular", "light_pos", "light_dir", "light_castshadow"),
+        *("light_diffuse", "light_specular", "light_dir", "light_castshadow"),
         *("mat_emission", "mat_specular", "mat_shininess"),
     )
     clearance: ClassVar[float] = 0.0
@@ -79,17 +82,7 @@ class LightPerturbation(RenderPerturbation):
         """Change every lamp of the model."""
         _limit(model.light_diffuse, model.light_directional, SHOWN_DIFFUSE)
         model.light_diffuse *= np.array(self.diffuse_scale_rgb)
-        if self.specular_scale > 1:
-            # What a surface reflects as a highlight it does not scatter. The root brings 2 to 30 to 0.9 to 0.6.
-            scattered = self.specular_scale ** (-1 / 6)
-            model.light_diffuse *= scattered
-            model.light_specular *= self.specular_scale
-            model.mat_shininess[model.mat_specular == 0] = FLOOR_SHININESS
-            model.mat_specular[:] = np.maximum(model.mat_specular, 1 - scattered**2)
-        if self.orbit_deg:
-            orbit = _rotation(np.array([0.0, 0.0, 1.0]), self.orbit_deg)
-            model.light_pos[:] = model.light_pos @ orbit.T
-            model.light_dir[:] = model.light_dir @ orbit.T
+        model.light_specular *= self.specular_scale
         if self.tilt_deg:
             azimuth = np.deg2rad(self.tilt_azimuth_deg)
             # Turning what points down about this axis takes it towards the azimuth.
@@ -103,6 +96,13 @@ class LightPerturbation(RenderPerturbation):
             # In MuJoCo a lamp's ambient light stops at shadows, the emission of a surface does not. A third of what
             # is taken from the lamps: with more, walls outshine the table, with less, all darkens.
             model.mat_emission += self.fill_scale * SHADOWED_DIFFUSE / 3
+        if self.specular_scale > 1:
+            # What a surface reflects as a highlight it does not scatter. The root brings 2 to 30 to 0.9 to 0.6.
+            # This comes after the limits: else a bright lamp with shadows would be as bright as without gloss.
+            scattered = self.specular_scale ** (-1 / 6)
+            model.light_diffuse *= scattered
+            model.mat_shininess[model.mat_specular == 0] = FLOOR_SHININESS
+            model.mat_specular[:] = np.maximum(model.mat_specular, 1 - scattered**2)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Nothing to compare with: the test tasks are known by number, not by their lamps."""
@@ -117,15 +117,13 @@ class LightRange(Frozen):
         saturation: the diffuse light is tinted so much, in any hue: 0 leaves white, 1 is a pure colour.
         specular_scale: multiple of the specular light; surfaces get as glossy, and scatter less of the diffuse light.
             One-pass lighting cuts highlights off at the colour of the surface: without that, none would show.
-        orbit_deg: how far about the vertical lamps are carried, to either side.
-        tilt_deg: how far lamps are turned in place, towards any side.
+        tilt_deg: how far lamps are turned in place.
         fill_scale: share of the light that reaches into shadows.
     """
 
     brightness_scale: Intervals[Multiple]
     saturation: Intervals[Share]
     specular_scale: Intervals[Multiple]
-    orbit_deg: Intervals[Degrees]
     tilt_deg: Intervals[Degrees]
     fill_scale: Intervals[Share]
 
@@ -135,7 +133,6 @@ def _range(
     bright: tuple[float, float],
     saturation: tuple[float, float],
     specular: tuple[float, float],
-    orbit: tuple[float, float],
     tilt: tuple[float, float],
     fill: tuple[float, float],
 ) -> LightRange:
@@ -143,7 +140,6 @@ def _range(
         brightness_scale=(dim, bright),
         saturation=(saturation,),
         specular_scale=(specular,),
-        orbit_deg=(orbit,),
         tilt_deg=(tilt,),
         fill_scale=(fill,),
     )
@@ -153,32 +149,44 @@ class LightAxis(Axis):
     """The ranges to draw from, chosen by looking at all arenas: from just noticeable to as far as all still shows.
 
     Noticeable: of the agent view's pixels, 5 % differ by 8 grey levels or more. So it was at levels 1 and 5 of every
-    component in every arena, twelve draws each, but for a weak tint in the study (see docs/axes.md).
+    component in every arena, twelve draws each (see docs/axes.md).
 
     Attributes:
-        components: which of them, each as often as the others; ``combined`` draws all four properties.
+        components: which of them. ``shadows`` turns the lamps, too. ``combined`` changes diffuse light, direction and
+            gloss together, with shadows in half of its draws.
+        combined_share: share of the draws that are ``combined``, where that is one of several components; the others
+            are drawn as often as one another.
         ranges: one for each level.
     """
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = (
         *("diffuse", "direction", "specular", "shadows", "combined"),
     )
+    combined_share: float = Field(default=0.6, ge=0.0, le=1.0)
     ranges: tuple[LightRange, LightRange, LightRange, LightRange, LightRange] = (
-        _range((0.7, 0.8), (1.25, 1.4), (0.15, 0.25), (3, 4), (20, 40), (5, 8), (0.42, 0.5)),
-        _range((0.58, 0.7), (1.4, 1.55), (0.25, 0.33), (4, 6), (40, 65), (8, 12), (0.32, 0.42)),
-        _range((0.44, 0.58), (1.55, 1.7), (0.33, 0.42), (6, 10), (65, 100), (12, 18), (0.2, 0.32)),
-        _range((0.25, 0.44), (1.7, 1.85), (0.42, 0.52), (10, 17), (100, 140), (18, 24), (0.1, 0.2)),
-        _range((0.05, 0.25), (1.85, 2.0), (0.52, 0.65), (17, 30), (140, 180), (24, 32), (0.0, 0.1)),
+        _range((0.7, 0.8), (1.25, 1.4), (0.25, 0.3), (3, 4), (8, 11), (0.24, 0.3)),
+        _range((0.58, 0.7), (1.4, 1.55), (0.3, 0.37), (4, 6), (11, 15), (0.18, 0.24)),
+        _range((0.44, 0.58), (1.55, 1.7), (0.37, 0.44), (6, 10), (15, 20), (0.12, 0.18)),
+        _range((0.25, 0.44), (1.7, 1.85), (0.44, 0.53), (10, 17), (20, 26), (0.06, 0.12)),
+        _range((0.05, 0.25), (1.85, 2.0), (0.53, 0.65), (17, 30), (26, 32), (0.0, 0.06)),
     )
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LightPerturbation:
-        component = self.components[rng.integers(len(self.components))]
-        level = self.draw_level(rng)
-        properties: tuple[Property, ...] = ("diffuse", "direction", "specular", "shadows")
+        component, level = self._draw_component(rng), self.draw_level(rng)
+        properties: dict[Component, tuple[Property, ...]] = {
+            "shadows": ("shadows", "direction"),
+            "combined": ("diffuse", "direction", "specular", *(("shadows",) if rng.random() < 0.5 else ())),
+        }
         drawn: dict[str, object] = {}
-        for name in properties if component == "combined" else (component,):
+        for name in properties.get(component, (component,)):
             drawn |= self._draw(rng, name, level, task)
         return LightPerturbation.model_validate({"component": component, "level": level, **drawn})
+
+    def _draw_component(self, rng: np.random.Generator) -> Component:
+        single = [component for component in self.components if component != "combined"]
+        if "combined" in self.components and (not single or rng.random() < self.combined_share):
+            return "combined"
+        return single[rng.integers(len(single))]
 
     def _draw(self, rng: np.random.Generator, component: str, level: Level, task: Task) -> dict[str, object]:
         ranges = self.ranges[level - 1]
@@ -196,21 +204,12 @@ class LightAxis(Axis):
             case "specular":
                 return {"specular_scale": draw(rng, ranges.specular_scale)}
             case "direction":
-                azimuth = round(rng.uniform(0.0, 360.0), 4)
                 return {
-                    **self._draw_orbit(rng, ranges),
                     "tilt_deg": draw(rng, ranges.tilt_deg),
-                    "tilt_azimuth_deg": azimuth,
+                    "tilt_azimuth_deg": draw(rng, TILT_AZIMUTH_DEG),
                 }
             case _:
-                return {
-                    **self._draw_orbit(rng, ranges),
-                    "shadows": True,
-                    "fill_scale": draw(rng, ranges.fill_scale),
-                }
-
-    def _draw_orbit(self, rng: np.random.Generator, ranges: LightRange) -> dict[str, object]:
-        return {"orbit_deg": draw(rng, ranges.orbit_deg) * (1 if rng.random() < 0.5 else -1)}
+                return {"shadows": True, "fill_scale": draw(rng, ranges.fill_scale)}
 
 
 def exposure(frame: Frame) -> str | None:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import model_validator
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, PixelPerturbation
+from pipeline.axes.base import Axis, ByLevel, PixelPerturbation, pick
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.types import Floats, Frame, Task
 
@@ -20,10 +20,7 @@ if TYPE_CHECKING:
 
 Effect = Motion | Gaussian | Zoom | Fog | Glass
 """Their ``strength`` names the parameter that grows with the severity, and gives its value for a clean frame."""
-T = TypeVar("T")
 E = TypeVar("E", Motion, Gaussian, Zoom, Fog, Glass)
-Levels = tuple[T, T, T, T, T]
-"""One value for each level, weakest first."""
 
 
 class NoisePerturbation(PixelPerturbation):
@@ -92,7 +89,7 @@ def _tested(test: TestSet, component: Component, name: str) -> tuple[tuple[float
     return tuple(ascending), np.array(places)
 
 
-def _grid(effect: type[E], **parameters: Levels[float]) -> Levels[E]:
+def _grid(effect: type[E], **parameters: ByLevel[float]) -> ByLevel[E]:
     """An effect at five levels, from one column of values per parameter."""
     rows = zip(*parameters.values(), strict=True)
     one, two, three, four, five = (effect(**dict(zip(parameters, row, strict=True))) for row in rows)
@@ -102,18 +99,18 @@ def _grid(effect: type[E], **parameters: Levels[float]) -> Levels[E]:
 class NoiseAxis(Axis):
     """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none."""
 
-    motion: Levels[Motion] = _grid(Motion, radius_px=(7, 11, 17, 23, 33), sigma_px=(2.5, 4.5, 7, 11, 17.5))
-    gaussian: Levels[Gaussian] = _grid(Gaussian, sigma_px=(1.5, 3.5, 5.5, 7.5, 9.5))
-    zoom: Levels[Zoom] = _grid(Zoom, max_scale=(1.13, 1.22, 1.33, 1.42, 1.52), copies=(14, 12, 23, 22, 27))
-    fog: Levels[Fog] = _grid(Fog, density=(0.75, 1.75, 2.75, 3.75, 4.75), roughness_decay=(2.9, 2.35, 1.9, 1.55, 1.35))
-    glass: Levels[Glass] = _grid(
+    motion: ByLevel[Motion] = _grid(Motion, radius_px=(7, 11, 17, 23, 33), sigma_px=(2.5, 4.5, 7, 11, 17.5))
+    gaussian: ByLevel[Gaussian] = _grid(Gaussian, sigma_px=(1.5, 3.5, 5.5, 7.5, 9.5))
+    zoom: ByLevel[Zoom] = _grid(Zoom, max_scale=(1.13, 1.22, 1.33, 1.42, 1.52), copies=(14, 12, 23, 22, 27))
+    fog: ByLevel[Fog] = _grid(Fog, density=(0.75, 1.75, 2.75, 3.75, 4.75), roughness_decay=(2.9, 2.35, 1.9, 1.55, 1.35))
+    glass: ByLevel[Glass] = _grid(
         Glass, sigma_px=(0.6, 0.95, 1.2, 1.65, 2.35), delta_px=(1, 2, 3, 4, 5), passes=(3, 3, 2, 2, 1)
     )
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
         """A component and a level, each with equal chance, whatever the task and the place."""
-        grids: tuple[Levels[Effect], ...] = (self.motion, self.gaussian, self.zoom, self.fog, self.glass)
-        grid = grids[rng.integers(len(grids))]
+        grids: tuple[ByLevel[Effect], ...] = (self.motion, self.gaussian, self.zoom, self.fog, self.glass)
+        grid = pick(rng, grids)
         level = self.draw_level(rng)
         effect = grid[level - 1]
         seed = int(rng.integers(2**53))  # what every JSON reader keeps exactly

@@ -7,33 +7,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, PhysicsPerturbation, on_task
+from pipeline.axes.base import Axis, PhysicsPerturbation, on_task, pick, point
 from pipeline.axes.scene import ScenePerturbation, draw_scene
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import PipelineError
 from pipeline.libero import bddl
-from pipeline.libero.relations import relation_holds
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 if TYPE_CHECKING:
-    from pipeline.scenes.compiled import CompiledScene
     from pipeline.testset.benchmark import TestSet
-
-SETTLE_S = 0.3
-"""How long an object is watched. The farthest that one of the starter demonstrations still falls takes 0.06 s."""
-
-DEEPER_M = 0.001
-"""How much deeper than recorded a moved object may sit in what it touches, such as the wall of its drawer."""
-
-CREEP_M, CREEP_DEG = 0.002, 2.0
-"""How much farther than the recorded object a moved one may slide and tilt until it stops."""
 
 Component = Literal["target", "receptacle", "scene"]
 """What the goal puts somewhere, what it is put on or in, where that is an object that can be moved, or everything."""
@@ -62,46 +49,12 @@ class PosePerturbation(PhysicsPerturbation):
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the object moved; its height and velocity and everything else stay as they are.
 
-        The recorded and the moved object are both watched for ``SETTLE_S`` while everything else is held: they must
-        come to rest on the same things, after as little motion.
-
         Raises:
-            RefusedError: ``relation_broken`` when the object leaves what it stands on or in, or a target the place
-                that the instruction names; ``object_in_collision`` when it touches something else;
-                ``object_unstable`` when it slides or tilts more than the recorded one.
+            RefusedError: see ``pipeline.scenes.moving.move_one``.
         """
-        from pipeline.scenes.compiled import CompiledScene
+        from pipeline.scenes.moving import move_one
 
-        compiled = CompiledScene(scene)
-        then = _settle(compiled, self.moved)
-        state = scene.state.copy()
-        address = 1 + int(compiled.model.joint(f"{self.moved}_joint0").qposadr[0])
-        pose = state[address : address + 7]
-        pose[:] = self._moved(pose)
-        compiled.restore(state)
-        targets = bddl.read(demo.task.bddl_file).targets
-        if not all(relation_holds(demo.task, target, compiled.xy_m) for target in targets):
-            raise RefusedError("relation_broken")
-        now = _settle(compiled, self.moved)
-
-        new = (now.started.keys() | now.rested.keys()) - (then.started.keys() | then.rested.keys())
-        deeper = any(gap_m < then.started.get(pair, 0.0) - DEEPER_M for pair, gap_m in now.started.items())
-        if new or deeper:
-            raise RefusedError("object_in_collision")
-        if then.rested.keys() - now.rested.keys():
-            raise RefusedError("relation_broken")
-        if now.slid_m > then.slid_m + CREEP_M or now.tilted_deg > then.tilted_deg + CREEP_DEG:
-            raise RefusedError("object_unstable")
-        found = {"moved": self.moved, "position_m": pose[:3].tolist(), "rotation_wxyz": pose[3:].tolist()}
-        return replace(scene, state=state, resolved={**scene.resolved, "pose": found})
-
-    def _moved(self, pose: Floats) -> Floats:
-        """A pose (7,) (m, wxyz), moved and turned."""
-        half_rad = math.radians(self.dyaw_deg) / 2
-        c, s = math.cos(half_rad), math.sin(half_rad)
-        x, y, z, qw, qx, qy, qz = pose
-        turned = [c * qw - s * qz, c * qx - s * qy, c * qy + s * qx, c * qz + s * qw]
-        return np.array([x + self.dx_m, y + self.dy_m, z, *turned])
+        return move_one(scene, demo.task, self.moved, (self.dx_m, self.dy_m), self.dyaw_deg)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Compared with the test tasks that move the same object of the same task, alone or with others.
@@ -125,40 +78,6 @@ def _test_moves_m(test: TestSet, task: Task, moved: str) -> Floats:
             if name == moved:
                 moves_m[place] = float(dx_m), float(dy_m)
     return moves_m
-
-
-class _Settled(NamedTuple):
-    """How the object came to rest: what it touched at the start and at rest, and how far its pose is from the start."""
-
-    started: Mapping[tuple[str, str], float]
-    rested: Mapping[tuple[str, str], float]
-    slid_m: float
-    tilted_deg: float
-
-
-def _settle(compiled: CompiledScene, moved: str) -> _Settled:
-    """Let the object come to rest from the compiled state while everything else is held."""
-    import mujoco
-
-    model, data = compiled.model, compiled.data
-    part = compiled.part(f"{moved}_main")
-    joint = model.joint(f"{moved}_joint0")
-    pose, velocity = slice(joint.qposadr[0], joint.qposadr[0] + 7), slice(joint.dofadr[0], joint.dofadr[0] + 6)
-    started, first = compiled.touching(part), data.qpos[pose].copy()
-    held = data.qpos.copy()
-    for _ in range(round(SETTLE_S / model.opt.timestep)):
-        mujoco.mj_step(model, data)
-        held[pose], moving = data.qpos[pose], data.qvel[velocity].copy()
-        data.qpos[:], data.qvel[:] = held, 0.0
-        data.qvel[velocity] = moving
-    mujoco.mj_forward(model, data)
-    cosine = min(1.0, abs(float(first[3:] @ held[pose][3:])))
-    return _Settled(
-        started,
-        compiled.touching(part),
-        float(np.linalg.norm(held[pose][:3] - first[:3])),
-        2 * math.degrees(math.acos(cosine)),
-    )
 
 
 class PoseAxis(Axis):
@@ -204,18 +123,17 @@ class PoseAxis(Axis):
                 expected="a task whose goal puts an object somewhere",
                 remedy="choose another task or another axis",
             )
-        component, moved = choices[rng.integers(len(choices))]
+        component, moved = pick(rng, choices)
         level = self.draw_level(rng)
         if component == "scene":
             return draw_scene(rng, level, task)
-        reach_m = self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2))
-        bearing_rad = rng.uniform(-math.pi, math.pi)
+        dx_m, dy_m = point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
         dyaw_deg = rng.uniform(-self.turn_deg, self.turn_deg)
         return PosePerturbation(
             level=level,
             component=component,
             moved=moved,
-            dx_m=round(reach_m * math.cos(bearing_rad), 4),
-            dy_m=round(reach_m * math.sin(bearing_rad), 4),
+            dx_m=dx_m,
+            dy_m=dy_m,
             dyaw_deg=round(dyaw_deg, 2),
         )

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
-from scipy.spatial.transform import Rotation
 
-from pipeline.axes.base import Axis, Nearest, PhysicsPerturbation
+from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import HOME_RAD
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
@@ -64,8 +63,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
         compiled = CompiledScene(scene)
         data, model = compiled.data, compiled.model
-        robot = compiled.part("robot0_base")
-        before = compiled.touching(robot).keys()
+        before = compiled.touching().keys()
         joints = [model.joint(f"robot0_joint{n}") for n in range(1, 8)]
         arm = [joint.qposadr[0] for joint in joints]
         drawn = self.component == "controller_posture" and scene.posture_rad is not None
@@ -80,10 +78,12 @@ class RobotPerturbation(PhysicsPerturbation):
         state = compiled.state
         compiled.restore(state)
         if self.component == "controller_posture":
+            from scipy.spatial.transform import Rotation  # takes long, and every process of a run imports the axes
+
             hand = Rotation.from_matrix(data.site("gripper0_grip_site").xmat.reshape(3, 3))
             drawn_to = {"posture_rad": posture.tolist(), "goal_wxyz": hand.as_quat(scalar_first=True).tolist()}
             return replace(scene, posture_rad=tuple(posture.tolist()), resolved={**scene.resolved, "robot": drawn_to})
-        if compiled.touching(robot).keys() - before:
+        if compiled.touching().keys() - before:
             raise RefusedError("robot_in_collision")
         resolved = {**scene.resolved, "robot": {"joints_rad": posture.tolist()}}
         return replace(scene, state=state, posture_rad=None, resolved=resolved)
@@ -125,17 +125,11 @@ class RobotAxis(Axis):
     """
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("controller_posture", "initial_joints")
-    norm_rad: tuple[Norm, Norm, Norm, Norm, Norm] = (
-        0.1,
-        0.2,
-        0.3,
-        0.4,
-        0.5,
-    )
+    norm_rad: ByLevel[Norm] = (0.1, 0.2, 0.3, 0.4, 0.5)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
         level = self.draw_level(rng)
-        component = self.components[rng.integers(len(self.components))]
+        component = pick(rng, self.components)
         direction = rng.standard_normal(7)
         offsets = direction * (self.norm_rad[level - 1] / np.linalg.norm(direction))
         return RobotPerturbation.model_validate(

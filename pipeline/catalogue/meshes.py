@@ -6,8 +6,8 @@ is imported where it is used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.errors import PipelineError
+from pipeline.types import Floats
 
 RECIPE = 1
 """Raise it whenever a change here changes what comes out: what was converted before is then converted again."""
@@ -30,9 +31,8 @@ _OPAQUE = 0.25
 """Least opacity: glass that is more transparent can hardly be seen in a frame of 256 x 256."""
 
 
-@dataclass(frozen=True)
-class _Part:
-    """The faces of one material.
+class _Surface(NamedTuple):
+    """A mesh.
 
     Attributes:
         vertices: (V, 3) metres, z up.
@@ -40,16 +40,20 @@ class _Part:
         uv: (V, 2) where a texture goes with it.
     """
 
-    vertices: NDArray[np.float64]
+    vertices: Floats
     faces: NDArray[np.int64]
-    uv: NDArray[np.float64] | None
-    rgba: NDArray[np.float64]
+    uv: Floats | None
+
+
+class _Part(NamedTuple):
+    """The faces of one material; with an image, they have ``uv``."""
+
+    surface: _Surface
+    rgba: Floats
     image: Image.Image | None
 
 
-def convert(
-    obj: Path, out: Path, size_m: tuple[float, float, float] | None = None, turn: NDArray[np.float64] | None = None
-) -> None:
+def convert(obj: Path, out: Path, size_m: tuple[float, float, float] | None = None, turn: Floats | None = None) -> None:
     """Write ``model.xml``, meshes and textures of an OBJ (y up) into the folder ``out``.
 
     The model stands on the origin with z up. One convex hull is what it collides with: objects that the
@@ -68,7 +72,7 @@ def convert(
 
     try:
         parts = _parts(obj, size_m, np.eye(3) if turn is None else turn)
-        points = np.concatenate([part.vertices for part in parts])
+        points = np.concatenate([part.surface.vertices for part in parts])
         if np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[-1] < _THINNEST_M:
             raise ValueError("it is flat")
         hull = trimesh.convex.convex_hull(points)
@@ -77,10 +81,10 @@ def convert(
     assets, geoms = [], []
     for number, part in enumerate(parts):
         name = f"part{number}"
-        _write_obj(out / f"{name}.obj", part.vertices, part.faces, part.uv)
+        _write_obj(out / f"{name}.obj", part.surface)
         colour = quoteattr(" ".join(f"{value:.4g}" for value in part.rgba))
         texture = ""
-        if part.image is not None and part.uv is not None:
+        if part.image is not None:
             _texture(part.image).save(out / f"{name}.png")
             assets.append(f'<texture name="{name}" type="2d" file="{name}.png"/>')
             texture = f' texture="{name}"'
@@ -89,7 +93,7 @@ def convert(
         geoms.append(
             f'<geom type="mesh" mesh="{name}" material="{name}" group="1" contype="0" conaffinity="0" mass="0"/>'
         )
-    _write_obj(out / "hull.obj", np.asarray(hull.vertices), np.asarray(hull.faces), None)
+    _write_obj(out / "hull.obj", _Surface(np.asarray(hull.vertices), np.asarray(hull.faces), None))
     assets.append(f'<mesh name="hull" file="hull.obj" maxhullvert="{_HULL_VERTICES}"/>')
     geoms.append('<geom type="mesh" mesh="hull" group="0"/>')
     lines = "\n    ".join
@@ -99,7 +103,7 @@ def convert(
     )
 
 
-def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: NDArray[np.float64]) -> list[_Part]:
+def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: Floats) -> list[_Part]:
     import trimesh
 
     scene = trimesh.load_scene(obj, process=False)
@@ -115,54 +119,51 @@ def _parts(obj: Path, size_m: tuple[float, float, float] | None, turn: NDArray[n
     share = min(1.0, FACES / sum(len(mesh.faces) for mesh in meshes))
     parts = []
     for mesh in meshes:
-        vertices = (mesh.vertices @ turn.T - foot) * scale @ stand.T
-        faces, material = np.asarray(mesh.faces), getattr(mesh.visual, "material", None)
+        material = getattr(mesh.visual, "material", None)
         coordinates = getattr(mesh.visual, "uv", None)
-        uv = None if coordinates is None else np.asarray(coordinates)
-        image = getattr(material, "image", None) if uv is not None else None
+        image = None if coordinates is None else getattr(material, "image", None)
+        uv = None if image is None else np.asarray(coordinates)
+        surface = _Surface((mesh.vertices @ turn.T - foot) * scale @ stand.T, np.asarray(mesh.faces), uv)
         if share < 1.0:
-            vertices, faces, uv = _simplified(vertices, faces, uv if image is not None else None, share)
+            surface = _simplified(surface, share)
         rgba = np.array([0.7, 0.7, 0.7, 1.0] if material is None else material.main_color / 255.0)
         if image is not None:
             rgba[:3] = 1.0
         rgba[3] = max(rgba[3], _OPAQUE)
-        if len(faces):
-            parts.append(_Part(*_thickened(vertices, faces, uv if image is not None else None), rgba, image))
+        if len(surface.faces):
+            parts.append(_Part(_thickened(surface), rgba, image))
     return parts
 
 
-def _simplified(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None, share: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+def _simplified(surface: _Surface, share: float) -> _Surface:
     """Fewer faces; a small part and a textured one keep theirs, as collapsing edges would distort the texture."""
-    if uv is not None or len(faces) < _SMALL_PART:
-        return vertices, faces, uv
+    if surface.uv is not None or len(surface.faces) < _SMALL_PART:
+        return surface
     import fast_simplification
     import trimesh
 
     # Faces that share places but not vertices (for normals of their own) would come apart.
-    merged = trimesh.Trimesh(vertices, faces, process=False)
+    merged = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     merged.merge_vertices(merge_norm=True, merge_tex=True)
-    fewer, faces_left = fast_simplification.simplify(
+    vertices, faces = fast_simplification.simplify(
         np.asarray(merged.vertices, np.float32), np.asarray(merged.faces, np.int32), target_reduction=1.0 - share
     )
-    return fewer.astype(np.float64), faces_left.astype(np.int64), None
+    return _Surface(vertices.astype(np.float64), faces.astype(np.int64), None)
 
 
-def _thickened(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64] | None]:
+def _thickened(surface: _Surface) -> _Surface:
     """A flat part with a back; MuJoCo finds no frame for a mesh without volume."""
+    vertices, faces, uv = surface
     used = vertices[np.unique(faces)]
     _, extents, axes = np.linalg.svd(used - used.mean(axis=0), full_matrices=False)
     if len(used) > 3 and extents[2] > 1e-3 * extents[1]:
-        return vertices, faces, uv
+        return surface
     normal = np.cross(*(vertices[faces[0, 1:]] - vertices[faces[0, 0]]))
-    normal = (
-        axes[2] if len(axes) > 2 and np.linalg.norm(normal) < 1e-12 else normal / max(np.linalg.norm(normal), 1e-12)
-    )
+    length = np.linalg.norm(normal)
+    normal = axes[2] if len(axes) > 2 and length < 1e-12 else normal / max(length, 1e-12)
     both = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
-    return np.concatenate([vertices, vertices - _SHEET_M * normal]), both, None if uv is None else np.tile(uv, (2, 1))
+    back = vertices - _SHEET_M * normal
+    return _Surface(np.concatenate([vertices, back]), both, None if uv is None else np.tile(uv, (2, 1)))
 
 
 def _texture(image: Image.Image) -> Image.Image:
@@ -171,12 +172,10 @@ def _texture(image: Image.Image) -> Image.Image:
     return small
 
 
-def _write_obj(
-    path: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64], uv: NDArray[np.float64] | None
-) -> None:
-    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]
-    corner = "{0}" if uv is None else "{0}/{0}"
-    if uv is not None:
-        lines += [f"vt {u:.5f} {v:.5f}" for u, v in uv]
-    lines += ["f " + " ".join(corner.format(index + 1) for index in face) for face in faces]
+def _write_obj(path: Path, surface: _Surface) -> None:
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in surface.vertices]
+    corner = "{0}" if surface.uv is None else "{0}/{0}"
+    if surface.uv is not None:
+        lines += [f"vt {u:.5f} {v:.5f}" for u, v in surface.uv]
+    lines += ["f " + " ".join(corner.format(index + 1) for index in face) for face in surface.faces]
     path.write_text("\n".join(lines) + "\n")

@@ -13,7 +13,7 @@ import re
 import shutil
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from hashlib import sha256
@@ -28,7 +28,6 @@ from pipeline.catalogue import sweethome3d
 from pipeline.catalogue.meshes import RECIPE, convert
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.sources import Folder
-from pipeline.catalogue.sweethome3d import Piece
 from pipeline.errors import PipelineError
 from pipeline.files import remove_leftovers, replaced
 from pipeline.libero.assets import libero_assets, package_folder
@@ -103,27 +102,21 @@ def _sweethome3d() -> Iterator[ObjectModel]:
     def missing() -> set[str]:
         return {member for member in wanted if (_about(names[member]) or {}).get("made_from") != made_from[member]}
 
-    def make(piece: Piece) -> None:
-        def write(folder: Path) -> None:
-            with tempfile.TemporaryDirectory() as scratch:
-                convert(piece.unpack(Path(scratch)), folder, piece.size_m, piece.turn)
-
-        about = {
-            "made_from": made_from[piece.member],
-            "category": wanted[piece.member],
-            "licence": piece.licence,
-            "attribution": f"{piece.title} by {piece.creator}, from Sweet Home 3D's {piece.member.partition('/')[0]} "
-            "catalogue, simplified and converted to MJCF",
-        }
-        _make(names[piece.member], about, write)
-
     if missing():
         with _locked():
             deb = sweethome3d.fetch(FOLDER)
             todo = missing()
             pieces = [piece for piece in sweethome3d.pieces(deb) if piece.member in todo]
             for piece in track(pieces, "converting sweethome3d", console=Console(stderr=True)):
-                make(piece)
+                about = {
+                    "made_from": made_from[piece.member],
+                    "category": wanted[piece.member],
+                    "licence": piece.licence,
+                    "attribution": f"{piece.title} by {piece.creator}, from Sweet Home 3D's "
+                    f"{piece.member.partition('/')[0]} catalogue, simplified and converted to MJCF",
+                }
+                with _made(names[piece.member], about) as folder, tempfile.TemporaryDirectory() as scratch:
+                    convert(piece.unpack(Path(scratch)), folder, piece.size_m, piece.turn)
             if absent := missing():
                 raise PipelineError(f"the package lacks {', '.join(sorted(absent))}", where=deb, remedy="report it")
     for name in names.values():
@@ -161,8 +154,8 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
             "attribution": f"{category}/{path.name}",
         }
         if _about(name) != about:
-            with _locked():
-                _make(name, about, lambda folder, path=path: _convert_own(path, folder))  # type: ignore[misc]
+            with _locked(), _made(name, about) as folder:
+                _convert_own(path, folder)
         yield converted(name)
 
 
@@ -207,11 +200,12 @@ def _copy(mjcf: Path, out: Path) -> None:
     tree.write(out / "model.xml")
 
 
-def _make(name: str, about: dict[str, str], write: Callable[[Path], None]) -> None:
-    """Let ``write`` fill the folder of a converted model, which is complete or absent."""
+@contextmanager
+def _made(name: str, about: dict[str, str]) -> Iterator[Path]:
+    """The folder of a converted model, to be filled; it is complete or absent."""
     with replaced(FOLDER / name) as folder:
         folder.mkdir()
-        write(folder)
+        yield folder
         (folder / "about.json").write_text(json.dumps(about, indent=2) + "\n")
 
 

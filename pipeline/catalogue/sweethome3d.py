@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import re
-import subprocess
-import sys
 import tarfile
-import tempfile
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.errors import PipelineError
+from pipeline.catalogue.downloads import fetched
 from pipeline.types import Floats
 
 PACKAGE = "sweethome3d-furniture"
@@ -66,32 +62,12 @@ def fetch(folder: Path) -> Path:
     Raises:
         PipelineError: when it cannot be downloaded, or is not the package that the catalogue was made for.
     """
-    deb = folder / DEB
-    if not deb.is_file():
-        print(f"fetching Debian's {PACKAGE} {VERSION} (120 MB) into {folder}", file=sys.stderr)
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            command = ["apt-get", "download", f"{PACKAGE}={VERSION}"]
-            try:
-                subprocess.run(command, cwd=scratch, check=True, capture_output=True, text=True)
-                (Path(scratch) / DEB).rename(deb)
-            except (OSError, subprocess.CalledProcessError) as error:
-                reason = (getattr(error, "stderr", "") or str(error)).strip().splitlines()[-1]
-                raise PipelineError(
-                    f"Debian's {PACKAGE} could not be downloaded ({reason})",
-                    where=deb,
-                    remedy=f"`sudo apt-get update`, and run it again; or put {DEB} of Debian 12 there; or leave "
-                    "sweethome3d out of plan.axes.layout.sources: libero, robosuite and a folder work without it",
-                ) from error
-    sha256 = hashlib.sha256(deb.read_bytes()).hexdigest()
-    if sha256 != SHA256:
-        raise PipelineError(
-            f"not the package that the catalogue was made for: its SHA-256 is {sha256}",
-            where=deb,
-            expected=SHA256,
-            remedy="delete it and run it again",
-        )
-    return deb
+    remedy = (
+        f"`sudo apt-get update`, and run it again; or put {DEB} of Debian 12 there; or leave sweethome3d out of "
+        "plan.axes.layout.sources: libero, robosuite and a folder work without it"
+    )
+    command = ["apt-get", "download", f"{PACKAGE}={VERSION}"]
+    return fetched(folder / DEB, SHA256, command, f"Debian's {PACKAGE} {VERSION} (120 MB)", remedy)
 
 
 def pieces(deb: Path) -> Iterator[Piece]:

@@ -12,7 +12,7 @@ import io
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -42,14 +42,12 @@ WHEELS = {
         version="3.1.1",
         sha256="99e25d9baf97f2f1a19ca89c0d2ca9c6a2b396d9a9be81729de64eedc683f0d3",
         content="metaworld's textures (37 MB)",
-        without="leave metaworld out of plan.axes.background.sources",
     ),
     "gymnasium-robotics": Wheel(
         name="gymnasium-robotics",
         version="1.4.2",
         sha256="a1743530431cb377e6b3b956d284bc96436fc68bac1648ef205054c178e7dc4b",
         content="gymnasium-robotics' textures (26 MB)",
-        without="leave gymnasium-robotics out of plan.axes.background.sources",
     ),
 }
 _LICENCES = {
@@ -132,7 +130,9 @@ def offered(source: Source) -> Iterator[Texture]:
             for file in _images(package_folder("robosuite") / "models" / "assets" / "textures"):
                 yield from_file(f"robosuite:{file.name}", file, _LICENCES[source])
         case "metaworld" | "gymnasium-robotics":
-            yield from _in_wheel(source, wheels.fetch(WHEELS[source], FOLDER))
+            yield from _in_wheel(
+                source, wheels.fetch(WHEELS[source], FOLDER, f"leave {source} out of plan.axes.background.sources")
+            )
 
 
 def from_file(name: str, file: Path, licence: str) -> Texture:
@@ -187,15 +187,11 @@ def _procedural() -> Iterator[Texture]:
                 source="procedural",
                 licence=_LICENCES["procedural"],
                 sha256=seeding.digest("texture", procedural.RECIPE, family, index),
-                _read=lambda family=family, index=index: procedural.texture(family, index),  # type: ignore[misc]
+                _read=partial(procedural.texture, family, index),
             )
 
 
 def _in_wheel(source: Package, path: Path) -> Iterator[Texture]:
-    def read(member: str) -> bytes:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read(member)
-
     with zipfile.ZipFile(path) as archive:
         for member in sorted(name for name in archive.namelist() if name.lower().endswith(_IMAGES)):
             yield Texture(
@@ -203,8 +199,13 @@ def _in_wheel(source: Package, path: Path) -> Iterator[Texture]:
                 source=source,
                 licence=_LICENCES[source],
                 sha256=hashlib.sha256(archive.read(member)).hexdigest(),
-                _read=lambda member=member: _decode(read(member), member),  # type: ignore[misc]
+                _read=partial(_member, path, member),
             )
+
+
+def _member(wheel: Path, member: str) -> Frame:
+    with zipfile.ZipFile(wheel) as archive:
+        return _decode(archive.read(member), member)
 
 
 def _images(root: Path) -> tuple[Path, ...]:

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import faulthandler
-import logging
 import os
-import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -15,10 +13,9 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
 from pipeline.compute.cluster import InPlace, Workplace, joined
+from pipeline.compute.local import local_cluster
+from pipeline.compute.progress import progress_of
 from pipeline.compute.slurm import slurm_cluster
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
@@ -76,7 +73,7 @@ class Run(Protocol):
 def loop(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
     """Everything in this process, one after the other: for debugging and small jobs. What ends it ends the run."""
     sizes = _sizes(fn, items)
-    with _progress(description, sum(sizes)) as advance:
+    with progress_of(description, sum(sizes)) as advance:
         results = []
         for item, size in zip(items, sizes, strict=True):
             results.append(fn(item))
@@ -109,7 +106,6 @@ def runner(
     # each start a thread for every core in every worker. The environment is inherited by spawned workers.
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     import dask
-    from dask.system import CPU_COUNT
     from distributed import Client
 
     # What the scheduler of a cluster elsewhere does, its own settings say.
@@ -124,21 +120,14 @@ def runner(
         }
     )
     if config.cluster == "local":
-        workers = config.workers or CPU_COUNT
-        # So would software GL; where workers are fewer than cores, it uses the others.
-        os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
-        with _local_cluster(workers) as cluster, Client(cluster) as client:
-            client.run(_leave_interrupts_to_the_run)
-            if opengl is not None:
-                _have_called(opengl(), client)
-            # A worker that dies while it starts is not replaced by Dask alone.
-            yield _on(client, refill=partial(cluster.scale, workers))
+        with local_cluster(config.workers, opengl) as (client, refill):
+            yield _Workers(client, refill=refill)
     elif config.cluster == "slurm":
         with slurm_cluster(config, folder) as cluster, Client(cluster) as client:
             client.wait_for_workers(1)
             with joined(client, folder) as workplace:
                 # Jobs that end are asked for again; they may wait in the queue for hours.
-                yield _on(client, workplace, partial(cluster.scale, config.workers), patience_s=inf)
+                yield _Workers(client, workplace, partial(cluster.scale, config.workers), patience_s=inf)
     else:
         try:
             client = Client(config.cluster, timeout=CONNECT_S)
@@ -149,49 +138,7 @@ def runner(
                 remedy="start one, or set compute.cluster: local",
             ) from error
         with client, joined(client, folder) as workplace:
-            yield _on(client, workplace)
-
-
-def _local_cluster(workers: int) -> Any:
-    """Worker processes on this machine. Where one of them dies before all have started, Dask ends them; they are
-    started once more."""
-    from distributed import LocalCluster
-
-    # An error reaches the user once, from here.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
-    for _ in range(TRIES):
-        try:
-            return LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=":0",
-                memory_limit=None,
-                silence_logs=logging.CRITICAL,
-            )
-        except RuntimeError as error:
-            failure = error
-    raise PipelineError(
-        f"worker processes ended while they started, {TRIES} times",
-        expected="workers that live: the system may have ended them because memory ran out",
-        remedy=f"see the system's log, use fewer workers, and {GO_ON}",
-    ) from failure
-
-
-def _have_called(prepare: Callable[[int], None], client: Any) -> None:
-    """Have each worker of this machine call a function with its number, also those that come later."""
-    from distributed import Worker, WorkerPlugin
-
-    class Prepared(WorkerPlugin):  # type: ignore[misc]
-        def setup(self, worker: Worker) -> None:
-            prepare(int(worker.name))
-
-    client.register_plugin(Prepared())
-
-
-def _leave_interrupts_to_the_run() -> None:
-    """In a worker: Ctrl-C reaches all processes of a terminal, and the run ends its workers itself."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+            yield _Workers(client, workplace)
 
 
 @dataclass(frozen=True)
@@ -208,27 +155,62 @@ class _Limited(Generic[Item, Result]):
             faulthandler.cancel_dump_traceback_later()
 
 
-def _on(
-    client: Any,
-    workplace: Workplace | None = None,
-    refill: Callable[[], None] = lambda: None,
-    patience_s: float = ALONE_S,
-) -> Run:
-    """Work on a client's workers; ``refill`` brings back those that are missing, ``patience_s`` is how long to wait for
-    one where none is left."""
-    from distributed import CancelledError, Future, KilledWorker
+@dataclass(frozen=True)
+class _Workers:
+    """Work on a client's workers.
 
-    def ended(work: Callable[[Item], Result], items: Sequence[Item]) -> Generator[tuple[int, Result | Exception]]:
+    Attributes:
+        client: of the cluster.
+        workplace: what workers elsewhere have to have in common with the run.
+        refill: brings back workers that are missing.
+        patience_s: how long to wait for a worker where none is left.
+    """
+
+    client: Any
+    workplace: Workplace | None = None
+    refill: Callable[[], None] = lambda: None
+    patience_s: float = ALONE_S
+
+    def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
+        from distributed import KilledWorker
+
+        limited = _Limited(fn) if isinstance(fn, Expendable) else fn
+        work = limited if self.workplace is None else InPlace(limited, self.workplace)
+        results: dict[int, Result] = {}
+        deadly: list[int] = []
+        sizes = _sizes(fn, items)
+        with progress_of(description, sum(sizes)) as advance, closing(self._ended(work, items)) as outcomes:
+            for number, outcome in outcomes:
+                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
+                    deadly.append(number)
+                    continue
+                results[number] = _result(outcome)
+                advance(sizes[number])
+            for number in deadly:
+                # Alone now: another item may have ended the workers that this one waited on.
+                ((_, outcome),) = self._ended(work, [items[number]])
+                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
+                    results[number] = fn.lost(items[number])
+                else:
+                    results[number] = _result(outcome)
+                advance(sizes[number])
+        return [results[number] for number in range(len(items))]
+
+    def _ended(
+        self, work: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Generator[tuple[int, Result | Exception]]:
         """The number of each item and its result or error, as they end."""
+        from distributed import CancelledError, Future, KilledWorker
+
         # Not pure: equal items are still separate work, and the scheduler must not remember earlier runs.
-        futures = client.map(work, items, pure=False)
+        futures = self.client.map(work, items, pure=False)
         numbers = {future.key: number for number, future in enumerate(futures)}
         done: Queue[Future] = Queue()
         for future in futures:
             future.add_done_callback(done.put)
         try:
             while numbers:
-                future = _next(done, client, refill, patience_s)
+                future = self._next(done)
                 if future.status == "error":
                     yield numbers.pop(future.key), future.exception()
                     continue
@@ -242,36 +224,42 @@ def _on(
                     yield numbers.pop(future.key), error
                     continue
                 except (CancelledError, ConnectionError) as error:
-                    raise _lost(client, "the Dask scheduler went away") from error
+                    raise self._lost("the Dask scheduler went away") from error
                 yield numbers.pop(future.key), result
         finally:
-            if client.status == "running":
-                client.cancel([future for future in futures if future.key in numbers])
+            if self.client.status == "running":
+                self.client.cancel([future for future in futures if future.key in numbers])
 
-    def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
-        limited = _Limited(fn) if isinstance(fn, Expendable) else fn
-        work = limited if workplace is None else InPlace(limited, workplace)
-        results: dict[int, Result] = {}
-        deadly: list[int] = []
-        sizes = _sizes(fn, items)
-        with _progress(description, sum(sizes)) as advance, closing(ended(work, items)) as outcomes:
-            for number, outcome in outcomes:
-                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
-                    deadly.append(number)
-                    continue
-                results[number] = _result(outcome)
-                advance(sizes[number])
-            for number in deadly:
-                # Alone now: another item may have ended the workers that this one waited on.
-                ((_, outcome),) = ended(work, [items[number]])
-                if isinstance(fn, Expendable) and isinstance(outcome, KilledWorker):
-                    results[number] = fn.lost(items[number])
-                else:
-                    results[number] = _result(outcome)
-                advance(sizes[number])
-        return [results[number] for number in range(len(items))]
+    def _next(self, done: Queue[Any]) -> Any:
+        """The next future that is done.
 
-    return run
+        Raises:
+            PipelineError: when nobody is left who could do one.
+        """
+        alone_s, last_came_s = 0, 0.0
+        while True:
+            try:
+                return done.get(timeout=LOOK_S)
+            except Empty:
+                self.refill()
+                workers, came_s = self._there()
+                # A new worker may be on its way, or have come and died over its work.
+                alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
+                last_came_s = came_s
+                if alone_s >= self.patience_s:
+                    raise self._lost(f"no worker is left, and none came in {self.patience_s} s") from None
+
+    def _there(self) -> tuple[int, float]:
+        """How many there are, and when the last of all came, by the scheduler's clock."""
+        try:
+            events = self.client.get_events("all")
+            came_s = [stamp for stamp, event in events if event.get("action") == "add-worker"]
+            return len(self.client.nthreads()), max(came_s, default=0.0)
+        except (OSError, TimeoutError):  # no scheduler
+            return 0, 0.0
+
+    def _lost(self, what: str) -> PipelineError:
+        return PipelineError(what, where=self.client.scheduler.address, remedy=f"start it again, and {GO_ON}")
 
 
 def _result(outcome: Result | Exception) -> Result:
@@ -285,73 +273,9 @@ def _result(outcome: Result | Exception) -> Result:
     return outcome
 
 
-def _next(done: Queue[Any], client: Any, refill: Callable[[], None], patience_s: float) -> Any:
-    """The next future that is done, as ``_on`` waits for it.
-
-    Raises:
-        PipelineError: when nobody is left who could do one.
-    """
-    alone_s, last_came_s = 0, 0.0
-    while True:
-        try:
-            return done.get(timeout=LOOK_S)
-        except Empty:
-            refill()
-            workers, came_s = _workers(client)
-            # A new worker may be on its way, or have come and died over its work.
-            alone_s = 0 if workers or came_s > last_came_s else alone_s + LOOK_S
-            last_came_s = came_s
-            if alone_s >= patience_s:
-                raise _lost(client, f"no worker is left, and none came in {patience_s} s") from None
-
-
-def _workers(client: Any) -> tuple[int, float]:
-    """How many there are, and when the last of all came, by the scheduler's clock."""
-    try:
-        came_s = [stamp for stamp, event in client.get_events("all") if event.get("action") == "add-worker"]
-        return len(client.nthreads()), max(came_s, default=0.0)
-    except (OSError, TimeoutError):  # no scheduler
-        return 0, 0.0
-
-
-def _lost(client: Any, what: str) -> PipelineError:
-    return PipelineError(what, where=client.scheduler.address, remedy=f"start it again, and {GO_ON}")
-
-
 def _killed(error: Any) -> PipelineError:
     return PipelineError(
         f"one piece of work ended {error.allowed_failures + 1} workers, the last on {error.last_worker.address}",
         expected="workers that live: the system may have ended them because memory ran out",
         remedy=f"see the system's log, use fewer workers, and {GO_ON}",
     )
-
-
-@contextmanager
-def _progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar with rate and ETA on a terminal; a line every tenth of the way where there is none."""
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TextColumn("elapsed"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task(description, total=total, rate="")
-
-        def advance(size: int) -> None:
-            state = progress.tasks[task]
-            tenths = int(10 * state.completed / total)
-            progress.advance(task, size)
-            done = int(state.completed)
-            rate = done / max(state.elapsed or 0.0, 1e-9)
-            progress.update(task, rate=f"{rate:.2f}/s")
-            if not console.is_terminal and int(10 * done / total) > tenths:
-                left = (total - done) / rate
-                console.print(f"{description}: {done}/{total}, {rate:.2f}/s, {left:.0f} s left", highlight=False)
-
-        yield advance

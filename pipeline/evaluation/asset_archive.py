@@ -10,17 +10,16 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 import zipfile
 from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pipeline.errors import PipelineError
-from pipeline.files import Edition, checksum, edition
+from pipeline.files import Edition, checksum_of, edition
 from pipeline.libero.assets import libero_assets
-from pipeline.physics.environment import control_env
+from pipeline.physics.control_env import control_env
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import Reader, SceneFiles
@@ -29,66 +28,54 @@ _ROTATION_RAD = {"x": (-np.pi / 2, -np.pi / 2), "y": (-np.pi, -np.pi), "z": (np.
 """How LIBERO's reset turns an added object: the same for all 867 models of the benchmark."""
 
 
-@dataclass(frozen=True)
-class Assets:
-    """LIBERO's assets, or the unpacked archive.
-
-    Args:
-        folder: where it was unpacked. The archive has its files below the path that they had on the machine that packed
-            it, so this may be any folder on the way to the one with ``scenes``.
-    """
-
-    folder: Path
-
-    @cached_property
-    def root(self) -> Path:
-        """The folder with ``scenes``, ``textures`` and ``new_objects``.
-
-        Raises:
-            PipelineError: when there is none.
-        """
-        root = self.folder
-        while not (root / "scenes").is_dir():
-            below = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
-            if len(below) != 1:
-                raise PipelineError(
-                    "not the unpacked asset archive of LIBERO-Plus",
-                    where=root,
-                    expected="a folder with scenes, textures and new_objects, or one that leads to it",
-                    remedy="unpack assets.zip of the dataset Sylvest/LIBERO-plus, and name that folder",
-                )
-            (root,) = below
-        return root.resolve()
-
-    def holds(self, test: TestTask) -> bool:
-        """Whether the files that a light, background or layout task names are there."""
-        if test.axis == "layout":
-            paths: Iterable[str] = object_models(test).values()
-        else:
-            paths = scene_files(test)
-        return all((self.root / path).is_file() for path in paths)
-
-    def scene(self, test: TestTask) -> SceneFiles:
-        """The files of a light or background task; absolute paths."""
-        return SceneFiles(*(str(self.root / path) for path in scene_files(test)))
-
-    def register_objects(self, test: TestTask) -> None:
-        """Let LIBERO build scenes with the objects that a layout task adds, by the categories of its BDDL file."""
-        control_env()  # which takes care of how it is imported
-        from libero.libero.envs.base_object import OBJECTS_DICT
-
-        for category, path in object_models(test).items():
-            OBJECTS_DICT[category] = _object_class(category, self.root / path)
-
-
-def having(test: TestTask, archive: Path | None) -> Assets | None:
+def having(test: TestTask, archive: Path | None) -> Path | None:
     """LIBERO's assets or the archive, whichever has the files of a light, background or layout task; None if neither.
 
     Args:
         archive: folder of the unpacked archive, where there is one.
     """
-    folders = [libero_assets(), *([] if archive is None else [archive])]
-    return next((assets for assets in map(Assets, folders) if assets.holds(test)), None)
+    for folder in (libero_assets(), archive):
+        if folder is not None and all((unpacked(folder) / path).is_file() for path in _named(test)):
+            return unpacked(folder)
+    return None
+
+
+@cache
+def unpacked(folder: Path) -> Path:
+    """The folder with ``scenes``, ``textures`` and ``new_objects``.
+
+    The archive has its files below the path that they had on the machine that packed it, so ``folder`` may be any on
+    the way to them.
+
+    Raises:
+        PipelineError: when there is none.
+    """
+    root = folder
+    while not (root / "scenes").is_dir():
+        below = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+        if len(below) != 1:
+            raise PipelineError(
+                "not the unpacked asset archive of LIBERO-Plus",
+                where=root,
+                expected="a folder with scenes, textures and new_objects, or one that leads to it",
+                remedy="unpack assets.zip of the dataset Sylvest/LIBERO-plus, and name that folder",
+            )
+        (root,) = below
+    return root.resolve()
+
+
+def scene(test: TestTask, assets: Path) -> SceneFiles:
+    """The files of a light or background task; absolute paths."""
+    return SceneFiles(*(str(assets / path) for path in scene_files(test)))
+
+
+def register_objects(test: TestTask, assets: Path) -> None:
+    """Let LIBERO build scenes with the objects that a layout task adds, by the categories of its BDDL file."""
+    control_env()  # which takes care of how it is imported
+    from libero.libero.envs.base_object import OBJECTS_DICT
+
+    for category, path in object_models(test).items():
+        OBJECTS_DICT[category] = _object_class(category, assets / path)
 
 
 def contents(test: TestTask, archive: Path | None) -> list[str]:
@@ -97,26 +84,25 @@ def contents(test: TestTask, archive: Path | None) -> list[str]:
     assets = having(test, archive) if test.axis in ("light", "background", "layout") else None
     if assets is None:
         return []
-    named = object_models(test).values() if test.axis == "layout" else scene_files(test)
-    files = [assets.root / path for path in named]
+    files = [assets / path for path in _named(test)]
     for file in files:
         if file.suffix == ".xml":
-            read = (file.parent / path for path in _referred(file, edition(file)))
+            read = (file.parent / path for path in _referred(edition(file)))
             files += [path.resolve() for path in read if path.is_file() and path.resolve() not in files]
-    return [_checksum(file, edition(file)) for file in files]
+    return [checksum_of(edition(file)) for file in files]
+
+
+def _named(test: TestTask) -> Iterable[str]:
+    """The files that a light, background or layout task names."""
+    return object_models(test).values() if test.axis == "layout" else scene_files(test)
 
 
 @cache
-def _referred(file: Path, version: Edition) -> tuple[str, ...]:
+def _referred(file: Edition) -> tuple[str, ...]:
     try:
-        return tuple(element.attrib["file"] for element in ET.parse(file).iterfind(".//*[@file]"))
+        return tuple(element.attrib["file"] for element in ET.parse(file.path).iterfind(".//*[@file]"))
     except ET.ParseError as error:
-        raise PipelineError(f"not XML ({error})", where=file, remedy="unpack the archive again") from error
-
-
-@cache
-def _checksum(file: Path, version: Edition) -> str:
-    return checksum(file)
+        raise PipelineError(f"not XML ({error})", where=file.path, remedy="unpack the archive again") from error
 
 
 def scene_files(test: TestTask) -> SceneFiles:

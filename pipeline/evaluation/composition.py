@@ -27,13 +27,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from scipy.stats import chi2_contingency
 
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
-from pipeline.evaluation.bootstrap import Interval, interval
 from pipeline.evaluation.results import REFUSED, Row
+from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
 from pipeline.types import Floats
 
@@ -59,24 +58,22 @@ class Pair:
     interval: Interval | None = None
 
     @property
-    def successes(self) -> int:
-        return self.neither + self.only_one + self.only_other + self.both
-
-    @property
     def joint(self) -> float:
         """p(D_i = 1, D_j = 1 | Y = 1); NaN without successes."""
-        return self.both / self.successes if self.successes else float("nan")
+        return float(_joint(self._sums)[0])
 
     @property
     def product(self) -> float:
         """p(D_i = 1 | Y = 1) p(D_j = 1 | Y = 1); NaN without successes."""
-        if not self.successes:
-            return float("nan")
-        return (self.only_one + self.both) * (self.only_other + self.both) / self.successes**2
+        return float(_product(self._sums)[0])
 
     @property
     def gap(self) -> float:
-        return self.joint - self.product
+        return float(gap(self._sums)[0])
+
+    @property
+    def _sums(self) -> Floats:
+        return np.array([[self.neither, self.only_one, self.only_other, self.both]], float)
 
     def chi_square(self) -> tuple[float, float]:
         """The paper's test: Pearson's statistic of the successes by D_i and D_j, with one degree of freedom and without
@@ -91,23 +88,36 @@ class Pair:
     def figures(self) -> dict[str, Any]:
         """All of it, JSON-serialisable: None where a number is not defined."""
         statistic, p_value = self.chi_square()
-        numbers = {"joint": self.joint, "product": self.product, "gap": self.gap}
-        paper = {"statistic": statistic, "p_value": p_value}
         counts = {"neither": self.neither, "one": self.only_one, "other": self.only_other, "both": self.both}
         return {
             "trials": self.trials,
             "successes": counts,
-            **_finite(numbers),
+            **_finite({"joint": self.joint, "product": self.product, "gap": self.gap}),
             "bootstrap": self.interval._asdict() if self.interval else None,
-            "papers_chi_square": _finite(paper),
+            "papers_chi_square": _finite({"statistic": statistic, "p_value": p_value}),
         }
 
 
 def gap(sums: Floats) -> Floats:
     """The gap, of (n, 4) successes without a perturbation, with the one, the other and both; NaN without successes."""
+    return _joint(sums) - _product(sums)
+
+
+def _joint(sums: Floats) -> Floats:
+    return np.asarray(sums[:, 3] / _whole(sums), float)
+
+
+def _product(sums: Floats) -> Floats:
     _, one, other, both = sums.T
-    whole = np.where(sums.any(axis=1), sums.sum(axis=1), np.nan)
-    return np.asarray(both / whole - (one + both) * (other + both) / whole**2, float)
+    return np.asarray((one + both) * (other + both) / _whole(sums) ** 2, float)
+
+
+def _whole(sums: Floats) -> Floats:
+    return np.where(sums.any(axis=1), sums.sum(axis=1), np.nan)
+
+
+Start = tuple[str, str, int]
+"""Suite, LIBERO task and number of the initial state, which the combinations of a trial share."""
 
 
 def pairs(rows: Iterable[Row]) -> list[Pair]:
@@ -123,19 +133,9 @@ def pairs(rows: Iterable[Row]) -> list[Pair]:
             expected="one policy under one setting",
             remedy="give each a folder of its own",
         )
-    clean = {_start(row): bool(row["success"]) for row in listed if row["axis"] == "clean"}
-    drawn = {(row["axis"], row["level"], _start(row)): bool(row["success"]) for row in listed if row["axis"] != "clean"}
-    axes = _in_order(axis for joined, _, _ in drawn for axis in joined.split("+"))
-    counted = []
-    for one, other in combinations(axes, 2):
-        both = f"{one}+{other}"
-        trials = [
-            (start, (clean[start], drawn[one, level, start], drawn[other, level, start], drawn[both, level, start]))
-            for axis, level, start in drawn
-            if axis == both and start in clean and {(one, level, start), (other, level, start)} <= drawn.keys()
-        ]
-        if trials:
-            counted.append(_pair(one, other, [start for start, _ in trials], np.array([four for _, four in trials])))
+    drawn = {(row["axis"], row["level"], _start(row)): bool(row["success"]) for row in listed}
+    axes = _in_order(axis for joined, _, _ in drawn if joined != "clean" for axis in joined.split("+"))
+    counted = [pair for one, other in combinations(axes, 2) if (pair := _pair(one, other, drawn)) is not None]
     if not counted:
         raise PipelineError(
             "no trial has all four combinations of two axes",
@@ -144,10 +144,19 @@ def pairs(rows: Iterable[Row]) -> list[Pair]:
     return counted
 
 
-def _pair(one: str, other: str, starts: Sequence[tuple[str, str, int]], outcomes: NDArray[np.bool_]) -> Pair:
-    """Two axes' trials (n, 4) counted. What has one initial state, at whichever level, is drawn together."""
-    measured = interval([start[:2] for start in starts], starts, outcomes, gap)
-    neither, only_one, only_other, both = outcomes.sum(axis=0).tolist()
+def _pair(one: str, other: str, drawn: Mapping[tuple[str, int, Start], bool]) -> Pair | None:
+    """Two axes' trials counted; None where there is none. What has one initial state, at whichever level, is drawn
+    together."""
+    starts, outcomes = [], []
+    for axis, level, start in drawn:
+        four = (("clean", 0, start), (one, level, start), (other, level, start), (f"{one}+{other}", level, start))
+        if axis == f"{one}+{other}" and drawn.keys() >= {*four}:
+            starts.append(start)
+            outcomes.append([drawn[combination] for combination in four])
+    if not starts:
+        return None
+    measured = interval([start[:2] for start in starts], starts, np.array(outcomes), gap)
+    neither, only_one, only_other, both = np.sum(outcomes, axis=0).tolist()
     return Pair(one, other, len(starts), neither, only_one, only_other, both, measured)
 
 
@@ -155,8 +164,7 @@ def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
     return {name: number if np.isfinite(number) else None for name, number in numbers.items()}
 
 
-def _start(row: Row) -> tuple[str, str, int]:
-    """What the combinations of a trial share."""
+def _start(row: Row) -> Start:
     return row["suite"], row["base"], row["number"]
 
 

@@ -6,20 +6,15 @@ project's axes with held-out draws: its layout is the axes layout and pose, and 
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
 from itertools import count, islice, product
-from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.disjoint import PlannedDraws
-from pipeline.evaluation.held_out import LEVELS, OWN_AXES
+from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, PlannedDraws, draw, drawn_task
 from pipeline.evaluation.results import REFUSED, Row
-from pipeline.evaluation.tasks import EvaluationTask, balanced, draw, drawn_task
-from pipeline.files import replaced
+from pipeline.evaluation.tasks import EvaluationTask, balanced
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.testset.benchmark import SUITES
 
@@ -31,35 +26,6 @@ SIZE = 10_000
 
 Identity = tuple[str, str, str]
 """Source, suite and name of a task, which are once in a benchmark."""
-
-
-@dataclass(frozen=True)
-class Construction:
-    """A benchmark, and what was left out of its candidates.
-
-    Attributes:
-        tasks: what it consists of.
-        candidates: how many were drawn.
-        refused: of these, whose scene takes no draw, as results say.
-        overlapping: of these, what a plan has or comes too close to.
-    """
-
-    tasks: list[EvaluationTask]
-    candidates: int
-    refused: int
-    overlapping: int
-
-    def counts(self) -> dict[str, Any]:
-        """What there is of each kind, JSON-serialisable."""
-        by_kind = Counter(f"{task.axis}/{task.component}" for task in self.tasks)
-        return {
-            "candidates": self.candidates,
-            "refused": self.refused,
-            "overlapping": self.overlapping,
-            "tasks": len(self.tasks),
-            "by_axis": dict(sorted(Counter(task.axis for task in self.tasks).items())),
-            "by_component": dict(sorted(by_kind.items())),
-        }
 
 
 def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
@@ -84,21 +50,30 @@ def construct(
     size: int = SIZE,
     results: Iterable[Row] = (),
     plan: PlannedDraws | None = None,
-) -> Construction:
+) -> tuple[list[EvaluationTask], dict[str, Any]]:
     """Filter candidates, and choose some evenly: axes in turn, of each axis its components, then levels, then suites.
 
     Args:
         results: episodes of candidates that were run; those whose scene was refused are left out.
         plan: a training plan; candidates that overlap with it are left out.
+
+    Returns:
+        The benchmark's tasks, and how many there are of each kind, JSON-serialisable, with those that were left out.
     """
     refused = {_identity(row) for row in results if row["reason"] == REFUSED}
     there = [task for task in drawn if (task.source, task.suite, task.name) not in refused]
-    apart = [task for task in there if plan is None or not _overlaps(task, seed, plan)]
-    return Construction(balanced(apart, size, seed), len(drawn), len(drawn) - len(there), len(there) - len(apart))
-
-
-def _overlaps(task: EvaluationTask, seed: int, plan: PlannedDraws) -> bool:
-    return plan.overlap(draw(task, seed), find_task(task.suite, task.base))
+    apart = there
+    if plan is not None:
+        apart = [task for task in there if not plan.overlap(draw(task, seed), find_task(task.suite, task.base))]
+    chosen = balanced(apart, size, seed)
+    return chosen, {
+        "candidates": len(drawn),
+        "refused": len(drawn) - len(there),
+        "overlapping": len(there) - len(apart),
+        "tasks": len(chosen),
+        "by_axis": dict(sorted(Counter(task.axis for task in chosen).items())),
+        "by_component": dict(sorted(Counter(f"{task.axis}/{task.component}" for task in chosen).items())),
+    }
 
 
 def difficulty(solved: int, models: int) -> int:
@@ -148,11 +123,3 @@ def _outcomes(rows: Iterable[Row]) -> dict[Identity, Row]:
 
 def _identity(row: Row) -> Identity:
     return row["source"], row["suite"], row["name"]
-
-
-def write(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
-    """Write a list of tasks that ``evaluate --tasks-from`` reads."""
-    content = [task if isinstance(task, dict) else asdict(task) for task in listed]
-    lines = ",\n".join(json.dumps(task) for task in content)
-    with replaced(file) as temporary:
-        temporary.write_text(f'{{"seed": {seed}, "tasks": [\n{lines}\n]}}\n')

@@ -1,16 +1,21 @@
-"""All that a report of evaluations says, as JSON."""
+"""All that a report of evaluations says, as JSON: rates, the paper's table, comparisons, failures."""
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
-from pipeline.evaluation.comparison import compare, paired
-from pipeline.evaluation.merging import Evaluated
-from pipeline.evaluation.paper_table import paper_table
-from pipeline.evaluation.results import Row, success_rate, summary
+import yaml
+
+from pipeline.evaluation.libero_plus import level_of
+from pipeline.evaluation.results import Evaluated, Row
+from pipeline.evaluation.statistics import compare, paired, success_rate, summary, wilson
+from pipeline.testset import benchmark
 
 SOURCES = ("libero_plus", "own", "libero")
 """Of tasks, in a report's order; others follow."""
@@ -27,7 +32,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     Returns:
         ``policies``: name to settings, versions, number of refused episodes, ``overall``: the ``success_rate`` of all
         its episodes, and ``results``: ``summary`` by source.
-        ``paper_table``: see ``PaperTable``; None where no test task was run.
+        ``paper_table``: see there; None where no test task was run.
         ``comparisons``: each two policies on the episodes of a source that both ran, see ``compare``.
         ``common``: source to the number of episodes that all policies ran which ran any of it.
         ``failures``: episodes to show, and whether there is a video.
@@ -47,7 +52,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
             for policy in policies
         },
         "common": {source: _common([rows for policy in policies if (rows := policy.of(source))]) for source in sources},
-        "paper_table": _plain(paper_table(tested)) if tested else None,
+        "paper_table": paper_table(tested) if tested else None,
         "comparisons": [
             {"source": source, "first": one.name, "second": other.name, **compare(pairs)}
             for source in sources
@@ -85,10 +90,148 @@ def _versions(rows: Sequence[Row]) -> dict[str, list[str]]:
     return {name: sorted({row["versions"][name] for row in rows if name in row["versions"]}) for name in names}
 
 
-def _plain(value: Any) -> Any:
-    """Named tuples as objects, by the names of their fields."""
-    if isinstance(value, tuple) and hasattr(value, "_asdict"):
-        value = value._asdict()
-    if isinstance(value, Mapping):
-        return {name: _plain(field) for name, field in value.items()}
-    return [_plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+PUBLISHED = Path(__file__).with_name("published.yaml")
+
+COLUMNS = {
+    "camera": ("camera",),
+    "robot": ("robot",),
+    "language": ("language",),
+    "light": ("light",),
+    "background": ("background",),
+    "noise": ("noise",),
+    "layout": ("layout", "pose"),
+}
+"""The paper's dimensions to this project's axes."""
+
+NAMES = {("layout", "objects"): "confounding objects", ("pose", "pose"): "displaced targets"}
+"""What the paper calls the two components of its layout."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A success rate over the benchmark's tasks, from some of them.
+
+    Attributes:
+        episodes: it rests on.
+        rate: in [0, 1].
+        effective: the number of equally weighted episodes that would be as informative (Kish, 1965).
+        low, high: Wilson's 95 % interval for that number (Korn and Graubard, 1998).
+        absent: what of the benchmark no episode stands for.
+    """
+
+    episodes: int
+    rate: float
+    effective: float
+    low: float
+    high: float
+    absent: str = ""
+
+
+def paper_table(policies: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
+    """The paper's table, policies beside the published models; JSON-serialisable.
+
+    An evaluation on a balanced subset has as many easy tasks as hard ones, and the benchmark has not. So an episode
+    stands for as many test tasks as there are of its axis, component and level for each one that was run. What no
+    episode was run of is left out of a column, and said.
+
+    Args:
+        policies: name to episodes on test tasks.
+
+    Returns:
+        ``source``: of the published rows.
+        ``tasks``: column to the number of test tasks in it.
+        ``shared``: the columns that every evaluated policy was measured on.
+        ``evaluated``: rows with ``name``, ``cells``, which are column to an ``Estimate`` where it was measured,
+        ``total`` over all columns, weighted by their numbers of tasks, None where one was not measured, and ``shared``,
+        the same over the shared columns.
+        ``published``: rows with ``name``, ``rates`` by column in percent, ``total``, and ``shared``, which is not in
+        the paper.
+    """
+    tasks = {column: _sizes(axes, 1).total() for column, axes in COLUMNS.items()}
+    cells = {
+        name: {column: cell for column, axes in COLUMNS.items() if (cell := _cell(rows, axes))}
+        for name, rows in policies.items()
+    }
+    shared = [column for column in COLUMNS if all(column in measured for measured in cells.values())]
+    evaluated = [
+        {
+            "name": name,
+            "cells": {column: asdict(cell) for column, cell in measured.items()},
+            "total": asdict(_joined(measured, tasks)) if len(measured) == len(COLUMNS) else None,
+            "shared": asdict(_joined({column: measured[column] for column in shared}, tasks)) if shared else None,
+        }
+        for name, measured in cells.items()
+    ]
+    packed = yaml.safe_load(PUBLISHED.read_text())
+    published = []
+    for name, row in packed["models"].items():
+        rates = dict(zip(packed["columns"], row["rates"], strict=True))
+        mean = _mean({column: rates[column] for column in shared}, tasks) if shared else None
+        published.append({"name": name, "rates": rates, "total": row["total"], "shared": mean})
+    return {
+        "source": packed["source"],
+        "tasks": tasks,
+        "shared": shared,
+        "published": published,
+        "evaluated": evaluated,
+    }
+
+
+def _cell(rows: Sequence[Row], axes: Sequence[str]) -> Estimate | None:
+    """A column's rate; None where it has no episode."""
+    outcomes: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
+    chosen = [row for row in rows if row["axis"] in axes]
+    for row in chosen:
+        outcomes[row["axis"], row["component"], row["level"]].append(bool(row["success"]))
+    if not outcomes:
+        return None
+    strata = {
+        stratum: Estimate(len(listed), sum(listed) / len(listed), len(listed), 0, 1)
+        for stratum, listed in outcomes.items()
+    }
+    return replace(_joined(strata, _sizes(axes, 3)), absent=_absent(chosen, axes))
+
+
+def _joined(parts: Mapping[Any, Estimate], sizes: Mapping[Any, int]) -> Estimate:
+    """The rate over several parts of the benchmark, each weighted by its number of tasks."""
+    rate = _mean({name: part.rate for name, part in parts.items()}, sizes)
+    whole = sum(sizes[name] for name in parts)
+    effective = whole**2 / sum(sizes[name] ** 2 / part.effective for name, part in parts.items())
+    low, high = wilson(rate * effective, effective)
+    return Estimate(sum(part.episodes for part in parts.values()), rate, effective, low, high)
+
+
+def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
+    """The mean, weighted by the numbers of tasks."""
+    return sum(sizes[name] * rate for name, rate in rates.items()) / sum(sizes[name] for name in rates)
+
+
+def _absent(rows: Sequence[Row], axes: Sequence[str]) -> str:
+    """Which components, suites and levels of a column have no episode; ``rows`` are those of its axes."""
+    run = {(row["axis"], row["component"]) for row in rows}
+    components = {kind: count for kind, count in _sizes(axes, 2).items() if kind not in run}
+    tests = [kind for kind in _tests() if kind[0] in {axis for axis, _ in run}]
+    suites = {suite for *_, suite in tests} - {row["suite"] for row in rows}
+    levels = {level for _, _, level, _ in tests} - {row["level"] for row in rows}
+    return ", ".join(
+        [
+            *(f"{NAMES.get(kind, kind[1])} ({count:,} tasks)" for kind, count in sorted(components.items())),
+            *sorted(suites),
+            *(f"level {level}" for level in sorted(levels)),
+        ]
+    )
+
+
+def _sizes(axes: Sequence[str], columns: int) -> Counter[Any]:
+    """How many test tasks of some axes there are, by the first columns of ``_tests``."""
+    sizes: Counter[Any] = Counter()
+    for kind, count in _tests().items():
+        if kind[0] in axes:
+            sizes[kind[:columns]] += count
+    return sizes
+
+
+@cache
+def _tests() -> Counter[tuple[str, str, int, str]]:
+    """How many test tasks there are of each axis, component, level and suite."""
+    return Counter((test.axis, test.component, level_of(test), test.suite) for test in benchmark.load().tasks)

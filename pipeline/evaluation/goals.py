@@ -71,11 +71,7 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
 
 
 def find(task: Task, name: str) -> Replacement:
-    """The replacement that the name of an evaluation task says.
-
-    Raises:
-        PipelineError: when the task has none of that name.
-    """
+    """The replacement that the name of an evaluation task says; refused when the task has none of that name."""
     named = {one.name(task, 0).rpartition("_")[0]: one for one in replacements(task)}
     replaced = name.rpartition("_")[0]
     if replaced not in named:

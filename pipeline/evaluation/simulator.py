@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,12 +11,19 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import RefusedError
-from pipeline.physics.environment import Environment, control_env, seeded
+from pipeline.axes import AnyPerturbation, RenderPerturbation, of_layer
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError, RefusedError
+from pipeline.evaluation.settings import VIEWS
+from pipeline.images.jpeg import to_policy
+from pipeline.physics.control_env import control_env, seeded
+from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
+from pipeline.rendering.frames import noisy
+from pipeline.rendering.last_scene import LastScene
 from pipeline.scenes.compiled import proprioception
 from pipeline.testset.definitions import SceneFiles
-from pipeline.types import Floats, Scene, Task
+from pipeline.types import Floats, Frame, Scene, Task
 
 SETTLING_STEPS = 10
 """Control steps before the policy's first look, while objects fall into place (OpenVLA's and LIBERO-Plus's rule)."""
@@ -202,3 +210,47 @@ def _styles(images: Mapping[str, str]) -> dict[str, str]:
 
 def _copied(attributes: dict[str, Any]) -> dict[str, Any]:
     return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in attributes.items()}
+
+
+class Picture:
+    """Renders one scene after the other; episodes of the same meshes and textures share an OpenGL context."""
+
+    def __init__(self) -> None:
+        self._opened = LastScene()
+        self._scene: mujoco.MjModel | str | None = None
+        self._perturbations: Sequence[AnyPerturbation] = ()
+        self._changes: ExitStack | None = None
+
+    def show(self, scene: mujoco.MjModel | str, perturbations: Sequence[AnyPerturbation]) -> None:
+        """Render from here on a model, or a scene's MJCF where the model is without its images, as it is perturbed."""
+        self.restore()
+        self._scene, self._perturbations = scene, perturbations
+
+    def frame(self, view: str, observed: Observed, step: int) -> Frame:
+        """(256, 256, 3) uint8 RGB, turned by 180 degrees.
+
+        Args:
+            view: one of ``VIEWS``.
+            step: how many steps were taken, for noise that is random.
+        """
+        if self._scene is None:
+            raise PipelineError("no episode was started", remedy="reset first")
+        renderer = self._opened.renderer(self._scene)
+        if self._changes is None:
+            self._changes = ExitStack()
+            self._changes.enter_context(renderer.perturbed(of_layer(self._perturbations, RenderPerturbation)))
+        state = np.concatenate([[0.0], observed.qpos, np.zeros(renderer.model.nv)])
+        renderer.restore(state, observed.site_alpha)
+        frame = renderer.frame(SCHEMA.views[VIEWS[view]].camera)
+        return to_policy(noisy(frame, VIEWS[view], self._perturbations, step))
+
+    def restore(self) -> None:
+        """Undo an episode's looks."""
+        if self._changes is not None:
+            self._changes.close()
+        self._changes = None
+
+    def close(self) -> None:
+        self.restore()
+        self._scene = None
+        self._opened.close()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -19,6 +19,7 @@ from pydantic import BaseModel
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
+from pipeline.identity import Step
 from pipeline.types import Extra
 
 Row = Mapping[str, Any]
@@ -33,6 +34,8 @@ class Export:
 
     Attributes:
         identity: digest of everything that the dataset's bytes depend on.
+        asked: of that, what was asked for: the episodes and the options.
+        made_with: and the rest, in words.
         files: all files below the format's folder, each with its SHA-256.
         places: episode id to the format's columns of the manifest.
     """
@@ -40,6 +43,8 @@ class Export:
     identity: str
     files: Mapping[str, str]
     places: Mapping[str, Mapping[str, Any]]
+    asked: str = ""
+    made_with: Mapping[str, str] = field(default_factory=dict)
 
 
 class Format(ABC, Generic[Options]):
@@ -51,15 +56,11 @@ class Format(ABC, Generic[Options]):
         extras: what the episodes have beside the frames.
     """
 
-    name: ClassVar[str]
-    """In the configuration's section ``export``, of the folder and the record in ``data/<run>``, and on the command
-    line."""
+    name: ClassVar[Step]
+    """In the configuration's section ``export``, of the folder and the record in ``data/<run>``, on the command line,
+    and in ``pipeline/identity.py``."""
     title: ClassVar[str]
     """For people, and the hub's tag."""
-    recipe: ClassVar[int]
-    """Counted up with every change of code that changes a byte of the dataset."""
-    packages: ClassVar[tuple[str, ...]]
-    """Installed packages whose version the bytes depend on."""
     columns: ClassVar[tuple[pa.Field, ...]]
     """Of the manifest: where an episode lies; null when it was dropped."""
     keys: ClassVar[Mapping[str, str]]

@@ -16,16 +16,15 @@ from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load, Piece, split
 from pipeline.formats.lerobot_columns import FILE_MB
 from pipeline.formats.read_back import Copy, Fault
+from pipeline.identity import Step
 from pipeline.tables import column
 
 
 class LeRobot(Format[LeRobotConfig]):
     """Files of one number hold the same episodes: of data, of each video and of ``meta/episodes``."""
 
-    name: ClassVar = "lerobot"
+    name: ClassVar[Step] = "lerobot"
     title: ClassVar = "LeRobot"
-    recipe: ClassVar = 5
-    packages: ClassVar = ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless")
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )

@@ -14,16 +14,15 @@ from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, by_suite, dataset_of, shard_path
+from pipeline.identity import Step
 from pipeline.tables import column
 
 
 class Rlds(Format[RldsConfig]):
     """Shard k of a set has the k-th slice of its episodes; the ids come shuffled, so neighbours are strangers."""
 
-    name: ClassVar = "rlds"
+    name: ClassVar[Step] = "rlds"
     title: ClassVar = "RLDS"
-    recipe: ClassVar = 2
-    packages: ClassVar = ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy")
     columns: ClassVar = (
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
         column("rlds_index", pa.int64(), "place in the shard, null when dropped"),

@@ -95,20 +95,17 @@ class StarterSource:
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         del per_task  # There is one for each task, and a count is at least one.
-        return DemoIndex([_entry(self._read(task)) for task in wanted], [])
+        return DemoIndex([_entry(self.of(task)) for task in wanted], [])
 
     def load(self, demo_id: str) -> Demo:
         task, key = _parse(demo_id)
-        demo = self._read(task)
+        demo = self.of(task)
         if demo.key != key:
             raise PipelineError(f"the starter set has no {demo_id}", expected=demo.demo_id)
         return demo
 
     def of(self, task: Task) -> Demo:
         """The task's one demonstration."""
-        return self._read(task)
-
-    def _read(self, task: Task) -> Demo:
         group = "libero-90" if task.suite == "libero_90" else "libero"
         name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
         folder = package_folder("robouse") / "bundled_tasks" / group / name

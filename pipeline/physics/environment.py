@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import logging
-import sys
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import lru_cache, partial
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -17,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipeline import gl
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.assets import as_evaluated
+from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import fixed_pose, physics_of, put_images, take_images
 from pipeline.scenes.swept_path import SURFACES
@@ -28,9 +24,6 @@ from pipeline.types import Floats, Scene, Task
 
 DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 """(7,) what is done while a scene settles: nothing, with the gripper open (OpenVLA's and LIBERO-Plus's rule)."""
-
-PLACEMENT_TRIES = 50
-"""Resets, of which each draws 5,000 places for an object that finds none."""
 
 
 class UnusableSceneError(PipelineError):
@@ -50,56 +43,6 @@ class UnusableSceneError(PipelineError):
             remedy="use demonstrations recorded with this LIBERO version, or ones that carry their model_file",
         )
         self.reason = reason
-
-
-def control_env() -> Any:
-    """LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner."""
-    logging.disable(logging.WARNING)
-    try:
-        with gl.left_out():
-            if "robosuite" not in sys.modules:
-                _turn_off_rendering()
-            from libero.libero.envs.env_wrapper import ControlEnv
-    finally:
-        logging.disable(logging.NOTSET)
-    return ControlEnv
-
-
-def _turn_off_rendering() -> None:
-    """Unset robosuite's ``MUJOCO_GPU_RENDERING``, by which it loads EGL when it is imported, even where disabled.
-
-    The flag lies in a module of the package, and importing that module would import the package first.
-    """
-    package = find_spec("robosuite")
-    if package is None or package.origin is None:
-        raise PipelineError("robosuite is not installed", remedy="bash setup.sh")
-    spec = spec_from_file_location("robosuite.macros", Path(package.origin).with_name("macros.py"))
-    if spec is None or spec.loader is None:
-        raise PipelineError("robosuite has no macros.py", where=package.origin, remedy="rm -rf .venv && bash setup.sh")
-    macros = module_from_spec(spec)
-    spec.loader.exec_module(macros)
-    macros.MUJOCO_GPU_RENDERING = False  # type: ignore[attr-defined]
-    sys.modules[spec.name] = macros
-
-
-def _until_placed(reset: Callable[[], Any], task: Task) -> Any:
-    """Call LIBERO's reset, or its constructor, which resets too, until the random draws give every object a place.
-
-    LIBERO's own wrapper repeats a reset without end, whatever went wrong, and its constructor never.
-
-    Raises:
-        PipelineError: after ``PLACEMENT_TRIES``.
-    """
-    from robosuite.utils.errors import RandomizationError
-
-    for _ in range(PLACEMENT_TRIES):
-        with suppress(RandomizationError):
-            return reset()
-    raise PipelineError(
-        f"LIBERO finds no place for all objects in {PLACEMENT_TRIES} resets",
-        where=task.bddl_file,
-        expected="regions that are large enough for the objects in them",
-    )
 
 
 class Environment:
@@ -135,7 +78,7 @@ class Environment:
             scene_xml=scene_xml,
         )
         with seeded(0), self._compiling():
-            self._env = _until_placed(build, task)
+            self._env = until_placed(build, task)
         self._control_step = ControlStep(self._env.env)
         self._openings = len(self._env.env.object_property_initializers)
         self._placed: dict[int, str] = {}
@@ -181,7 +124,7 @@ class Environment:
             MjSim.from_xml_string = compiled
 
     def _reset_until_placed(self) -> None:
-        _until_placed(self._env.env.reset, self.task)
+        until_placed(self._env.env.reset, self.task)
 
     def restore(self, scene: Scene) -> None:
         """Put the environment where a scene starts; nothing from before has an effect on what follows.
@@ -337,17 +280,3 @@ class Environment:
 def shared(task: Task) -> Environment:
     """This process's environment for ``task``, for whoever restores it before stepping."""
     return Environment(task)
-
-
-class seeded:  # noqa: N801 - reads as a verb where it is used
-    """LIBERO's samplers draw from numpy's global generator: seed it for a moment, then put it back."""
-
-    def __init__(self, seed: int):
-        self._seed = seed
-
-    def __enter__(self) -> None:
-        self._saved = np.random.get_state()
-        np.random.seed(self._seed)
-
-    def __exit__(self, *_: object) -> None:
-        np.random.set_state(self._saved)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -64,62 +65,21 @@ class Reference:
         """
         compiled = CompiledScene(Scene(model_xml, states[0]))
         model, data = compiled.model, compiled.data
-        steps = len(states)
-        root = model.body_rootid
-        robot = int(root[model.body("robot0_base").id])
-        grip = model.site("gripper0_grip_site").id
-        # Movable objects by their body, each with the place of its pose in qpos.
-        free = {
-            int(root[model.jnt_bodyid[joint]]): (
-                model.joint(joint).name.removesuffix("_joint0"),
-                slice(model.jnt_qposadr[joint], model.jnt_qposadr[joint] + 7),
-            )
-            for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-        }
+        free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        objects = [model.joint(joint).name.removesuffix("_joint0") for joint in free]
         places = _places(model, data)
-        things = {body: name for body, (name, _) in free.items()} | {
-            int(model.body(f"{name}_main").id): name for name in places if f"{name}_main" in _roots(model)
-        }
-        regions = [name for name in places if name not in things.values()]
-        positions, matrices = np.empty((steps, 3)), np.empty((steps, 3, 3))
-        busy, engaged = np.zeros(steps, bool), np.zeros(steps, bool)
-        held, carried = ({name: np.zeros(steps, bool) for name, _ in free.values()} for _ in range(2))
-        met = {name: np.zeros(steps, bool) for name in (*things.values(), *regions)}
-        poses = {name: np.empty((steps, 7)) for name, _ in free.values()}
-        # What an object stood on until the hand took it: it is not met when that happens.
-        stood_on: dict[int, set[int]] = {body: set() for body in free}
-        let_go: dict[int, int] = {}
+        positions, matrices = np.empty((len(states), 3)), np.empty((len(states), 3, 3))
+        poses = {name: np.empty((len(states), 7)) for name in objects}
+        partners = []
         for step, state in enumerate(states):
             compiled.restore(state)
-            positions[step], matrices[step] = data.site_xpos[grip], data.site_xmat[grip].reshape(3, 3)
-            for name, place in free.values():
-                poses[name][step] = data.qpos[place]
-            partners = _partners(compiled)
-            for body in partners.get(robot, set()):
-                alone = body in free and partners[body] == {robot}
-                busy[step] |= not alone
-                engaged[step] |= not alone and body in things
-                if body in free:
-                    (carried if alone else met)[things[body]][step] = True
-                elif body in things:
-                    met[things[body]][step] = True
-            for body, (name, _) in free.items():
-                touched = partners.get(body, set())
-                if robot in touched:
-                    held[name][step], let_go[body] = True, step
-                elif not held[name].any():
-                    stood_on[body] |= touched
-                    continue
-                elif step > let_go[body] + FALL:
-                    continue
-                # The last step in the hand stands for where it came down.
-                for other in (touched & things.keys()) - stood_on[body]:
-                    met[things[other]][let_go[body]] = True
-                if touched - {robot}:
-                    for region in regions:
-                        if _within(model.site(region).size, places[region], poses[name][step]):
-                            met[region][let_go[body]] = True
-        return cls(positions, Rotation.from_matrix(matrices), actions, busy, engaged, held, carried, met, poses, places)
+            grip = data.site("gripper0_grip_site")
+            positions[step], matrices[step] = grip.xpos, grip.xmat.reshape(3, 3)
+            for name in objects:
+                poses[name][step] = data.joint(f"{name}_joint0").qpos
+            partners.append(_partners(compiled))
+        contacts = _contacts(model, partners, poses, places)
+        return cls(positions, Rotation.from_matrix(matrices), actions, *contacts, poses, places)
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -133,6 +93,59 @@ class Reference:
             "path_m": float(np.linalg.norm(travelled, axis=1).sum()),
             "jerk": float(np.sqrt((jerks**2).sum(axis=1).mean())),
         }
+
+
+class _Contacts(NamedTuple):
+    """The masks of ``Reference``."""
+
+    busy: Mask
+    engaged: Mask
+    held: Mapping[str, Mask]
+    carried: Mapping[str, Mask]
+    met: Mapping[str, Mask]
+
+
+def _contacts(
+    model: mujoco.MjModel,
+    partners: Sequence[Mapping[int, set[int]]],
+    poses: Mapping[str, Floats],
+    places: Mapping[str, Floats],
+) -> _Contacts:
+    """Read the contacts at each of K+1 states; ``poses`` and ``places`` are those of ``Reference``."""
+    steps, robot = len(partners), int(model.body("robot0_base").rootid[0])
+    free = {int(model.body(f"{name}_main").rootid[0]): name for name in poses}
+    things = free | {int(model.body(f"{name}_main").id): name for name in places if f"{name}_main" in _roots(model)}
+    regions = [name for name in places if name not in things.values()]
+    busy, engaged = np.zeros(steps, bool), np.zeros(steps, bool)
+    held, carried = ({name: np.zeros(steps, bool) for name in poses} for _ in range(2))
+    met = {name: np.zeros(steps, bool) for name in (*things.values(), *regions)}
+    # What an object stood on until the hand took it: it is not met when that happens.
+    stood_on: dict[int, set[int]] = {body: set() for body in free}
+    let_go: dict[int, int] = {}
+    for step, touching in enumerate(partners):
+        for body in touching.get(robot, set()):
+            alone = body in free and touching[body] == {robot}
+            busy[step] |= not alone
+            engaged[step] |= not alone and body in things
+            if body in things:
+                (carried if alone else met)[things[body]][step] = True
+        for body, name in free.items():
+            touched = touching.get(body, set())
+            if robot in touched:
+                held[name][step], let_go[body] = True, step
+            elif not held[name].any():
+                stood_on[body] |= touched
+                continue
+            elif step > let_go[body] + FALL:
+                continue
+            # The last step in the hand stands for where it came down.
+            for other in (touched & things.keys()) - stood_on[body]:
+                met[things[other]][let_go[body]] = True
+            if touched - {robot}:
+                for region in regions:
+                    if _within(model.site(region).size, places[region], poses[name][step]):
+                        met[region][let_go[body]] = True
+    return _Contacts(busy, engaged, held, carried, met)
 
 
 def _roots(model: mujoco.MjModel) -> set[str]:
@@ -158,11 +171,9 @@ def _within(half_m: Floats, region: Floats, pose: Floats) -> bool:
 
 def _partners(compiled: CompiledScene) -> dict[int, set[int]]:
     """Root body to the root bodies that it touches."""
-    model = compiled.model
     partners: dict[int, set[int]] = {}
-    for contact in compiled.data.contact:
-        one, other = (int(model.body_rootid[model.geom_bodyid[geom]]) for geom in contact.geom)
-        if contact.dist <= 0 and one != other:
-            partners.setdefault(one, set()).add(other)
-            partners.setdefault(other, set()).add(one)
+    for pair in compiled.touching():
+        one, other = compiled.model.body_rootid[[*pair]].tolist()
+        partners.setdefault(one, set()).add(other)
+        partners.setdefault(other, set()).add(one)
     return partners

@@ -1,22 +1,23 @@
-"""Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory out."""
+"""Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory with a verdict out."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError
 from pipeline.physics.reference import Reference
 from pipeline.physics.roll_out import roll_out
-from pipeline.physics.success import verdict
 from pipeline.physics.tracking import Route, follow
 from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
@@ -43,49 +44,59 @@ def replay(
         reference: gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
             ``tracked``; the result says how its actions came about.
     """
-    mask = kept_actions(demo.actions, config.noops)
     try:
         scene, refused = _perturbed(environment, demo, config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
-        return _not_simulated(demo, trajectory_id, error, mask)
+        return _not_simulated(demo, trajectory_id, error)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
-        environment.restore(scene)
-        # What has no first look is dropped with the state that it was put in.
-        refusal, states, alphas = refused, [environment.state], [environment.site_alpha]
-        actions, succeeded = [], []
-        try:
-            environment.settle(0 if refused else config.settle_steps)
-            states, alphas = [environment.state], [environment.site_alpha]
-            for action in policy() if not refused else ():
-                environment.step(action)
-                actions.append(action)
-                states.append(environment.state)
-                alphas.append(environment.site_alpha)
-                succeeded.append(environment.succeeded())
-        except RefusedError as error:
-            refusal = Verdict(False, error.reason)
-        return Trajectory(
-            trajectory_id=trajectory_id,
-            mode=mode,
-            scene=scene,
-            states=np.stack(states),
-            actions=np.array(actions).reshape(-1, 7),
-            kept_mask=mask,
-            site_alpha=np.stack(alphas),
-            verdict=refusal or verdict(np.stack(states), np.array(succeeded, bool)),
-        )
+        settle_steps, acting = (0, lambda: iter(())) if refused else (config.settle_steps, policy)
+        states, actions, alphas, judged = _execute(environment, scene, settle_steps, acting)
+        return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused or judged)
 
     followed = reference() if config.mode == "tracked" else None
     if followed is None:
-        opened = rollout("open_loop", lambda: iter(demo.actions[mask]))
+        opened = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
         if config.mode == "open_loop" or opened.verdict.kept or refused:
             return opened
         followed = reference()
         if followed is None:
             return opened
     return rollout("tracked", lambda: _tracking(environment, followed))
+
+
+class _Executed(NamedTuple):
+    """As in ``Trajectory``."""
+
+    states: Floats
+    actions: Floats
+    site_alpha: NDArray[np.float32]
+    verdict: Verdict
+
+
+def _execute(
+    environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
+) -> _Executed:
+    """Let a scene settle, and then take the actions that ``policy`` makes from there."""
+    environment.restore(scene)
+    # What has no first look is dropped with the state that it was put in.
+    states, alphas = [environment.state], [environment.site_alpha]
+    actions, succeeded = [], []
+    refused = None
+    try:
+        environment.settle(settle_steps)
+        states, alphas = [environment.state], [environment.site_alpha]
+        for action in policy():
+            environment.step(action)
+            actions.append(action)
+            states.append(environment.state)
+            alphas.append(environment.site_alpha)
+            succeeded.append(environment.succeeded())
+    except RefusedError as error:
+        refused = Verdict(False, error.reason)
+    judged = refused or verdict(np.stack(states), np.array(succeeded, bool))
+    return _Executed(np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged)
 
 
 def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
@@ -114,14 +125,29 @@ def _perturbed(
     return scene, None
 
 
-def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError, mask: NDArray[np.bool_]) -> Trajectory:
+def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError) -> Trajectory:
     return Trajectory(
         trajectory_id=trajectory_id,
         mode="open_loop",
         scene=Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)}),
         states=demo.init_state[None],
         actions=np.empty((0, 7)),
-        kept_mask=mask,
         site_alpha=np.empty((1, 0), np.float32),
         verdict=Verdict(False, error.reason),
     )
+
+
+def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
+    """Judge a replay: the task's goal must hold after the last executed action.
+
+    Args:
+        states: (K+1, S) states before each executed action and after the last.
+        succeeded: (K,) LIBERO's success check after each executed action.
+    """
+    if len(succeeded) < SCHEMA.min_steps:
+        return Verdict(False, "too_short")
+    if not np.isfinite(states).all():
+        return Verdict(False, "simulation_unstable")
+    if succeeded[-1]:
+        return Verdict(True, "kept")
+    return Verdict(False, "goal_lost" if succeeded.any() else "goal_not_reached")

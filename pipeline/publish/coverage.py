@@ -132,8 +132,7 @@ def _light(draws: Sequence[LightPerturbation], test: TestSet) -> AxisPlots:
         "brightness": ("multiple of the diffuse light", [float(np.mean(p.diffuse_scale_rgb)) for p in draws]),
         "tint": ("saturation", [1 - min(p.diffuse_scale_rgb) / max(*p.diffuse_scale_rgb, 1e-9) for p in draws]),
         "gloss": ("multiple of the specular light", [p.specular_scale for p in draws]),
-        "direction": ("lamps carried round by (°)", [p.orbit_deg for p in draws]),
-        "tilt": ("lamps tilted by (°)", [p.tilt_deg for p in draws]),
+        "direction": ("lamps tilted by (°)", [p.tilt_deg for p in draws]),
     }
     shown = [strips(name, {"draws": {"light": np.array(values)}}, label) for name, (label, values) in columns.items()]
     return AxisPlots(

@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.bootstrap import FEW, RESAMPLES, SAMPLE
 from pipeline.evaluation.findings import FAILURES, findings
-from pipeline.evaluation.merging import Evaluated
-from pipeline.evaluation.results import wilson
+from pipeline.evaluation.results import Evaluated
+from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
 from pipeline.files import replaced
 from pipeline.publish import clips, figures, pages
 from pipeline.publish.figures import Panel, Share

@@ -21,8 +21,6 @@ from pipeline.axes import (
     AnyPerturbation,
     Axes,
     PhysicsPerturbation,
-    PixelPerturbation,
-    RenderPerturbation,
     of_layer,
 )
 from pipeline.compute.pool import Run
@@ -38,6 +36,7 @@ from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import first_look, roll_out
 from pipeline.planning.plan import draws_of
 from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
+from pipeline.rendering.frames import frames_of
 from pipeline.rendering.last_scene import LastScene, scene_of_process
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
@@ -80,15 +79,8 @@ class Stage:
         for physics in of_layer(changes, PhysicsPerturbation):
             scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
-        shown = []
-        with renderer.perturbed(of_layer(changes, RenderPerturbation)):
-            renderer.restore(first_look(scene, self.demo.task, self.replay), renderer.model.site_rgba[:, 3].copy())
-            for view in views:
-                frame = renderer.frame(SCHEMA.views[view].camera)
-                for noise in of_layer(changes, PixelPerturbation):
-                    frame = noise.apply(frame, 0) if view in noise.views else frame
-                shown.append(to_policy(frame))
-        return shown
+        state, site_alpha = first_look(scene, self.demo.task, self.replay), renderer.model.site_rgba[:, 3].copy()
+        return [to_policy(frame) for frame in frames_of(renderer, state, site_alpha, changes, 0, views).values()]
 
 
 def staged(tasks: Iterable[Task], config: Config) -> Stage:

@@ -8,10 +8,12 @@ in what the benchmark's files say of them.
 from __future__ import annotations
 
 import json
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -26,8 +28,9 @@ from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.layout import LayoutPerturbation
 from pipeline.axes.noise import NoisePerturbation
+from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
-from pipeline.axes.scene import ScenePerturbation, displacements
+from pipeline.axes.scene import ScenePerturbation, Shifts, displacements
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import decode
@@ -85,13 +88,23 @@ def spread(values: ArrayLike) -> Spread:
     return Spread(measured.size, *(round(float(q), 4) for q in np.percentile(measured, [10, 50, 90])))
 
 
+class Share(NamedTuple):
+    """Of ``number`` things, such as scenes, the share of which something is true."""
+
+    number: int
+    share: float
+
+    def __str__(self) -> str:
+        return f"{100 * self.share:.0f} %"
+
+
 class Measure(NamedTuple):
     """One thing that is seen; None where there is nothing to measure."""
 
     axis: str
     what: str
-    tested: Spread | None
-    ours: Spread | None
+    tested: Spread | Share | None
+    ours: Spread | Share | None
 
 
 @dataclass(frozen=True)
@@ -148,7 +161,7 @@ class Look:
 
 
 @cache
-def _run_tests() -> dict[str, Spread]:
+def _run_tests() -> dict[str, Spread | Share]:
     """What was measured by running test tasks."""
     return {name: Spread(*values) for name, values in json.loads(FILE.read_text()).items()}
 
@@ -164,13 +177,14 @@ def measure(config: Config, test: TestSet) -> list[Measure]:
     # In the order in which they are written: shuffled, so that the first of each axis are of many tasks.
     kept = [rows[episode_id] for episode_id in run.kept]
     seen = _Run(config, kept)
-    ours = _spreads(
-        pair
+    looked_at = chain.from_iterable(
+        seen.of(row)
         for axis in dict.fromkeys(row.axis for row in kept)
         for row in [row for row in kept if row.axis == axis][:SAMPLE]
-        for pair in seen.of(row)
     )
-    tested = _run_tests() | _spreads(pair for task in test.tasks for pair in _of_test(task))
+    ours = _summaries(chain(looked_at, to_nearest_draw(test, kept)))
+    told = chain.from_iterable(_of_test(task) for task in test.tasks)
+    tested = _run_tests() | _summaries(chain(told, to_nearest_test(test)))
     named = ((name.partition(": "), name) for name in sorted({*tested, *ours}))
     return [Measure(axis, what, tested.get(name), ours.get(name)) for (axis, _, what), name in named]
 
@@ -178,16 +192,21 @@ def measure(config: Config, test: TestSet) -> list[Measure]:
 def table(measures: Sequence[Measure]) -> Table:
     """The measures for people."""
     shown = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
+    shown.caption = "A run adds each number of objects equally often, unless it is configured otherwise."
     for one in measures:
         shown.add_row(one.axis, one.what, *(NOT_HERE if of is None else str(of) for of in (one.tested, one.ours)))
     return shown
 
 
-def _spreads(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread]:
+def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
+    """By name: the spread of numbers, and of what is true or false the share."""
     values: dict[str, list[float]] = defaultdict(list)
     for name, value in pairs:
         values[name].append(value)
-    return {name: spread(measured) for name, measured in values.items()}
+    return {
+        name: Share(len(found), round(float(np.mean(found)), 4)) if isinstance(found[0], bool) else spread(found)
+        for name, found in values.items()
+    }
 
 
 class _Run:
@@ -263,13 +282,52 @@ def _targets_moved(
             yield f"pose: target of {suite} moved, level {level} (cm)", 100 * float(np.hypot(*moves[target]))
 
 
+def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, float]]:
+    """How far the things that a pose test is about are from the nearest place that some rows put them at.
+
+    Tests of tasks for which no row moves a thing are left out.
+    """
+    drawn: dict[tuple[str, str], list[Shifts]] = defaultdict(list)
+    for row in rows:
+        for change in from_json(row.perturbations):
+            match change:
+                case ScenePerturbation():
+                    drawn[row.suite, row.task].append({one.name: (one.dx_m, one.dy_m) for one in change.moves})
+                case PosePerturbation():
+                    drawn[row.suite, row.task].append({change.moved: (change.dx_m, change.dy_m)})
+    return _to_nearest(test, lambda tested: drawn[tested.suite, tested.base])
+
+
+def to_nearest_test(test: TestSet) -> Iterator[tuple[str, float]]:
+    """The same to the nearest place in another test of the same task: how close tests are to each other."""
+    moved: dict[tuple[str, str], dict[str, Shifts]] = defaultdict(dict)
+    for one in test.of("pose"):
+        moved[one.suite, one.base][one.name] = displacements(one.parameters)
+
+    def others(tested: TestTask) -> list[Shifts]:
+        return [shifts for name, shifts in moved[tested.suite, tested.base].items() if name != tested.name]
+
+    return _to_nearest(test, others)
+
+
+def _to_nearest(test: TestSet, shifts_for: Callable[[TestTask], Sequence[Shifts]]) -> Iterator[tuple[str, float]]:
+    for tested in test.of("pose"):
+        own, others = displacements(tested.parameters), shifts_for(tested)
+        for thing in bddl.read(find_task(tested.suite, tested.base).bddl_file).things_of_interest:
+            apart_m = [math.dist(own[thing], other[thing]) for other in others if thing in other and thing in own]
+            if apart_m:
+                yield f"pose: test's thing of interest in {tested.suite} to the nearest other (cm)", 100 * min(apart_m)
+
+
 def _added(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:
     """Of one scene with objects added: their models, and where they stand (N, 2) in the frame of the surface."""
-    yield "layout: objects added", len(models)
-    yield "layout: a model comes twice (share of scenes)", float(max(Counter(models).values()) > 1)
+    for number in range(1, 6):
+        yield f"layout: scenes with {number} added", len(models) == number
+    if len(models) > 1:
+        yield f"layout: scenes with {len(models)} added that repeat a model", len(set(models)) < len(models)
     x_m, z_m = CAMERA_M[arena]
-    yield "layout: objects on the camera's side (share)", float((xy_m[:, 0] > CAMERA_SIDE_M).mean())
     for place in xy_m:
+        yield "layout: object on the camera's side", bool(place[0] > CAMERA_SIDE_M)
         yield "layout: object to camera (m)", float(np.hypot(np.linalg.norm(place - [x_m, 0.0]), z_m))
 
 

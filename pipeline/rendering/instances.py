@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
-from pipeline.rendering.renderer import Surfaces
+from pipeline.rendering.drawing import Surfaces
 from pipeline.types import Task, Trajectory
 
 COMMON = ("nothing", "robot", "gripper", "floor", "wall", "room", "table")

@@ -1,4 +1,4 @@
-"""Scenes one after the other through one OpenGL context, as long as they are alike."""
+"""Scenes one after the other, of which the last stays open."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ import functools
 import mujoco
 
 from pipeline.rendering.renderer import Renderer
-from pipeline.scenes.compiled import Images, physics_of
+from pipeline.scenes.compiled import compiled
 
 
 class LastScene:
-    """Keeps the renderer of the last scene open for whoever asks for the same scene next, or for another one, which
-    goes on in the same OpenGL context; only one is open at a time.
-
-    To open the first scene takes 4 s on one core, and another one with the same images 0.5 s.
-    """
+    """Keeps the renderer of the last scene open for whoever asks for the same scene next, and its drawing for whoever
+    asks for another one that it can go on with; only one is open at a time."""
 
     def __init__(self) -> None:
         self._renderer: Renderer | None = None
@@ -26,25 +23,28 @@ class LastScene:
     def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
         """The renderer of a scene, by its MJCF or by a compiled model, which must not change meanwhile.
 
+        It is no longer to be used when another scene was asked for.
+
         Raises:
             PipelineError: when nothing renders on this machine.
-            ValueError: when MuJoCo refuses the scene or one of its images; the next scene gets another context.
+            ValueError: when MuJoCo refuses the scene or one of its images.
         """
         if self._renderer is None or not self._is_last(scene):
-            # Of its images, a new scene mostly needs none: the context has them.
-            images = Images(scene) if isinstance(scene, str) else None
-            model = physics_of(scene) if isinstance(scene, str) else copy.copy(scene)
-            if self._renderer is None or not self._adopted(self._renderer, model, images):
+            model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
+            drawing = self._renderer.drawing if self._renderer and self._adopted(self._renderer, model) else None
+            if drawing is None:
                 self.close()
-                self._renderer = Renderer(model, images)
                 # Of a process that ends before anyone is done, MuJoCo ends OpenGL, after what is registered later.
+                self._renderer = Renderer(model)
                 atexit.register(self.close)
+            else:
+                self._renderer = Renderer(model, drawing)
             self._scene = scene
         return self._renderer
 
-    def _adopted(self, renderer: Renderer, model: mujoco.MjModel, images: Images | None) -> bool:
+    def _adopted(self, renderer: Renderer, model: mujoco.MjModel) -> bool:
         try:
-            return renderer.adopted(model, images)
+            return renderer.drawing.adopt(model)
         except BaseException:
             # It shows something of both scenes now.
             self.close()

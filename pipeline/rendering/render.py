@@ -7,12 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer, to_json
+from pipeline.axes import RenderPerturbation, of_layer, to_json
 from pipeline.axes.light import exposure
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA, named
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.planning.streams import Stream
+from pipeline.rendering.drawing import SideBySide
+from pipeline.rendering.frames import noisy
 from pipeline.rendering.geometry import see
 from pipeline.rendering.instances import Instances
 from pipeline.rendering.last_scene import LastScene
@@ -29,18 +31,19 @@ def render(
     Streams that differ in pixel noise alone share the clean frames they are made from. A perturbed scene whose first
     frame is black or blown out is not rendered any further, nor one whose agent view does not show what it should (see
     ``Sight``): a moved camera the task, any camera the objects that were added. Streams that differ in colours alone
-    share their geometry. Scenes that differ in textures alone are rendered side by side, so that what is the same in
-    them is drawn once.
+    share their geometry. Scenes that differ in textures alone are rendered side by side where a drawing makes use of
+    it (``SideBySide``).
     """
-    scenes: dict[str, dict[str, list[Stream]]] = {}
-    for stream in streams:
-        scenes.setdefault(scene_of(stream, textures=False), {}).setdefault(scene_of(stream), []).append(stream)
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     refused: dict[str, str] = {}
     proprioceptions: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = []
     poses: list[NDArray[np.float32]] = []
     steps = len(trajectory.actions)
     renderer = opened.renderer(trajectory.model_xml)
+    apart = not isinstance(renderer.drawing, SideBySide)
+    scenes: dict[str, dict[str, list[Stream]]] = {}
+    for stream in streams:
+        scenes.setdefault(scene_of(stream, textures=apart), {}).setdefault(scene_of(stream), []).append(stream)
     instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
     for step in range(steps):
         renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
@@ -73,9 +76,7 @@ def render(
                             refused |= {stream.stream_id: faults[0] for stream in members}
                             continue
                     for stream in members:
-                        frame = clean[stream.view]
-                        for noise in of_layer(stream.perturbations, PixelPerturbation):
-                            frame = noise.apply(frame, step)
+                        frame = noisy(clean[stream.view], stream.view, stream.perturbations, step)
                         encoded[stream.stream_id].append(encode(to_policy(frame), config))
     views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in refused)
     geometry = {view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in views}

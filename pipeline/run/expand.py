@@ -21,6 +21,7 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.catalogue.scene_files import portable
 from pipeline.compute.pool import Run
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
+from pipeline.identity import refuse_unasked
 from pipeline.libero import hdf5
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan
@@ -69,10 +70,11 @@ def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSe
     before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was.
 
     Raises:
-        PipelineError: when a demonstration cannot be read.
+        PipelineError: when a demonstration cannot be read, or finished replays would be made anew unasked.
     """
     rows = _rows(demos, per_task, seed, test)
     store = TrajectoryStore(out / ".replays")
+    refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     result = Expansion()
     while True:
         verdicts = replay_plan(rows, demos, REPLAY, store.root, run)

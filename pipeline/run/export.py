@@ -7,6 +7,7 @@ is whole. The finished dataset then takes the place of the one before in one ren
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -20,6 +21,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
+from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
 from pipeline.run import outcome
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.seeding import digest
@@ -33,6 +35,7 @@ def export_run(target: Format[Any], config: Config) -> None:
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
         return
+    refuse_unasked(outdated(target, episodes), target.folder)
     with runner(config.compute, config.data) as workers:
         export(target, episodes, workers)
     print(f"wrote {len(episodes.ids)} episodes to {target.folder}")
@@ -55,8 +58,8 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
     return digest(
         "export",
         target.name,
-        target.recipe,
-        {package: version(package) for package in target.packages},
+        RECIPES[target.name],
+        {package: version(package) for package in PACKAGES[target.name]},
         SCHEMA.model_dump(mode="json"),
         target.options.model_dump(mode="json"),
         target.extras,
@@ -65,25 +68,61 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
     )[:16]
 
 
+def asked(target: AnyFormat, episodes: Episodes) -> str:
+    """A short digest of what of it was asked for: the episodes with all that they are, and the options."""
+    content = [known.content for known in episodes.known.values()]
+    return digest(target.options.model_dump(mode="json"), target.extras, content)[:16]
+
+
+def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
+    """Why the finished dataset would be made anew although the same was asked for, to its number of files."""
+    try:
+        record = target.record()
+    except PipelineError:
+        return Counter()
+    if record.asked != asked(target, episodes) or record.identity == identity(target, episodes):
+        return Counter()
+    return Counter({f"files, made with {differences(record.made_with, _made_with(target))}": len(record.files)})
+
+
+def _made_with(target: AnyFormat) -> dict[str, str]:
+    return {**made_with(target.name), "episode schema": digest(SCHEMA.model_dump(mode="json"))[:8]}
+
+
 def is_current(target: AnyFormat, episodes: Episodes) -> bool:
     """Whether the dataset is there, whole and of these episodes.
 
     Every file must be there and no younger than the record. What else lies in the folder, such as the statistics that
     a client left, is removed then.
     """
-    try:
-        record = target.record()
-        if record.identity != identity(target, episodes):
-            return False
-        files = {target.folder / name for name in record.files}
-        recorded = target.record_file.stat().st_mtime_ns
-        if any(file.stat().st_mtime_ns > recorded for file in files):
-            return False
-    except (PipelineError, OSError):
+    if not untouched(target) or target.record().identity != identity(target, episodes):
         return False
-    keep_below(target.folder, files)
+    keep_below(target.folder, {target.folder / name for name in target.record().files})
     _clear_work(target)
     return True
+
+
+def untouched(target: AnyFormat) -> bool:
+    """Whether all files of a finished dataset are there, and none has changed since it was recorded."""
+    try:
+        recorded = target.record_file.stat().st_mtime_ns
+        return all((target.folder / name).stat().st_mtime_ns <= recorded for name in target.record().files)
+    except (PipelineError, OSError):
+        return False
+
+
+def settle(target: AnyFormat) -> None:
+    """Where files of a finished dataset are gone or have changed, have it count as not there."""
+    if not target.record_file.exists() or untouched(target):
+        return
+    try:
+        same = all(checksum(target.folder / name) == sha256 for name, sha256 in target.record().files.items())
+    except (PipelineError, OSError):
+        same = False
+    if same:  # Such as in a copy.
+        target.record_file.touch()
+    else:
+        target.record_file.unlink()
 
 
 def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
@@ -115,7 +154,8 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
         checksums = run(checksum, paths, f"{target.title} checksums")
         files = {path.relative_to(dataset).as_posix(): sha256 for path, sha256 in zip(paths, checksums, strict=True)}
         with replaced(finished) as temporary:
-            temporary.write_text(json.dumps(asdict(Export(work.name, files, places)), indent=0) + "\n")
+            record = Export(work.name, files, places, asked(target, episodes), _made_with(target))
+            temporary.write_text(json.dumps(asdict(record), indent=0) + "\n")
     target.record_file.unlink(missing_ok=True)  # It is about the dataset before.
     if (work / "dataset").is_dir():
         put_in_place(work / "dataset", target.folder)

@@ -1,5 +1,8 @@
-"""What a run's files were made with, and whether it goes on with the same: else finished work would be thrown away
-unasked. What nothing was made with yet may change: a login node may plan for the nodes that replay and render."""
+"""Whether this machine still computes what it, or another, computed for a run: versions alone do not say that.
+
+Ten control steps and a frame are tried. Their digests are recorded with what they were made with, and a run that has
+files goes on only where the same versions and the same device give the same digests.
+"""
 
 from __future__ import annotations
 
@@ -8,65 +11,57 @@ from pathlib import Path
 
 from pipeline.errors import PipelineError
 from pipeline.files import read_json, write_json
-from pipeline.identity import machine
+from pipeline.identity import fingerprint, made_with
 
 FILE = "machine.json"
-"""File of a run's folder that says what its files were made with."""
+"""File of a run's folder that says what it began with, and what trials came to."""
+
+STORES = {"ten steps": ("trajectories", "frames"), "one frame": ("frames",)}
+"""What of a trial stands for the files of which folders."""
 
 
-_PIXELS = ("OpenGL device", "one frame")
-"""What only frames depend on; trajectories are made without OpenGL."""
-
-
-def same_machine(folder: Path, further: Mapping[str, str] | None = None) -> None:
-    """Record what is here, unless files of the run were made with something else.
+def record(folder: Path, trial: Mapping[str, str]) -> None:
+    """Write what is here, unless the run was begun where the trial came to something else.
 
     Args:
         folder: of the run.
-        further: name to value of what only the caller knows, such as the OpenGL device.
+        trial: see ``pipeline.validation.doctor.trial``.
 
     Raises:
-        PipelineError: as ``refuse_another_machine``.
+        PipelineError: as ``refuse_another``.
     """
-    refuse_another_machine(folder, further)
-    recorded, here = _recorded(folder), machine() | dict(further or {})
-    if any(recorded.get(name, value) != value for name, value in here.items()):
-        # Of another machine, on which nothing was made with it.
-        recorded = {name: value for name, value in recorded.items() if _used(folder, name)}
-    if recorded != (together := recorded | here):
-        write_json(folder / FILE, dict(sorted(together.items())))
+    refuse_another(folder, trial)
+    here = {**made_with("encoding"), "OpenGL device": trial["OpenGL device"]}
+    write_json(folder / FILE, {"made with": here, "trials": trials(folder) | _named(trial)})
 
 
-def refuse_another_machine(folder: Path, further: Mapping[str, str] | None = None) -> None:
-    """Compare what a run's files were made with and what is here; nothing is written.
-
-    Args:
-        folder, further: as for ``same_machine``.
+def refuse_another(folder: Path, trial: Mapping[str, str]) -> None:
+    """Compare a trial with those that are recorded; nothing is written.
 
     Raises:
-        PipelineError: when anything differs that a stored trajectory or frame was made with.
+        PipelineError: when another machine with the same versions and device came to something else, and files were
+            made. They would count as current, so that the run would be of two kinds.
     """
-    recorded, here = _recorded(folder), machine() | dict(further or {})
-    if changed := [
-        f"{name} {recorded[name]}, here {value}"
-        for name, value in here.items()
-        if recorded.get(name, value) != value and _used(folder, name)
-    ]:
-        file = folder / FILE
-        raise PipelineError(
-            f"the run was begun with {'; '.join(changed)}",
-            where=file,
-            expected="the same versions, processor features and OpenGL device for all files of a run",
-            remedy=f"go on where it was begun, or delete {file}: then all that was made otherwise is made again",
-        )
+    recorded = trials(folder)
+    for name, digest in _named(trial).items():
+        stores = STORES[name.split(",")[0]]
+        if recorded.get(name, digest) != digest and any(next((folder / one).rglob("*.h5"), None) for one in stores):
+            raise PipelineError(
+                f"the run was begun where {name} came to {recorded[name]}, here it is {digest}",
+                where=folder / FILE,
+                expected="the same results of the same versions on the same OpenGL device",
+                remedy="go on where it was begun, or delete its " + " and its ".join(stores),
+            )
 
 
-def _recorded(folder: Path) -> dict[str, str]:
+def trials(folder: Path) -> dict[str, str]:
+    """What the run's folder has, by name; none where there is no record, or one of an earlier version."""
     file = folder / FILE
-    return read_json(file) if file.exists() else {}
+    return dict(read_json(file).get("trials", {})) if file.exists() else {}
 
 
-def _used(folder: Path, name: str) -> bool:
-    """Whether files were made that depend on this part of the record."""
-    stores = ("frames",) if name in _PIXELS else ("trajectories", "frames")
-    return any(next((folder / store).rglob("*.h5"), None) for store in stores)
+def _named(trial: Mapping[str, str]) -> dict[str, str]:
+    return {
+        f"ten steps, made by {fingerprint('physics')}": trial["ten steps"],
+        f"one frame, made by {fingerprint('pixels', trial['OpenGL device'])}": trial["one frame"],
+    }

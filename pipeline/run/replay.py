@@ -89,7 +89,6 @@ class ReplayJob:
             scene=Scene("", np.zeros(1), {"fault": "workers ended in it, or it took too long"}),
             states=np.zeros((1, 1)),
             actions=np.empty((0, 7)),
-            kept_mask=np.empty(0, bool),
             site_alpha=np.empty((1, 0), np.float32),
             verdict=Verdict(False, LOST),
         )

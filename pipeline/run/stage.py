@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import fcntl
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,6 +15,7 @@ from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import exit_status
 from pipeline.files import remove_leftovers, write_json
+from pipeline.identity import REMAKE
 
 OWNER = "configuration.json"
 """File of a run's folder that says which configuration file the folder belongs to."""
@@ -26,7 +28,10 @@ def main(stage: Callable[[Config], None], description: str) -> None:
     """Run ``stage`` on the configuration named on the command line."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
+    parser.add_argument("--remake", action="store_true", help=f"make finished work anew, as does {REMAKE}=1 before it")
     arguments = parser.parse_args()
+    if arguments.remake:
+        os.environ[REMAKE] = "1"
 
     def run() -> int:
         config = claimed(arguments.config)

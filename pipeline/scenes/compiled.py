@@ -5,14 +5,17 @@ from __future__ import annotations
 import copy
 import posixpath
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import lru_cache
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.types import Floats, Scene
+from pipeline.rotations import axis_angle
+from pipeline.types import Floats, Scene, State
+
+Joints = NDArray[np.intp]
 
 WRITTEN = ("type", "name", "file")
 """Attributes that MuJoCo writes of an image, in its order; LIBERO's have no others."""
@@ -66,37 +69,6 @@ def take_images(scene: ET.Element) -> dict[str, dict[str, str]]:
     return taken
 
 
-class Images:
-    """The images of a scene that was compiled without them (``physics_of``).
-
-    Args:
-        model_xml: MJCF of the scene.
-    """
-
-    def __init__(self, model_xml: str):
-        self._model_xml = model_xml
-        scene = ET.fromstring(model_xml)
-        self._compiler = scene.findall("compiler")
-        self._taken = take_images(scene)
-
-    def content(self, name: str) -> tuple[tuple[str, str], ...] | None:
-        """Tells a texture that is an image from any other; None when it is none."""
-        attributes = self._taken.get(name, {})
-        return tuple(sorted(item for item in attributes.items() if item[0] != "name")) or None
-
-    def load(self, names: Sequence[str]) -> mujoco.MjModel:
-        """A model of nothing but these textures, in their order."""
-        scene = ET.Element("mujoco")
-        scene.extend(self._compiler)
-        asset = ET.SubElement(scene, "asset")
-        asset.extend(ET.Element("texture", self._taken[name]) for name in names)
-        return compiled(ET.tostring(scene, encoding="unicode"))
-
-    def scene(self) -> mujoco.MjModel:
-        """The scene compiled with its images."""
-        return compiled(self._model_xml)
-
-
 def put_images(scene: ET.Element, taken: Mapping[str, Mapping[str, str]]) -> None:
     """Undo ``take_images``, in a scene that MuJoCo compiled without its images and wrote as MJCF since."""
     for texture in scene.iterfind("asset/texture[@name]"):
@@ -122,37 +94,44 @@ class CompiledScene:
     @property
     def state(self) -> Floats:
         """(S,) flattened MuJoCo state: time, qpos, qvel."""
-        return np.concatenate([[self.data.time], self.data.qpos, self.data.qvel])
+        return State(self.data.time, self.data.qpos, self.data.qvel).flat
 
     def restore(self, state: Floats) -> None:
         """Reset the data, put a flattened state (S,) into it and compute its contacts."""
         mujoco.mj_resetData(self.model, self.data)
-        nq = self.model.nq
-        self.data.time, self.data.qpos[:], self.data.qvel[:] = state[0], state[1 : 1 + nq], state[1 + nq :]
+        State.of(state, self.model.nq).put_into(self.data)
         mujoco.mj_forward(self.model, self.data)
-
-    def part(self, body: str) -> NDArray[np.bool_]:
-        """(nbody,) which bodies move with ``body``'s tree: a robot with its gripper, an object with all its parts."""
-        mask: NDArray[np.bool_] = self.model.body_rootid == self.model.body(body).rootid
-        return mask
 
     def xy_m(self, name: str) -> Floats:
         """(2,) where a movable object stands, by its name in the BDDL file."""
         position: Floats = self.data.body(f"{name}_main").xpos[:2]
         return position
 
-    def touching(self, part: NDArray[np.bool_]) -> dict[tuple[str, str], float]:
-        """Each pair of (a body of the part, a body outside of it) in contact, and the gap in m: deepest, negative."""
-        gaps: dict[tuple[str, str], float] = {}
-        for contact in self.data.contact:
-            own, other = self.model.geom_bodyid[contact.geom]
-            if part[own] == part[other] or contact.dist > 0:
-                continue
-            if part[other]:
-                own, other = other, own
-            pair = (self.model.body(own).name, self.model.body(other).name)
-            gaps[pair] = min(gaps.get(pair, 0.0), float(contact.dist))
+    def pose_in(self, state: Floats, name: str) -> Floats:
+        """(7,) the part of a flattened state (S,) that is a movable object's pose: position in m, rotation wxyz."""
+        first = int(self.model.joint(f"{name}_joint0").qposadr[0])
+        return State.of(state, self.model.nq).qpos[first : first + 7]
+
+    def touching(self) -> dict[tuple[int, int], float]:
+        """Each pair of bodies of different things in contact, and the gap in m: deepest, negative."""
+        contact = self.data.contact
+        bodies = np.sort(self.model.geom_bodyid[contact.geom], axis=1)
+        one, other = self.model.body_rootid[bodies].T
+        met = (one != other) & (contact.dist <= 0)
+        gaps: dict[tuple[int, int], float] = {}
+        for (first, second), gap_m in zip(bodies[met].tolist(), contact.dist[met].tolist(), strict=True):
+            gaps[first, second] = min(gaps.get((first, second), 0.0), gap_m)
         return gaps
+
+
+def simulate_held(model: mujoco.MjModel, data: mujoco.MjData, held: Joints, seconds: float) -> None:
+    """Let a scene move for some time while the ``held`` of its joints stay where they are."""
+    positions_of = np.repeat(np.arange(model.njnt), np.diff([*model.jnt_qposadr, model.nq]))
+    qpos, qvel = np.isin(positions_of, held), np.isin(model.dof_jntid, held)
+    start = data.qpos[qpos].copy()
+    for _ in range(round(seconds / model.opt.timestep)):
+        mujoco.mj_step(model, data)
+        data.qpos[qpos], data.qvel[qvel] = start, 0.0
 
 
 def fixed_pose(data: mujoco.MjData, name: str) -> Floats:
@@ -171,14 +150,5 @@ def proprioception(data: mujoco.MjData) -> tuple[NDArray[np.float32], NDArray[np
     w, *xyz = data.body("robot0_right_hand").xquat
     fingers = [data.joint(f"gripper0_finger_joint{n}").qpos[0] for n in (1, 2)]
     joints = [data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)]
-    state = np.concatenate([position, _axis_angle(w, np.array(xyz)), fingers])
+    state = np.concatenate([position, axis_angle(w, np.array(xyz)), fingers])
     return state.astype(np.float32), np.array(joints, np.float32)
-
-
-def _axis_angle(w: float, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis times angle (rad) of a unit quaternion, the angle in [0, 2 pi] as robosuite's ``quat2axisangle`` has it."""
-    w = float(np.clip(w, -1.0, 1.0))
-    sine = np.sqrt(1.0 - w * w)
-    if np.isclose(sine, 0.0):
-        return np.zeros(3)
-    return np.asarray(xyz * 2.0 * np.arccos(w) / sine)

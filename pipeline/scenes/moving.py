@@ -1,4 +1,4 @@
-"""A demonstration's scene with its objects and fixtures moved, and whether that scene can be."""
+"""A demonstration's scene with one or all of its things moved, and whether that scene can be."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
+from pipeline import rotations
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
 from pipeline.libero.relations import relation_holds
-from pipeline.scenes.compiled import CompiledScene
+from pipeline.scenes.compiled import CompiledScene, simulate_held
 from pipeline.types import Floats, Scene, Task
 
 SETTLE_S = 0.3
@@ -29,8 +31,26 @@ CREEP_M, CREEP_DEG = 0.002, 2.0
 Moves = Mapping[str, tuple[float, float]]
 """Object or fixture, by its name in the BDDL file, to its displacement (dx, dy) in m."""
 
-Pair = tuple[str, str]
-"""Names of two bodies that touch, in alphabetical order."""
+
+def move_one(scene: Scene, task: Task, name: str, shift_m: tuple[float, float], turn_deg: float) -> Scene:
+    """The scene with an object moved in the horizontal plane and turned about the vertical through its origin.
+
+    The recorded and the moved object are both watched for ``SETTLE_S`` while everything else is held: they must come to
+    rest on the same things, after as little motion.
+
+    Raises:
+        RefusedError: as ``move``.
+    """
+    before = CompiledScene(scene)
+    moved = replace(scene, state=scene.state.copy())
+    pose = before.pose_in(moved.state, name)
+    pose[:2] += shift_m
+    pose[3:] = rotations.product(rotations.about("z", turn_deg), pose[3:])
+    after = CompiledScene(moved)
+    _refuse_relations(task, after)
+    _refuse(before, after, before.model.jnt_bodyid == before.model.body(f"{name}_main").id, {name: shift_m})
+    found = {"moved": name, "position_m": pose[:3].tolist(), "rotation_wxyz": pose[3:].tolist()}
+    return replace(moved, resolved={**scene.resolved, "pose": found})
 
 
 def move(scene: Scene, task: Task, moves: Moves) -> Scene:
@@ -52,19 +72,14 @@ def move(scene: Scene, task: Task, moves: Moves) -> Scene:
     model_xml = _shifted(scene.model_xml, fixtures, regions)
     state = scene.state.copy()
     for name in moves.keys() - fixtures.keys():
-        address = 1 + int(before.model.joint(f"{name}_joint0").qposadr[0])
-        state[address : address + 2] += moves[name]
+        before.pose_in(state, name)[:2] += moves[name]
     moved = replace(scene, model_xml=model_xml, state=state)
     after = CompiledScene(moved)
-    if not all(relation_holds(task, target, after.xy_m) for target in known.targets):
-        raise RefusedError("relation_broken")
+    _refuse_relations(task, after)
     placed = {name: after.data.body(f"{name}_main").xpos.tolist() for name in moves}
     if _blocked(after, fixtures) - _blocked(before, fixtures):
         raise RefusedError("object_in_collision")
-    model = after.model
-    roots = {model.body(f"{name}_main").id: shift for name, shift in moves.items()}
-    shifts = {model.body(body).name: roots[root] for body, root in enumerate(model.body_rootid) if root in roots}
-    _refuse(_settle(before), _settle(after), shifts)
+    _refuse(before, after, before.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE, moves)
     return replace(moved, resolved={**scene.resolved, "pose": {"positions_m": placed}})
 
 
@@ -82,55 +97,39 @@ def _shifted(model_xml: str, fixtures: Moves, regions: Moves) -> str:
     return ET.tostring(tree, encoding="unicode")
 
 
+def _refuse_relations(task: Task, scene: CompiledScene) -> None:
+    if not all(relation_holds(task, target, scene.xy_m) for target in bddl.read(task.bddl_file).targets):
+        raise RefusedError("relation_broken")
+
+
 class _Settled(NamedTuple):
     """How a scene came to rest: gaps in m of what touched at the start and at rest, and how far objects went.
 
     Attributes:
-        started, rested: pairs to the gap between them, deepest, negative.
-        slid_m, tilted_deg: (N,) of each free object.
+        started, rested: pairs of bodies to the gap between them, deepest, negative.
+        slid_m, tilted_deg: (N,) of each object that was free to move.
     """
 
-    started: Mapping[Pair, float]
-    rested: Mapping[Pair, float]
+    started: Mapping[tuple[int, int], float]
+    rested: Mapping[tuple[int, int], float]
     slid_m: Floats
     tilted_deg: Floats
 
 
-def _settle(compiled: CompiledScene) -> _Settled:
-    """Let all objects come to rest from the compiled state while the robot and the fixtures' joints are held."""
+def _settle(compiled: CompiledScene, free: NDArray[np.bool_]) -> _Settled:
+    """Let objects come to rest from the compiled state while all but their joints (njnt,) are held."""
     model, data = compiled.model, compiled.data
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
-    qpos = model.jnt_qposadr[free, None] + np.arange(7)
-    qvel = (model.jnt_dofadr[free, None] + np.arange(6)).ravel()
-    started, first, held = _touching(compiled), data.qpos[qpos].copy(), data.qpos.copy()
-    for _ in range(round(SETTLE_S / model.opt.timestep)):
-        mujoco.mj_step(model, data)
-        held[qpos], moving = data.qpos[qpos], data.qvel[qvel].copy()
-        data.qpos[:], data.qvel[:] = held, 0.0
-        data.qvel[qvel] = moving
+    poses = model.jnt_qposadr[free, None] + np.arange(7)
+    started, first = compiled.touching(), data.qpos[poses]
+    simulate_held(model, data, np.flatnonzero(~free), SETTLE_S)
     mujoco.mj_forward(model, data)
-    last = data.qpos[qpos]
+    last = data.qpos[poses]
     cosines = np.minimum(1.0, np.abs((first[:, 3:] * last[:, 3:]).sum(axis=1)))
     slid_m: Floats = np.linalg.norm((last - first)[:, :3], axis=1)
-    return _Settled(started, _touching(compiled), slid_m, np.rad2deg(2 * np.arccos(cosines)))
+    return _Settled(started, compiled.touching(), slid_m, np.rad2deg(2 * np.arccos(cosines)))
 
 
-def _touching(compiled: CompiledScene) -> dict[Pair, float]:
-    """Each pair of bodies of different things in contact, and the gap in m: deepest, negative."""
-    model, gaps = compiled.model, dict[Pair, float]()
-    for contact in compiled.data.contact:
-        one, other = model.geom_bodyid[contact.geom]
-        if contact.dist <= 0 and model.body_rootid[one] != model.body_rootid[other]:
-            pair = _pair(model.body(one).name, model.body(other).name)
-            gaps[pair] = min(gaps.get(pair, 0.0), float(contact.dist))
-    return gaps
-
-
-def _pair(one: str, other: str) -> Pair:
-    return (one, other) if one < other else (other, one)
-
-
-def _blocked(compiled: CompiledScene, fixtures: Iterable[str]) -> set[Pair]:
+def _blocked(compiled: CompiledScene, fixtures: Iterable[str]) -> set[tuple[str, str]]:
     """Pairs of fixtures, or a fixture and the robot's mount, that overlap: MuJoCo has no contacts between what cannot
     move."""
     model, data = compiled.model, compiled.data
@@ -145,22 +144,23 @@ def _blocked(compiled: CompiledScene, fixtures: Iterable[str]) -> set[Pair]:
             if apart_m < model.geom_rbound[first] + model.geom_rbound[second] and (
                 mujoco.mj_geomDistance(model, data, first, second, 0.001, None) <= 0
             ):
-                overlapping.add(_pair(one, other))
+                overlapping.add((one, other))
                 break
     return overlapping
 
 
-def _refuse(then: _Settled, now: _Settled, shifts: Mapping[str, tuple[float, float]]) -> None:
-    """Raise what is wrong with the moved scene; ``shifts`` has the move of each body that moves."""
+def _refuse(before: CompiledScene, after: CompiledScene, free: NDArray[np.bool_], moves: Moves) -> None:
+    """Raise what is wrong with the moved scene, where the ``free`` of its joints (njnt,) are let move."""
+    then, now = _settle(before, free), _settle(after, free)
     new = (now.started.keys() | now.rested.keys()) - (then.started.keys() | then.rested.keys())
     deeper = any(gap_m < then.started.get(pair, 0.0) - DEEPER_M for pair, gap_m in now.started.items())
     if new or deeper:
         raise RefusedError("object_in_collision")
     # Neighbours that move apart may lose touch; nothing may lose touch with what it moves with or stands on.
-    if any(
-        shifts.get(one) == shifts.get(other) or one not in shifts or other not in shifts
-        for one, other in then.rested.keys() - now.rested.keys()
-    ):
-        raise RefusedError("relation_broken")
+    shifts = {int(after.model.body(f"{name}_main").id): shift for name, shift in moves.items()}
+    for pair in then.rested.keys() - now.rested.keys():
+        one, other = (shifts.get(int(after.model.body_rootid[body])) for body in pair)
+        if one == other or one is None or other is None:
+            raise RefusedError("relation_broken")
     if (now.slid_m > then.slid_m + CREEP_M).any() or (now.tilted_deg > then.tilted_deg + CREEP_DEG).any():
         raise RefusedError("object_unstable")

@@ -6,6 +6,7 @@ import itertools
 import re
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -16,10 +17,10 @@ from pipeline.errors import RefusedError
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
 from pipeline.scenes.agent_view import AgentView
-from pipeline.scenes.compiled import physics_to_read
-from pipeline.scenes.regions import regions
+from pipeline.scenes.compiled import CompiledScene, physics_to_read, simulate_held
+from pipeline.scenes.regions import REGIONS
 from pipeline.scenes.swept_path import SweptPath
-from pipeline.types import Demo, Floats, RollOut, Scene
+from pipeline.types import Demo, Floats, RollOut, Scene, State
 
 _BODY = "layout"
 SCENES, DRAWS = 12, 60
@@ -40,8 +41,9 @@ _DISTURBED_M = 1e-3
 def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, roll_out: RollOut) -> Scene:
     """Add objects to a scene: at rest on its working surface, seen, clear of the demonstration's path.
 
-    Everything that was in the scene keeps its recorded state exactly. The objects' joints come last: the state is
-    time, the old qpos, the new qpos (7 each), the old qvel, the new qvel (6 each).
+    Everything that was in the scene keeps its recorded state exactly, and the gripper and the controller what they were
+    at. The objects' joints come last: the state is time, the old qpos, the new qpos (7 each), the old qvel, the new
+    qvel (6 each).
 
     Args:
         seed: keys the places that are tried.
@@ -50,10 +52,7 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
     Raises:
         RefusedError: when no place was found; the reason is the one that most places were refused for.
     """
-    names = [f"{_BODY}{number}" for number in range(len(objects))]
-    model_xml = _with(scene.model_xml, objects, names)
-    known = bddl.read(demo.task.bddl_file)
-    placement = _Placement(model_xml, scene.state, roll_out(scene, demo), objects, names, known)
+    placement = _Placement(scene, roll_out(scene, demo), objects, bddl.read(demo.task.bddl_file))
     rejected: Counter[str] = Counter()
     for attempt in range(SCENES):
         poses = placement.draw(seeding.rng(seed, "layout", attempt), rejected)
@@ -63,16 +62,17 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
         if fault:
             rejected[fault] += 1
             continue
-        nq = placement.old_nq
-        state = np.concatenate(
-            [scene.state[: 1 + nq], settled.ravel(), scene.state[1 + nq :], np.zeros(6 * len(names))]
-        )
         placed = [
             {"name": model.name, "position_m": pose[:3].tolist(), "quaternion_wxyz": pose[3:].tolist(), "seen_px": px}
             for model, pose, px in zip(objects, settled, placement.seen_px(settled), strict=True)
         ]
         resolved = {"objects": placed, "scenes": attempt + 1, "rejected": dict(sorted(rejected.items()))}
-        return Scene(model_xml, state, {**scene.resolved, "layout": resolved})
+        return replace(
+            scene,
+            model_xml=placement.model_xml,
+            state=placement.state_with(scene.state, settled),
+            resolved={**scene.resolved, "layout": resolved},
+        )
     raise RefusedError(f"layout_{max(sorted(rejected), key=rejected.__getitem__)}")
 
 
@@ -101,35 +101,35 @@ class _Placement:
     """A scene with objects in it whose places are still open.
 
     Args:
-        model_xml: the scene with the objects.
-        state: (S,) of the scene without them.
-        states: (K+1, S) that the demonstration leads through.
-        names: the objects' bodies.
+        scene: without the objects.
+        states: (K+1, S) that the demonstration leads through in it.
+        objects: to add.
         known: the task, which tells the arena and the things that must stay in sight.
+
+    Attributes:
+        model_xml: of the scene with the objects.
     """
 
-    def __init__(
-        self,
-        model_xml: str,
-        state: Floats,
-        states: Floats,
-        objects: Sequence[ObjectModel],
-        names: Sequence[str],
-        known: Bddl,
-    ):
-        self._model = physics_to_read(model_xml)
-        self._data = mujoco.MjData(self._model)
-        self.old_nq = self._model.nq - 7 * len(names)
-        self._old_nv = self._model.nv - 6 * len(names)
-        self._state, self._states, self._objects, self._names = state, states, objects, names
-        self._added = np.isin(self._model.geom_bodyid, [self._model.body(name).id for name in names])
-        self._swept = SweptPath(self._model, self._added, states[:, 1 : 1 + self.old_nq])
+    def __init__(self, scene: Scene, states: Floats, objects: Sequence[ObjectModel], known: Bddl):
+        names = [f"{_BODY}{number}" for number in range(len(objects))]
+        self.model_xml = _with(scene.model_xml, objects, names)
+        self._state, self._states, self._objects = scene.state, states, objects
         self._parked = np.array([[50.0 + 5 * number, 0.0, 50.0, 1.0, 0.0, 0.0, 0.0] for number in range(len(names))])
-        self._regions = regions(known.problem)
-        self._put(states[0], self._parked)
-        self._view = AgentView(self._model, self._data)
-        things = [int(self._model.body(f"{thing}_main").rootid[0]) for thing in known.things_of_interest]
+        model = physics_to_read(self.model_xml)
+        self._old_nq = model.nq - 7 * len(names)
+        self._scene = CompiledScene(Scene(self.model_xml, self.state_with(states[0], self._parked)))
+        self._added = [model.body(name).id for name in names]
+        path = np.stack([State.of(state, self._old_nq).qpos for state in states])
+        self._swept = SweptPath(model, np.isin(model.geom_bodyid, self._added), path)
+        self._regions = REGIONS[known.arena]
+        self._view = AgentView(model, self._scene.data)
+        things = [int(model.body(f"{thing}_main").rootid[0]) for thing in known.things_of_interest]
         self._things_px = [pixels for pixels in self._view.pixels_of(things) if len(pixels)]
+
+    def state_with(self, state: Floats, poses: Floats) -> Floats:
+        """The state (S,) of the scene without the objects, and they at rest at poses (N, 7)."""
+        time, qpos, qvel = State.of(state, self._old_nq)
+        return State(time, np.append(qpos, poses), np.append(qvel, np.zeros(6 * len(poses)))).flat
 
     def draw(self, rng: np.random.Generator, rejected: Counter[str]) -> Floats | None:
         """(N, 7) a place for each object, the broadest first; None when one finds none."""
@@ -193,9 +193,9 @@ class _Placement:
 
     def seen_px(self, poses: Floats) -> list[int]:
         """On how many pixels of the agent view's first frame each object shows; 0 for one that is still parked."""
-        self._put(self._states[0], poses)
+        self._scene.restore(self.state_with(self._states[0], poses))
         counts = []
-        for name, model, pose in zip(self._names, self._objects, poses, strict=True):
+        for body, model, pose in zip(self._added, self._objects, poses, strict=True):
             low, high, _ = model.shape
             # A body's origin is in the middle of its underside.
             half = (np.array(high) - np.array(low)) / 2
@@ -204,46 +204,25 @@ class _Placement:
             mujoco.mju_quat2Mat(turn, pose[3:])
             # The bounds are those of what collides; what is drawn may be somewhat larger.
             pixels = self._view.pixels_near(corners @ turn.reshape(3, 3).T + pose[:3])
-            counts.append(int((self._view.shown(pixels) == self._model.body(name).id).sum()))
+            counts.append(int((self._view.shown(pixels) == body).sum()))
         return counts
 
     def _simulated(self, poses: Floats, held: bool) -> tuple[tuple[Floats, Floats], Floats]:
         """The objects' poses (N, 7) at the end and ``_REST_S`` before, and where all other bodies are (B, 3)."""
-        self._put(self._state, poses)
-        model, data = self._model, self._data
-        still = [
-            joint
-            for joint in range(model.njnt)
-            if model.joint(joint).name.startswith(("robot0_", "gripper0_"))
-            or (held and model.jnt_qposadr[joint] >= self.old_nq)
-        ]
-        width = {mujoco.mjtJoint.mjJNT_FREE: (7, 6), mujoco.mjtJoint.mjJNT_BALL: (4, 3)}
-        qpos: list[int] = []
-        qvel: list[int] = []
-        for joint in still:
-            positions, velocities = width.get(model.jnt_type[joint], (1, 1))
-            qpos += range(model.jnt_qposadr[joint], model.jnt_qposadr[joint] + positions)
-            qvel += range(model.jnt_dofadr[joint], model.jnt_dofadr[joint] + velocities)
-        start, poses_at = data.qpos[qpos].copy(), []
+        self._scene.restore(self.state_with(self._state, poses))
+        model, data = self._scene.model, self._scene.data
+        robot = [joint for joint in range(model.njnt) if model.joint(joint).name.startswith(("robot0_", "gripper0_"))]
+        still = np.append(robot, np.flatnonzero(held & (model.jnt_qposadr >= self._old_nq)))
+        poses_at = []
         for seconds in (_SETTLE_S, _REST_S):
-            for _ in range(round(seconds / model.opt.timestep)):
-                mujoco.mj_step(model, data)
-                data.qpos[qpos], data.qvel[qvel] = start, 0.0
-            poses_at.append(data.qpos[self.old_nq :].reshape(-1, 7).copy())
+            simulate_held(model, data, still, seconds)
+            poses_at.append(data.qpos[self._old_nq :].reshape(-1, 7).copy())
         mujoco.mj_kinematics(model, data)
         others = data.xpos[: model.nbody - len(poses)].copy()
         return (poses_at[1], poses_at[0]), others
 
-    def _put(self, state: Floats, poses: Floats) -> None:
-        mujoco.mj_resetData(self._model, self._data)
-        nq = self.old_nq
-        self._data.qpos[:] = np.concatenate([state[1 : 1 + nq], poses.ravel()])
-        self._data.qvel[: self._old_nv] = state[1 + nq :]
-        mujoco.mj_forward(self._model, self._data)
-
     def _hidden(self, poses: Floats) -> float:
         """Largest share of what the first frame shows of one of the task's things that the objects cover."""
-        self._put(self._states[0], poses)
-        added = [self._model.body(name).id for name in self._names]
-        shares = [np.isin(self._view.shown(pixels), added).mean() for pixels in self._things_px]
+        self._scene.restore(self.state_with(self._states[0], poses))
+        shares = [np.isin(self._view.shown(pixels), self._added).mean() for pixels in self._things_px]
         return float(max(shares, default=0.0))

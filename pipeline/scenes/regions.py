@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.errors import PipelineError
+from pipeline.libero.bddl import Arena
 from pipeline.types import Floats
 
 
@@ -48,7 +48,7 @@ class Regions(NamedTuple):
         return (self.front, self.back) if rng.random() < self.front_share else (self.back, self.front)
 
 
-_ARENAS = {
+REGIONS: dict[Arena, Regions] = {
     "tabletop": Regions(Region((0.19, 0.32), (-0.24, 0.28)), Region((-0.48, 0.13), (0.12, 0.48)), 0.60),
     "floor": Regions(Region((0.22, 0.38), (-0.28, 0.28)), Region((-0.38, -0.22), (-0.33, 0.33)), 0.60),
     "kitchen": Regions(Region((0.17, 0.28), (-0.23, 0.23)), Region((-0.38, -0.17), (-0.33, 0.28)), 0.60),
@@ -56,18 +56,4 @@ _ARENAS = {
     # The study's table stands at x = -0.2.
     "study": Regions(Region((-0.07, 0.08), (-0.33, 0.28)), Region((-0.48, -0.12), (-0.28, 0.38)), 0.38),
 }
-
-
-def regions(problem: str) -> Regions:
-    """The regions of the arena that a class of LIBERO's builds, by its name.
-
-    Raises:
-        PipelineError: when the arena is none of LIBERO's.
-    """
-    for arena, found in _ARENAS.items():
-        if problem.startswith(f"libero_{arena}_"):
-            return found
-    raise PipelineError(
-        f"no places for added objects are known in the scene class {problem!r}",
-        expected=f"a class named libero_<arena>_..., with {', '.join(_ARENAS)}",
-    )
+"""The regions of each of LIBERO's arenas."""

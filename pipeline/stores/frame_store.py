@@ -6,6 +6,7 @@ A trajectory has a folder, and in it a file for each set of streams that were re
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.identity import fingerprint
+from pipeline.identity import fingerprint, made_with
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
@@ -68,8 +69,10 @@ class FrameStore(Store):
 
     def __init__(self, root: Path, config: RenderConfig):
         shown = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        made_by = fingerprint("encoding", config.model_dump(), shown)
-        super().__init__(root, made_by, "render", _COLUMNS, _describe, files="*/*.h5")
+        settings = config.model_dump(mode="json")
+        made_by = fingerprint("encoding", settings, shown)
+        here = {**made_with("encoding"), "episode schema": digest(shown)[:8]}
+        super().__init__(root, made_by, here, settings, "render", _COLUMNS, _describe, files="*/*.h5")
 
     def folder(self, trajectory_id: str) -> Path:
         return self.root / trajectory_id
@@ -156,6 +159,16 @@ class FrameStore(Store):
                 continue
             missing -= here
         return parts
+
+    def outdated_of(self, trajectories: Collection[str], device: str | None) -> Counter[str]:
+        """``outdated`` for all files of some trajectories; with a device, those of another are counted too."""
+        names = [name for name in self.names() if name.split("/")[0] in trajectories]
+        reasons = self.outdated(names)
+        rows = self.rows()
+        for name in names if device else ():
+            if name in rows and rows[name]["device"] != device:
+                reasons[f"OpenGL device {rows[name]['device']}, here {device}"] += 1
+        return reasons
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Action (K, 7) and state (K, 8) of a trajectory, without its frames.

@@ -5,11 +5,13 @@ for something else, and still finds every file that it shares with the plan befo
 
 The table has a row for each file. It spares the stages from opening every file to learn a verdict or a length. It is
 rebuilt where it is missing or doubted: a row is believed while its file has the recorded size and is older than the
-table; any other file is opened and read.
+table; any other file is opened and read. For people, the table's metadata says what fingerprints stand for.
 """
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,13 +19,18 @@ from typing import Any
 
 import h5py
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from pipeline.errors import PipelineError
 from pipeline.files import keep_below, replaced
+from pipeline.identity import differences
 from pipeline.stores.sealed_file import BrokenSealError, SealedFile, sealed, unsealed
 from pipeline.tables import read_table, write_table
 
 TABLE = "index.parquet"
+
+_MADE_WITH = b"made_with"
+"""The table's metadata that has, as JSON, a fingerprint to what files of it were made with."""
 
 
 class Store:
@@ -32,6 +39,8 @@ class Store:
     Args:
         root: the folder.
         made_by: the fingerprint (``pipeline.identity``) of files that are current; others count as missing.
+        made_with: what it is made of, in words.
+        settings: and the user's settings in it, JSON-serialisable.
         stage: which stage makes them, for messages.
         columns: of the table, beside ``file``, ``made_by`` and ``bytes``.
         describe: reads those columns from an open file.
@@ -42,6 +51,8 @@ class Store:
         self,
         root: Path,
         made_by: str,
+        made_with: Mapping[str, str],
+        settings: object,
         stage: str,
         columns: Mapping[str, pa.DataType],
         describe: Callable[[SealedFile], dict[str, Any]],
@@ -49,6 +60,7 @@ class Store:
     ):
         self.root = root
         self.made_by = made_by
+        self._made_with: dict[str, Any] = {"made_with": dict(made_with), "settings": settings}
         self._stage = stage
         self._describe = describe
         self._files = files
@@ -111,16 +123,25 @@ class Store:
 
     def _rows(self) -> tuple[dict[str, dict[str, Any]], bool]:
         """The rows, and whether the table on disk is these rows and is believed in every one."""
-        believed, written_ns = self._table()
-        rows, doubted = {}, False
+        believed, doubted = self._believed()
+        read = {name: self.row(name) for name in doubted}
+        rows = {name: row for name, row in (believed | read).items() if row and row["made_by"] == self.made_by}
+        return dict(sorted(rows.items())), not doubted and len(rows) == len(believed)
+
+    def _believed(self) -> tuple[dict[str, dict[str, Any]], set[str]]:
+        """The table's rows of files that have not changed since, and the names of all other files, also of those gone.
+
+        The rows are whatever fingerprint they have.
+        """
+        told, written_ns = self._table()
+        believed = {}
         for name in self.names():
             status = self.path(name).stat()
-            row = believed.get(name)
-            if row is None or row["bytes"] != status.st_size or status.st_mtime_ns >= written_ns:
-                row, doubted = self._read(name, status.st_size), True
-            if row is not None and row["made_by"] == self.made_by:
-                rows[name] = row
-        return rows, not doubted and rows == believed
+            if name in told and told[name]["bytes"] == status.st_size and status.st_mtime_ns < written_ns:
+                believed[name] = told[name]
+            else:
+                told.setdefault(name, {})
+        return believed, told.keys() - believed.keys()
 
     def row(self, name: str) -> dict[str, Any] | None:
         """One row, read from the file; None when that is missing, damaged or not current."""
@@ -144,15 +165,70 @@ class Store:
             return None
         return {"file": name, "made_by": self.made_by, "bytes": size, **described}
 
+    def untouched(self) -> bool:
+        """Whether the table tells of every file that is there, and none has changed since."""
+        return self._rows()[1]
+
+    def settle(self) -> None:
+        """Where files are gone or have changed since the table was written, have it tell so."""
+        if (self.root / TABLE).exists() and self._believed()[1]:
+            self.refresh()
+
     def refresh(self) -> dict[str, dict[str, Any]]:
         """``rows``, written as the table; only for the stage that makes the files."""
         rows, written = self._rows()
-        if not written:
-            listed = [row for _, row in sorted(rows.items())]
-            write_table(pa.Table.from_pylist(listed, schema=self._schema), self.root / TABLE)
+        known = self._known()
+        if not written or self.made_by not in known:
+            self._write(rows, known | {self.made_by: self._made_with})
         return rows
 
     def keep(self, names: Iterable[str]) -> None:
         """Delete every other file, and what a killed worker left; write the table anew."""
         keep_below(self.root, {self.root / TABLE, *map(self.path, names)})
-        self.refresh()
+        rows = self.refresh()
+        if self._known().keys() - {self.made_by} and len(rows) == len(self.names()):
+            self._write(rows, {self.made_by: self._made_with})
+
+    def _write(self, rows: Mapping[str, Mapping[str, Any]], known: Mapping[str, Any]) -> None:
+        listed = [row for _, row in sorted(rows.items())]
+        schema = self._schema.with_metadata({_MADE_WITH: json.dumps(known, sort_keys=True)})
+        write_table(pa.Table.from_pylist(listed, schema=schema), self.root / TABLE)
+
+    def _known(self) -> dict[str, dict[str, Any]]:
+        """Fingerprint to what files with it were made with, as far as the table says so."""
+        try:
+            known: dict[str, dict[str, Any]] = json.loads(pq.read_schema(self.root / TABLE).metadata[_MADE_WITH])
+        except (OSError, pa.ArrowException, LookupError, TypeError, ValueError):
+            return {}
+        return known
+
+    def outdated(self, names: Iterable[str]) -> Counter[str]:
+        """Why finished files count as missing, to how many do for this reason.
+
+        Those that are damaged are not counted, nor those with other settings: whoever changed these wants new files.
+
+        Args:
+            names: of the files to look at.
+        """
+        current, known = self.rows(), self._known()
+        reasons: Counter[str] = Counter()
+        for name in names:
+            made_by = self._made_by(name) if name not in current else None
+            if made_by is None:
+                continue
+            then = known.get(made_by)
+            if then is None:
+                reasons["something that was not written down"] += 1
+            elif then["settings"] == self._made_with["settings"]:
+                reasons[differences(then["made_with"], self._made_with["made_with"])] += 1
+        return reasons
+
+    def _made_by(self, name: str) -> str | None:
+        """The fingerprint that a file has; None when it is missing or damaged."""
+        if not self.path(name).exists():
+            return None
+        try:
+            with unsealed(self.path(name)) as file:
+                return str(file.attributes["made_by"])
+        except (BrokenSealError, KeyError):
+            return None

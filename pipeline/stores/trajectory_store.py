@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from pipeline.catalogue.scene_files import located, portable
-from pipeline.identity import fingerprint
+from pipeline.identity import fingerprint, made_with
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
 from pipeline.types import Scene, Trajectory, Verdict
@@ -35,7 +35,7 @@ class TrajectoryStore(Store):
     """
 
     def __init__(self, root: Path):
-        super().__init__(root, fingerprint("physics"), "render", _COLUMNS, _describe)
+        super().__init__(root, fingerprint("physics"), made_with("physics"), None, "render", _COLUMNS, _describe)
 
     def save(self, trajectory: Trajectory) -> None:
         attributes = {
@@ -51,7 +51,6 @@ class TrajectoryStore(Store):
             file["start"] = trajectory.scene.state
             file["states"] = trajectory.states
             file["actions"] = trajectory.actions
-            file["kept_mask"] = trajectory.kept_mask
             file.create_dataset("site_alpha", data=trajectory.site_alpha, compression="gzip")
 
     def load(self, trajectory_id: str) -> Trajectory:
@@ -75,7 +74,6 @@ class TrajectoryStore(Store):
                 scene=scene,
                 states=file.array("states"),
                 actions=file.array("actions"),
-                kept_mask=file.array("kept_mask"),
                 site_alpha=file.array("site_alpha"),
                 verdict=Verdict(file.attributes["kept"], file.attributes["reason"]),
             )

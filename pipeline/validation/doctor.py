@@ -26,7 +26,9 @@ from pipeline.config import ComputeConfig, Config, DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import find_task, select_tasks
-from pipeline.run.machine import refuse_another_machine
+from pipeline.planning import plan
+from pipeline.run.machine import refuse_another
+from pipeline.run.remake import outdated
 from pipeline.testset import benchmark
 from pipeline.validation.disk import RUN_MB, needed_mb
 
@@ -81,8 +83,13 @@ def check(
     ]
 
 
-def run(config: Config) -> int:
-    """Print what ``check`` finds for a configuration; the exit status: 1 when something fails."""
+def run(config: Config, *, tried: bool = False) -> int:
+    """Print what ``check`` and a trial find for a configuration; the exit status: 1 when something fails.
+
+    Args:
+        config: of the run.
+        tried: whether the trial was made before, on this machine as it is.
+    """
     table = Table(box=None)
     for column in ("", "what", "found", "try"):
         table.add_column(column, overflow="fold")
@@ -96,7 +103,7 @@ def run(config: Config) -> int:
         demos=config.demos,
     )
     if all(finding.status != "fail" for finding in findings):
-        findings.append(_same(config.data))
+        findings += [*([] if tried else [_same(config.data)]), _finished(config)]
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
@@ -106,12 +113,22 @@ def run(config: Config) -> int:
 
 
 def _same(data: Path) -> Diagnosis:
-    """Whether a run that was begun elsewhere, or with other packages or drivers, would go on here with the same."""
+    """Whether a run that was begun elsewhere would go on here with the same."""
     try:
-        refuse_another_machine(data, trial())
+        refuse_another(data, trial())
     except PipelineError as error:
         return Diagnosis("same machine", "fail", error.what, error.remedy or "")
     return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or nothing was made yet")
+
+
+def _finished(config: Config) -> Diagnosis:
+    """What of the last plan's stored work this version or this device would make anew, if it were allowed to."""
+    file = config.data / "plan.parquet"
+    found = outdated(plan.read(file), config, gl.choose().device) if file.exists() else {}
+    if not found:
+        return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
+    told = "; ".join(f"{number} {what}" for what, number in found.items())
+    return Diagnosis("finished work", "warn", f"outdated: {told}", "go on where it was made, or `REMAKE=1 dvc repro`")
 
 
 @cache

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from pipeline import gl
-from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.axes import from_json
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import decode, encode
-from pipeline.planning.streams import streams_of
+from pipeline.rendering.frames import frames_of
 from pipeline.rendering.last_scene import LastScene
 from pipeline.types import Frame, Trajectory
 from pipeline.validation.checks import Case, psnr_db
@@ -91,13 +91,6 @@ def _turned(raw: Frame) -> Frame:
 
 def _raw(trajectory: Trajectory, perturbations: str, opened: LastScene, step: int) -> dict[str, Frame]:
     """View to its frame before a step, in the orientation of LIBERO's raw observations."""
-    frames = {}
     renderer = opened.renderer(trajectory.model_xml)
-    for view, stream in streams_of(perturbations).items():
-        with renderer.perturbed(of_layer(stream.perturbations, RenderPerturbation)):
-            renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
-            frame = renderer.frame(SCHEMA.views[view].camera)
-        for noise in of_layer(stream.perturbations, PixelPerturbation):
-            frame = noise.apply(frame, step)
-        frames[view] = frame
-    return frames
+    state, site_alpha = trajectory.states[step], trajectory.site_alpha[step]
+    return frames_of(renderer, state, site_alpha, from_json(perturbations), step)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +14,17 @@ from numpy.typing import ArrayLike
 from pipeline.axes import AnyPerturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.evaluation import disjoint, goals, libero_plus
-from pipeline.evaluation.asset_archive import Assets, having
-from pipeline.evaluation.drawn_scene import drawn_scene
-from pipeline.evaluation.initial_states import libero_states, moved_state
-from pipeline.evaluation.picture import Picture
+from pipeline.evaluation import asset_archive, goals, libero_plus, own_draws
 from pipeline.evaluation.results import REFUSED
-from pipeline.evaluation.settings import VIEWS, Settings, Wanted
-from pipeline.evaluation.simulator import Observed, Simulator
-from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.evaluation.settings import VIEWS, Settings, Wanted, checked_actions
+from pipeline.evaluation.simulator import Observed, Picture, Simulator
+from pipeline.evaluation.tasks import EvaluationTask, libero_states
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import SceneFiles
-from pipeline.types import Demo, Floats, Frame, Scene, Task
+from pipeline.types import Floats, Frame, Scene, Task
 
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
 """Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
@@ -43,8 +38,9 @@ class Progress:
         steps: actions taken, without the settling steps.
         success: whether the goal was reached; then the episode is over.
         over: whether it was reached, the limit was, or the simulation became unstable; or the episode cannot begin.
-        reason: ``success``, ``step_limit``, ``simulation_unstable``, ``running``, or ``refused`` where the scene does
-            not take what was drawn. Such an episode is over before its first look and says nothing of a policy.
+        reason: ``success``, ``step_limit``, ``simulation_unstable``, ``running``, ``not_begun``, or ``refused`` where
+            the scene does not take what was drawn. Such an episode is over before its first look and says nothing of a
+            policy.
     """
 
     steps: int
@@ -64,11 +60,10 @@ class EpisodeEnvironment:
 
     def __init__(self, settings: Settings = Settings(), archive: Path | None = None):  # noqa: B008 - frozen
         self.settings, self._archive = settings, archive
+        self.progress = Progress(0, False, True, "not_begun")
         self._simulator: Simulator | None = None
         self._key: tuple[str, ...] = ()
         self._picture = Picture()
-        self._perturbations: tuple[AnyPerturbation, ...] = ()
-        self._running = False
 
     def reset(self, task: EvaluationTask) -> Progress:
         """Start an episode: LIBERO's reset, the initial state, ten settling steps; over where the scene is refused.
@@ -77,24 +72,19 @@ class EpisodeEnvironment:
             PipelineError: when the task cannot be rebuilt here.
         """
         self._picture.restore()
-        self._running = False
+        self.progress = Progress(0, False, True, "not_begun")
         self.task, self._base = task, find_task(task.suite, task.base)
         self.limit = STEP_LIMITS[task.suite]
         self.resolved: Mapping[str, Any] = {}
-        self._perturbations = ()
-        self._progress = Progress(0, False, False, "running")
+        self.perturbations: tuple[AnyPerturbation, ...] = ()
         self._seen: dict[str, Frame] = {}
+        starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
         try:
-            if task.source == "libero_plus":
-                self._start_test_task()
-            elif task.source == "goals":
-                self._start_goal()
-            else:
-                self._start_libero()
+            starts.get(task.source, self._start_libero)()
+            self.progress = Progress(0, False, False, "running")
         except RefusedError:
-            self._progress = Progress(0, False, True, REFUSED)
-        self._running = True
-        return self._progress
+            self.progress = Progress(0, False, True, REFUSED)
+        return self.progress
 
     def step(self, action: ArrayLike) -> Progress:
         """Take one control step, 50 ms.
@@ -106,27 +96,21 @@ class EpisodeEnvironment:
         Raises:
             PipelineError: when the action is not seven finite numbers, or no episode is running.
         """
-        given = _checked(action)
-        simulator = self._opened
-        if not self._running or self._progress.over:
+        (given,) = checked_actions(action, "action").copy()
+        if self.progress.over:
             raise PipelineError("no episode is running", expected="reset before step, and no step after its end")
         given[6] = -1.0 if given[6] < 0 else 1.0
-        steps = self._progress.steps + 1
+        steps = self.progress.steps + 1
         self._seen = {}
         try:
-            simulator.step(given)
+            self._opened.step(given)
         except RefusedError as error:
-            self._progress = Progress(steps, False, True, error.reason)
-            return self._progress
-        success = simulator.succeeded()
-        limit = steps >= self.limit
+            self.progress = Progress(steps, False, True, error.reason)
+            return self.progress
+        success, limit = self._opened.succeeded(), steps >= self.limit
         reason = "success" if success else "step_limit" if limit else "running"
-        self._progress = Progress(steps, success, success or limit, reason)
-        return self._progress
-
-    @property
-    def progress(self) -> Progress:
-        return self._progress
+        self.progress = Progress(steps, success, success or limit, reason)
+        return self.progress
 
     @property
     def instruction(self) -> str:
@@ -142,19 +126,15 @@ class EpisodeEnvironment:
         """What LIBERO observed of the last control step."""
         return self._opened.observed
 
-    @property
-    def perturbations(self) -> Sequence[AnyPerturbation]:
-        """What is changed in this episode."""
-        return self._perturbations
-
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
         if view not in self._seen:
-            if self.settings.black in (view, "all"):
-                self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8)
-            else:
-                steps = self._progress.steps
-                self._seen[view] = self._picture.frame(view, self.observed, self._perturbations, steps)
+            black = self.settings.black in (view, "all")
+            self._seen[view] = (
+                np.zeros(SCHEMA.frame.shape, np.uint8)
+                if black
+                else self._picture.frame(view, self.observed, self.progress.steps)
+            )
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
@@ -175,8 +155,7 @@ class EpisodeEnvironment:
         self._picture.close()
         if self._simulator is not None:
             self._simulator.close()
-            self._simulator = None
-        self._key = ()
+        self._simulator, self._key = None, ()
 
     @property
     def _opened(self) -> Simulator:
@@ -187,37 +166,26 @@ class EpisodeEnvironment:
     def _start_test_task(self) -> None:
         test = self._test
         posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
+        state = libero_states(self._base)[0]
         if test.axis in ("light", "background"):
-            self._build(self._base, test.name, self._assets(test).scene(test))
-            state = libero_states(self._base)[0]
+            self._build(self._base, test.name, asset_archive.scene(test, self._assets(test)))
         elif test.axis in ("pose", "layout"):
             if test.axis == "layout":
-                self._assets(test).register_objects(test)
-            with tempfile.TemporaryDirectory() as folder:
-                file = Path(folder) / f"{self._base.name}.bddl"
-                file.write_text(libero_plus.bddl_text(test))
-                self._build(replace(self._base, bddl_file=file), test.name)
-            state = moved_state(test.suite, test.name)
+                asset_archive.register_objects(test, self._assets(test))
+            self._build_from(libero_plus.bddl_text(test), test.name)
+            state = libero_plus.moved_state(test.suite, test.name)
         else:
             self._build(self._base)
-            state = libero_states(self._base)[0]
         noise = (libero_plus.noise(test, self.settings.seed),) if test.axis == "noise" else ()
-        self._perturbations = (libero_plus.camera(test), *noise)
-        self._opened.start(self.settings.fixture_seed, state, posture)
-        self._picture.show(self._opened.model)
+        self.perturbations = (libero_plus.camera(test), *noise)
+        self._start(self.settings.fixture_seed, state, posture)
 
     def _start_goal(self) -> None:
         """Start LIBERO's own task with another goal."""
         replacement = goals.find(self._base, self.task.name)
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / self._base.bddl_file.name
-            file.write_text(replacement.bddl_text(self._base))
-            self._build(replace(self._base, bddl_file=file), f"{replacement.old} {replacement.new}")
+        self._build_from(replacement.bddl_text(self._base), f"{replacement.old} {replacement.new}")
         self._base = replace(self._base, instruction=replacement.instruction)
-        states = libero_states(self._base)
-        number = self.task.number % len(states)
-        self._opened.start(self.settings.fixture_seed + number, states[number])
-        self._picture.show(self._opened.model)
+        self._start(*self._initial_state())
 
     def _start_libero(self) -> None:
         """Start LIBERO's own task, or held-out draws on it.
@@ -226,46 +194,47 @@ class EpisodeEnvironment:
             RefusedError: see ``drawn_scene``.
         """
         self._build(self._base)
-        demo = StarterSource().of(self._base)
-        seed = self.settings.fixture_seed
+        seed, demo, recorded = self.settings.fixture_seed, StarterSource().of(self._base), True
         if self.settings.initial_states == "libero":
-            states = libero_states(self._base)
-            number = self.task.number % len(states)
-            seed, demo = seed + number, replace(demo, init_state=states[number])
+            seed, state = self._initial_state()
+            demo, recorded = replace(demo, init_state=state), False
+
+        def nominal() -> Scene:
+            scene = recorded_start(demo, self._opened.place_fixtures(seed))
+            # A recording had the gripper open; LIBERO's reset, after which its own states are put in, leaves it without
+            # a command.
+            return scene if recorded else replace(scene, gripper=0.0)
+
         scene = None
         if self.task.source == "own":
-            nominal = partial(self._nominal, seed, demo)
-            planned = None if self.settings.plan is None else disjoint.planned(self.settings.plan)
-            self._perturbations, scene = drawn_scene(self.task, self.settings.seed, demo, nominal, planned)
-        self.resolved = scene.resolved if scene else {}
-        self._start(demo, seed, scene)
-
-    def _nominal(self, seed: int, demo: Demo) -> Scene:
-        scene = recorded_start(demo, self._opened.place_fixtures(seed))
-        # A recording had the gripper open; LIBERO's reset, after which its own states are put in, leaves it without a
-        # command.
-        return scene if self.settings.initial_states == "demonstration" else replace(scene, gripper=0.0)
-
-    def _start(self, demo: Demo, seed: int, scene: Scene | None) -> None:
-        """Start from a demonstration's initial state, in LIBERO's scene or a changed one."""
-        if scene is None and self.settings.initial_states == "libero":
-            self._opened.start(seed, demo.init_state)
-            self._picture.show(self._opened.model)
+            planned = None if self.settings.plan is None else own_draws.planned(self.settings.plan)
+            self.perturbations, scene = own_draws.drawn_scene(self.task, self.settings.seed, demo, nominal, planned)
+        if scene is None and not recorded:
+            self._start(seed, demo.init_state)
             return
-        scene = scene or self._nominal(seed, demo)
+        scene = scene or nominal()
+        self.resolved = scene.resolved
         self._opened.start_scene(scene)
-        self._picture.show(scene.model_xml)
+        self._picture.show(scene.model_xml, self.perturbations)
+
+    def _start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
+        """Start from a state in the model of LIBERO's own reset."""
+        self._opened.start(seed, state, posture_rad)
+        self._picture.show(self._opened.model, self.perturbations)
+
+    def _initial_state(self) -> tuple[int, Floats]:
+        """The seed of LIBERO's reset and its initial state for the task's number."""
+        states = libero_states(self._base)
+        number = self.task.number % len(states)
+        return self.settings.fixture_seed + number, states[number]
 
     @property
     def _test(self) -> TestTask:
-        tests = libero_plus.by_name()
-        key = (self.task.suite, self.task.name)
-        if key not in tests:
-            raise PipelineError(f"LIBERO-Plus has no test task {self.task.name!r}", where=self.task.suite)
-        return tests[key]
+        return libero_plus.find(self.task.suite, self.task.name)
 
-    def _assets(self, test: TestTask) -> Assets:
-        assets = having(test, self._archive)
+    def _assets(self, test: TestTask) -> Path:
+        """The folder that has the files of a light, background or layout task."""
+        assets = asset_archive.having(test, self._archive)
         if assets is None:
             raise PipelineError(
                 f"changes the {test.axis}, for which the asset archive of LIBERO-Plus is needed",
@@ -275,27 +244,16 @@ class EpisodeEnvironment:
             )
         return assets
 
+    def _build_from(self, bddl_text: str, scene: str) -> None:
+        """Have the simulator of a scene of the task that another BDDL file defines."""
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / self._base.bddl_file.name
+            file.write_text(bddl_text)
+            self._build(replace(self._base, bddl_file=file), scene)
+
     def _build(self, task: Task, scene: str = "", files: SceneFiles | None = None) -> None:
         """Have the simulator of a task, or of another scene of it."""
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()
             self._simulator, self._key = Simulator(task, files), key
-
-
-def _checked(action: ArrayLike) -> Floats:
-    """A copy of the action.
-
-    Raises:
-        PipelineError: when it is not seven finite numbers.
-    """
-    try:
-        given = np.array(action, np.float64)
-    except (TypeError, ValueError) as error:
-        raise PipelineError(f"the action is not numbers ({error})", where="action", expected="(7,) numbers") from error
-    expected = "(7,): three of position, three of rotation, and the gripper"
-    if given.shape != (7,):
-        raise PipelineError(f"the action has shape {given.shape}", where="action", expected=expected)
-    if not np.isfinite(given).all():
-        raise PipelineError("the action has NaN or infinity", where="action", expected=f"finite numbers, {expected}")
-    return given

@@ -10,8 +10,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.policies import Look
-from pipeline.evaluation.settings import Wanted
+from pipeline.evaluation.settings import Look, Wanted
 from pipeline.evaluation.simulator import Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
@@ -48,8 +47,6 @@ class Replay:
 
     def end(self, success: bool) -> None: ...
 
-    def close(self) -> None: ...
-
 
 class TrackedReplay:
     """Follows the hand's path of the demonstration by feedback, one action at a time.
@@ -77,8 +74,6 @@ class TrackedReplay:
         return next(self._actions, np.append(np.zeros(6), self._reference.actions[-1, 6]))
 
     def end(self, success: bool) -> None: ...
-
-    def close(self) -> None: ...
 
 
 @lru_cache(maxsize=8)

@@ -1,5 +1,5 @@
 """The tasks as a benchmark of vla-eval, the field's harness: ``vla-eval run`` with a configuration that names
-``pipeline.evaluation.vla_eval_benchmark:PerturbedLibero`` evaluates any of its model servers.
+``pipeline.evaluation.harness:PerturbedLibero`` evaluates any of its model servers.
 """
 
 from __future__ import annotations
@@ -7,8 +7,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
+from vla_eval.model_servers.base import ModelServer, SessionContext
+from vla_eval.model_servers.serve import run_server
 from vla_eval.specs import (
     GRIPPER_CLOSE_POS,
     IMAGE_RGB,
@@ -21,11 +22,14 @@ from vla_eval.specs import (
 
 from pipeline import gl
 from pipeline.errors import PipelineError
-from pipeline.evaluation.episode import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import NextLook
-from pipeline.evaluation.selection import check_settings
-from pipeline.evaluation.settings import Settings, Wanted
-from pipeline.evaluation.tasks import EvaluationTask, Selection, select
+from pipeline.evaluation.reference_policies import Replay, TrackedReplay
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.settings import Settings, Wanted, check_settings, checked_actions
+from pipeline.evaluation.tasks import EvaluationTask
+
+ACTION = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
 
 
 class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
@@ -94,7 +98,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     def step(self, action: dict[str, Any]) -> StepResult:
         """Take one action (7,), or all of a chunk (n, 7) until the episode is over."""
         given = action.get("actions", action.get("action"))
-        for one in np.atleast_2d(np.asarray(given)):
+        for one in checked_actions(given, "model server"):
             progress = self._environment.step(one)
             if progress.over:
                 break
@@ -104,8 +108,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         return StepResult(self._last, float(progress.success), progress.over, {"success": progress.success})
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
-        observation: dict[str, Any] = raw_obs
-        return observation
+        return dict(raw_obs)
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         progress = self._environment.progress
@@ -121,7 +124,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         }
 
     def get_action_spec(self) -> dict[str, DimSpec]:
-        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+        return ACTION
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         spec = {"agentview": IMAGE_RGB, "language": LANGUAGE}
@@ -138,3 +141,38 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         self._last = self._environment.observation(self._wanted)
         self._next_look.looked()
         return self._last
+
+
+class ReplayServer(ModelServer):  # type: ignore[misc]
+    """Answers with the actions of the starter set's demonstration of the task.
+
+    Args:
+        chunk: how many actions each answer has; all are taken before the next look. Of no effect when tracked.
+        tracked: follow the demonstration's path by the state in each observation, one action at a time.
+    """
+
+    def __init__(self, *, chunk: int = 1, tracked: bool = False):
+        self._chunk, self._tracked = chunk, tracked
+        self._replays: dict[str, Replay | TrackedReplay] = {}
+
+    async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
+        replay = self._replays[ctx.session_id] = TrackedReplay() if self._tracked else Replay(self._chunk)
+        replay.begin(EvaluationTask.of_harness(config["task"]))
+
+    async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
+        actions = self._replays[ctx.session_id].act(lambda _: obs)
+        # A chunk of one is sent as one action (7,), but not the last action of a longer one: it keeps none.
+        await ctx.send_action({"actions": actions.squeeze() if self._tracked or self._chunk == 1 else actions})
+
+    def get_observation_params(self) -> dict[str, Any]:
+        return {"send_state": self._tracked}
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        return ACTION
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        return {"image": IMAGE_RGB, **({"state": STATE_EEF_POS_AA_GRIP} if self._tracked else {})}
+
+
+if __name__ == "__main__":
+    run_server(ReplayServer)

@@ -12,6 +12,15 @@ ROUND = 0.8
 """Least cosine between a corner's normal and its face's: else MuJoCo takes the face's (``mjr_uploadMesh``)."""
 
 
+PARTS = {
+    "vert": ("vert",),
+    "normal": ("normal",),
+    "texcoord": ("texcoord",),
+    "face": ("face", "facenormal", "facetexcoord"),
+}
+"""Arrays of a model that a mesh is drawn from, by what says which part of them is the mesh's."""
+
+
 class Faces(NamedTuple):
     """A mesh by its vertices, each a place with what is drawn there; faces that meet mostly differ in the normal.
 

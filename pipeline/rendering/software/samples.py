@@ -13,9 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.jit import compiled
-from pipeline.rendering.faces import Faces
-from pipeline.rendering.mesh_pieces import BATCH_FACES, PIECE_FACES
+from pipeline.rendering.software.faces import Faces
 from pipeline.types import Floats
+
+BATCH_FACES = 341
+"""llvmpipe draws so many faces of a display list or of a buffer at once. Where one of them has a corner outside of the
+view, all of them are sorted by front and back before their corners are rounded, else afterwards."""
 
 MARGIN_PX = 1 / 128
 """How far beside a face a sample counts as covered. OpenGL rounds corners to 1/256 of a pixel, so by half of that."""
@@ -50,7 +53,6 @@ def faces_that_show(
     position_m: Floats,
     rotation: Floats,
     faces: Faces,
-    pieces: NDArray[np.bool_],
     samples: NDArray[np.float32],
     found: NDArray[np.uint32],
 ) -> int:
@@ -60,7 +62,6 @@ def faces_that_show(
         projection: of the picture.
         position_m, rotation: (3,) and (9,) of the mesh in the world.
         faces: of the mesh; their corners come counter-clockwise as seen from the front.
-        pieces: (P,) which pieces of the mesh are looked at.
         samples: (``SAMPLES``, 2) place of each sample in its pixel, 0 to 1 to the right and up.
         found: (``room(F)``,) to write into.
 
@@ -76,8 +77,6 @@ def faces_that_show(
         projection.far_m,
         faces.places_m,
         faces.place_of_corner,
-        pieces,
-        PIECE_FACES,
         BATCH_FACES,
         samples,
         *projection.size_px,
@@ -92,8 +91,6 @@ def _covering(
     far_m: float,
     places_m: NDArray[np.float32],
     place_of_corner: NDArray[np.uint32],
-    pieces: NDArray[np.bool_],
-    piece_faces: int,
     batch_faces: int,
     samples: NDArray[np.float32],
     width_px: int,
@@ -125,8 +122,6 @@ def _covering(
     count = 0
     for batch in range((len(place_of_corner) + batch_faces - 1) // batch_faces):
         first, last = batch_faces * batch, min(batch_faces * (batch + 1), len(place_of_corner))
-        if not pieces[first // piece_faces]:
-            continue
         sorted_before = False
         for face in range(first, last):
             a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]

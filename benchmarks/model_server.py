@@ -1,0 +1,43 @@
+"""Model servers in processes of their own, as evaluations meet them."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+
+@contextmanager
+def running(*program: str) -> Iterator[str]:
+    """Run a model server; yields its address.
+
+    Args:
+        program: what Python is given: its file, or ``-m`` and its module, and its options but the address.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    server = subprocess.Popen([sys.executable, *program, "--address", f"127.0.0.1:{port}"])
+    try:
+        while server.poll() is None:
+            try:
+                socket.create_connection(("127.0.0.1", port)).close()
+                break
+            except OSError:
+                time.sleep(0.1)
+        yield f"ws://127.0.0.1:{port}"
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def replaying(chunk: int) -> AbstractContextManager[str]:
+    """Run the server that replays demonstrations; its address, while it is entered.
+
+    Args:
+        chunk: how many actions each answer has.
+    """
+    return running("-m", "pipeline.evaluation.harness", "--args.chunk", str(chunk))

@@ -1,0 +1,40 @@
+"""How far the work is, in a terminal and in a log."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+@contextmanager
+def progress_of(description: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar with rate and ETA on a terminal; a line every tenth of the way where there is none."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TextColumn("elapsed"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task(description, total=total, rate="")
+
+        def advance(size: int) -> None:
+            state = progress.tasks[task]
+            tenths = int(10 * state.completed / total)
+            progress.advance(task, size)
+            done = int(state.completed)
+            rate = done / max(state.elapsed or 0.0, 1e-9)
+            progress.update(task, rate=f"{rate:.2f}/s")
+            if not console.is_terminal and int(10 * done / total) > tenths:
+                left = (total - done) / rate
+                console.print(f"{description}: {done}/{total}, {rate:.2f}/s, {left:.0f} s left", highlight=False)
+
+        yield advance

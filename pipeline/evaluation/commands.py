@@ -1,0 +1,254 @@
+"""The commands ``evaluate`` and ``analyse``. Each prints one line of JSON last."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline import gl
+from pipeline.arguments import positive
+from pipeline.compute.pool import runner
+from pipeline.config import ComputeConfig
+from pipeline.errors import PipelineError
+from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.tasks import write_tasks
+from pipeline.files import write_json
+
+
+def add_commands(commands: Any) -> None:
+    """Add ``evaluate`` and ``analyse`` to the commands of a parser."""
+    _add_evaluate(commands)
+    _add_analyse(commands)
+
+
+def _add_evaluate(commands: Any) -> None:
+    command = commands.add_parser(
+        "evaluate",
+        help="run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes",
+        description="Writes one file for each episode, and summary.json with success rates and their 95 % intervals. "
+        "Run again after a kill, it goes on. The policy is a model server of vla-eval (started by you), or a "
+        "checkpoint of lerobot on disk.",
+        argument_default=argparse.SUPPRESS,  # of what is left out, the defaults are those of the models' fields
+    )
+    add = command.add_argument
+    add("out", type=Path, metavar="DIR", help="folder of the results")
+    acting = command.add_mutually_exclusive_group(required=True)
+    acting.add_argument("--server", metavar="URL", help="address of a model server, such as ws://localhost:8000")
+    acting.add_argument("--checkpoint", type=Path, metavar="DIR", help="a policy that lerobot saved")
+    acting.add_argument(
+        "--replay",
+        nargs="?",
+        choices=("open_loop", "tracked"),
+        const="open_loop",
+        help="the demonstrations, as a check: their own actions (open_loop, as without a value), or their paths, "
+        "followed by feedback (tracked)",
+    )
+    _add_selection(command)
+    _add_settings(command)
+    add(
+        "--label",
+        metavar="NAME",
+        help="name of the policy in the results; a server must have one, another for each policy (default of a "
+        "checkpoint: its folder and a part of the hash of its content)",
+    )
+    add(
+        "--assets",
+        dest="archive",
+        type=Path,
+        metavar="DIR",
+        help="LIBERO-Plus's unpacked asset archive, which its light, layout and most of its background tasks need",
+    )
+    add(
+        "--timeout",
+        dest="timeout_s",
+        type=positive,
+        metavar="S",
+        help="seconds that a server's answer may take (default: 120)",
+    )
+    add("--workers", type=positive, default=0, metavar="N", help="processes (default: one for each core)")
+    add("--videos", choices=("none", "failures", "all"), help="of which episodes to keep a video (default: none)")
+    command.set_defaults(run=_evaluate)
+
+
+def _add_selection(command: argparse.ArgumentParser) -> None:
+    """Fields of ``Selection``."""
+    add = command.add_argument
+    add(
+        "--source",
+        choices=("libero", "libero_plus", "own", "pairs", "goals"),
+        help="of the tasks (default: libero)",
+    )
+    add(
+        "--tasks-from",
+        dest="file",
+        type=Path,
+        metavar="FILE",
+        help="in place of a source, a list that `analyse construct` wrote",
+    )
+    add("--suite", dest="suites", nargs="+", metavar="SUITE", help="of these suites only")
+    add("--axis", dest="axes", nargs="+", metavar="AXIS", help="of these axes only")
+    add("--component", dest="components", nargs="+", metavar="NAME", help="of these components only")
+    add("--level", dest="levels", nargs="+", type=int, metavar="N", help="of these levels only")
+    add("--task", dest="tasks", nargs="+", metavar="PATTERN", help="named so, or perturbing one so named")
+    add("--subset", type=positive, metavar="N", help="so many, spread evenly over all of these")
+    add(
+        "--episodes",
+        type=positive,
+        metavar="N",
+        help="initial states, of which LIBERO has 50, or draws of each task (default: 1)",
+    )
+    add("--seed", type=int, help="of the subset and of every draw (default: 0)")
+
+
+def _add_settings(command: argparse.ArgumentParser) -> None:
+    """Fields of ``Settings``, but the seed, which is the selection's."""
+    add = command.add_argument
+    add("--plan", type=Path, metavar="FILE", help="draw held-out draws anew that overlap with this training plan")
+    add(
+        "--prompt",
+        choices=("clean", "benchmark", "blank"),
+        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name; "
+        "or say nothing at all",
+    )
+    add(
+        "--black",
+        choices=("none", "agentview", "all"),
+        help="show the policy black frames in place of the agent view, or of all views (default: none)",
+    )
+    add(
+        "--initial-states",
+        choices=("libero", "demonstration"),
+        help="LIBERO's own (default), or the first state of the starter set's demonstration",
+    )
+    add(
+        "--look-every",
+        type=positive,
+        metavar="N",
+        help="a server that keeps its chunk of actions to itself takes N of each: it is shown the scene once in N "
+        "control steps (default: 1)",
+    )
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    # The simulator takes seconds to import, which the other commands can do without.
+    from dask.system import CPU_COUNT
+
+    from pipeline.evaluation.evaluate import evaluate
+    from pipeline.evaluation.policies import PolicyConfig
+    from pipeline.evaluation.rollout import Evaluation
+    from pipeline.evaluation.selection import Selection
+    from pipeline.evaluation.settings import Settings
+
+    def given(*names: str) -> dict[str, Any]:
+        return {name: value for name, value in vars(arguments).items() if name in names}
+
+    kind, address = next(iter(given("server", "checkpoint", "replay").items()))
+    policy = {"kind": address} if kind == "replay" else {"kind": kind, "address": str(address)}
+    config = PolicyConfig.model_validate(policy | given("label", "timeout_s"))
+    settings = Settings.model_validate(given(*Settings.model_fields))
+    evaluation = Evaluation(settings, config, config.identity(), arguments.out, **given("videos", "archive"))
+    workers = arguments.workers or CPU_COUNT
+    compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
+    with runner(compute, arguments.out, gl.Shared) as run:
+        found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
+    print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
+    return 0
+
+
+def _add_analyse(commands: Any) -> None:
+    top = commands.add_parser("analyse", help="compositional gap, difficulty, a benchmark of your own, leakage")
+    kinds = top.add_subparsers(dest="analysis", required=True, metavar="ANALYSIS")
+
+    command = kinds.add_parser(
+        "gap",
+        help="compositional gap of the pairs that were run with --source pairs: gap.json and gap.png in their folder",
+    )
+    command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
+    command.set_defaults(run=_gap)
+
+    command = kinds.add_parser(
+        "construct",
+        help="draw 14,000 candidates of held-out draws, filter and balance them to a benchmark",
+        description="The file is for `evaluate --tasks-from`. Which scenes refuse their draw is known once candidates "
+        "were run: give those results, and these tasks are left out.",
+    )
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks to write")
+    command.add_argument("--size", type=int, metavar="N", help="tasks of the benchmark (default: 10,000)")
+    command.add_argument("--results", type=Path, nargs="+", default=(), metavar="DIR", help="results of candidates")
+    command.add_argument("--plan", type=Path, metavar="FILE", help="leave out what overlaps with this training plan")
+    command.add_argument("--seed", type=int, default=0, help="of all draws (default: 0)")
+    command.set_defaults(run=_construct)
+
+    command = kinds.add_parser("grade", help="levels of difficulty, 1 to 5, by how many of several models solve a task")
+    command.add_argument("results", type=Path, nargs="+", metavar="DIR", help="results of one model each")
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks with their difficulty")
+    command.set_defaults(run=_grade)
+
+    command = kinds.add_parser(
+        "leakage",
+        help="how close the held-out draws of results come to a training plan; ends with 1 where they overlap",
+    )
+    command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
+    command.add_argument("--plan", type=Path, required=True, metavar="FILE", help="data/<run>/plan.parquet")
+    command.set_defaults(run=_leakage)
+
+
+def _gap(arguments: argparse.Namespace) -> int:
+    from pipeline.evaluation import composition
+
+    measured = composition.pairs(EpisodeFiles(arguments.results).some_rows())
+    composition.heatmap(measured, arguments.results / "gap.png")
+    figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
+    write_json(arguments.results / "gap.json", figures)
+    print(json.dumps(figures))
+    return 0
+
+
+def _construct(arguments: argparse.Namespace) -> int:
+    # The draws need LIBERO, which takes seconds to import.
+    from pipeline.evaluation import construction, own_draws
+
+    chosen, counts = construction.construct(
+        construction.candidates(arguments.seed),
+        arguments.seed,
+        arguments.size or construction.SIZE,
+        [row for folder in arguments.results for row in EpisodeFiles(folder).some_rows()],
+        own_draws.planned(arguments.plan) if arguments.plan else None,
+    )
+    write_tasks(chosen, arguments.seed, arguments.out)
+    print(json.dumps(counts))
+    return 0
+
+
+def _grade(arguments: argparse.Namespace) -> int:
+    from pipeline.evaluation import construction
+
+    results = [list(EpisodeFiles(folder).some_rows()) for folder in arguments.results]
+    seed, *others = sorted({row["seed"] for rows in results for row in rows})
+    if others:
+        raise PipelineError(f"results of seeds {[seed, *others]}", expected="one seed, and so the same draws")
+    graded = construction.grade(results)
+    write_tasks(graded, seed, arguments.out)
+    by_level = {level: sum(task["difficulty"] == level for task in graded) for level in range(1, 6)}
+    print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
+    return 0
+
+
+def _leakage(arguments: argparse.Namespace) -> int:
+    from pipeline.axes import from_json
+    from pipeline.evaluation import own_draws
+    from pipeline.libero.tasks import find_task
+
+    drawn = [
+        (row["name"], one, find_task(row["suite"], row["base"]))
+        for row in EpisodeFiles(arguments.results).some_rows()
+        if row["source"] == "own"
+        for one in from_json(json.dumps(row["perturbations"]))
+    ]
+    if not drawn:
+        raise PipelineError("there are no held-out draws", where=arguments.results, remedy="evaluate --source own")
+    findings = own_draws.compare(drawn, own_draws.planned(arguments.plan))
+    print(json.dumps(findings))
+    return int(any(finding["overlaps"] for finding in findings.values()))

@@ -1,0 +1,279 @@
+"""Draws of the axes that no plan has: how they are drawn, and kept clear of a plan."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline import seeding
+from pipeline.axes import AnyAxis, AnyPerturbation, Axes, PhysicsPerturbation, axes_of, from_json
+from pipeline.axes.background import BackgroundPerturbation
+from pipeline.axes.base import Level
+from pipeline.axes.camera import CameraPerturbation
+from pipeline.axes.layout import LayoutPerturbation
+from pipeline.axes.noise import NoiseAxis, NoisePerturbation
+from pipeline.axes.pose import PosePerturbation
+from pipeline.axes.robot import RobotPerturbation
+from pipeline.axes.scene import ScenePerturbation
+from pipeline.errors import PipelineError, RefusedError
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.files import Edition, checksum_of, edition
+from pipeline.libero.tasks import find_task
+from pipeline.physics.roll_out import roll_out
+from pipeline.planning import plan
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.testset.definitions import Value
+from pipeline.types import Demo, Floats, Scene, Task
+
+LEVELS: tuple[Level, ...] = (1, 2, 3, 4, 5)
+
+OWN_AXES = ("layout", "pose", "robot", "camera", "light", "background", "noise")
+"""The axes with draws of their own to hold out. Language is none: its rewrites are a list, which training uses up."""
+
+ATTEMPTS = 20
+"""How often a draw that its scene refuses, or that a plan has, is drawn anew."""
+
+
+def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
+    """A held-out draw on a LIBERO task; None where an axis cannot change anything that the task has.
+
+    Args:
+        axis: one, or several joined by +.
+        number: counts the draws of a task, axis and level.
+    """
+    axes = axes_of(axis)
+    if not all(default_axis(one).applies(task) for one in axes):
+        return None
+    name = f"{task.name}_{axis}_level{level}_draw{number}"
+    drawn = EvaluationTask("own", task.suite, task.name, name, axis, "", level, number)
+    return replace(drawn, component="+".join(draw(drawn, seed, axis=one).component for one in axes))
+
+
+def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> AnyPerturbation:
+    """The perturbation of a held-out draw on one axis.
+
+    Its key begins with ``evaluation``, which no plan's does, so that no seed makes the two draw alike. What a draw is
+    joined with is not part of the key: a pair has the draws of its singles.
+
+    Args:
+        attempt: counts the draws that were refused.
+        axis: which, where the task joins several.
+    """
+    name = axis or task.axis
+    key = seeding.rng("evaluation", seed, name, task.suite, task.base, task.level, task.number, attempt)
+    ranges = default_axis(name).model_copy(update={"levels": (task.level,)})
+    drawn: AnyPerturbation = ranges.sample(key, find_task(task.suite, task.base), task.number)
+    return drawn
+
+
+@cache
+def default_axis(name: str) -> AnyAxis:
+    """An axis with its default ranges; noise has the strengths of the benchmark's even severities.
+
+    Noise has one strength for each component and level. With the default ones, held-out draws would be as strong as
+    those that plans train on; from the benchmark's, plans keep clear.
+    """
+    if name == "noise":
+        tests = benchmark.load().of("noise")
+        effects = {(test.component, test.parameters["severity"]): libero_plus.noise(test, 0).effect for test in tests}
+        components = dict.fromkeys(test.component for test in tests)
+        return NoiseAxis.model_validate(
+            {component: tuple(effects[component, 2 * level] for level in LEVELS) for component in components}
+        )
+    default: AnyAxis = getattr(Axes.model_validate({name: {}}), name)
+    return default
+
+
+def drawn_scene(
+    task: EvaluationTask, seed: int, demo: Demo, nominal: Callable[[], Scene], planned: PlannedDraws | None
+) -> tuple[tuple[AnyPerturbation, ...], Scene | None]:
+    """What a task draws, in the order in which it applies, and the scene with it; None where physics stay LIBERO's.
+
+    Each axis has the first draw that the scene takes by itself. That is so too where other axes join it, so that a
+    pair has the draws of its singles. They apply one after the other, as those of a plan do.
+
+    Args:
+        seed: of all draws.
+        demo: of the task, in the initial state that the episode begins in.
+        nominal: gives the scene without any change.
+        planned: what draws must keep clear of.
+
+    Raises:
+        RefusedError: when the scene takes no draw of an axis, or not the draws of several together.
+    """
+    perturbations: list[AnyPerturbation] = []
+    scene = None
+    for axis in axes_of(task.axis):
+        drawn = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
+        apart = (one for one in drawn if planned is None or not planned.overlap(one, demo.task))
+        fitting = _first_that_fits(apart, demo, nominal)
+        if fitting is None:
+            raise RefusedError(f"no_{axis}_draw_fits")
+        perturbation, alone = fitting
+        perturbations.append(perturbation)
+        if isinstance(perturbation, PhysicsPerturbation):
+            scene = alone if scene is None else perturbation.apply(scene, demo, roll_out)
+    return tuple(perturbations), scene
+
+
+def _first_that_fits(
+    drawn: Iterable[AnyPerturbation], demo: Demo, nominal: Callable[[], Scene]
+) -> tuple[AnyPerturbation, Scene | None] | None:
+    """The first draw that the scene takes, and the scene with it, or None where physics stay LIBERO's."""
+    for one in drawn:
+        if not isinstance(one, PhysicsPerturbation):
+            return one, None
+        try:
+            return one, one.apply(nominal(), demo, roll_out)
+        except RefusedError:
+            continue
+    return None
+
+
+class PlannedDraws:
+    """What a plan draws, to keep held-out draws clear of it.
+
+    Distances are those of the leakage report, with the plan in the place of the benchmark's test tasks.
+
+    Args:
+        rows: of the plan, reserves among them.
+    """
+
+    def __init__(self, rows: Iterable[plan.Row]):
+        self._draws: dict[str, list[AnyPerturbation]] = defaultdict(list)
+        tests: list[TestTask] = []
+        for row in rows:
+            for one in from_json(row.perturbations):
+                self._draws[one.axis].append(one)
+                tests.append(TestTask(row.suite, row.task, row.episode_id, one.axis, one.component, _as_test(one)))
+        self._tests = TestSet(tuple(tests))
+
+    def nearest(self, drawn: AnyPerturbation, task: Task) -> tuple[float, str]:
+        """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
+        episode, where there is none to compare with."""
+        distances = self._distances(drawn, task)
+        distances = np.where(np.isnan(distances), np.inf, distances)
+        if not np.isfinite(distances).any():
+            return math.inf, ""
+        closest = int(distances.argmin())
+        return float(distances[closest]), self._tests.of(drawn.axis)[closest].name
+
+    def count(self, name: str) -> int:
+        """How many planned draws an axis has."""
+        return len(self._draws[name])
+
+    def overlap(self, drawn: AnyPerturbation, task: Task) -> bool:
+        """Whether a draw is a planned one, or closer to one than the axis keeps from the benchmark's test tasks."""
+        distance, _ = self.nearest(drawn, task)
+        return distance == 0 or distance < drawn.clearance
+
+    def _distances(self, drawn: AnyPerturbation, task: Task) -> Floats:
+        """(N,) to the planned draws of the axis, not finite where there is nothing to compare."""
+        if drawn.axis in COMPARED_IN_PAIRS:
+            return np.array([_distance(drawn, planned) for planned in self._draws[drawn.axis]])
+        return drawn.distances(self._tests, task)
+
+
+COMPARED_IN_PAIRS = ("robot", "noise", "background", "light")
+"""The axes whose own ``distances`` read what is known of the benchmark alone."""
+
+
+def _distance(one: AnyPerturbation, other: AnyPerturbation) -> float:
+    """Between two draws on the same axis of ``COMPARED_IN_PAIRS``; NaN where they cannot be compared.
+
+    Of light, whose test tasks cannot be compared with, two draws are 0 apart where all their parameters are equal.
+    """
+    match one, other:
+        case RobotPerturbation(), RobotPerturbation():
+            return math.dist(one.joint_offsets_rad, other.joint_offsets_rad)
+        case NoisePerturbation(), NoisePerturbation():
+            test = benchmark.load()
+            return abs(one.severity(test) - other.severity(test)) if one.component == other.component else math.nan
+        case BackgroundPerturbation(), BackgroundPerturbation():
+            shown = {covering.sha256 for covering in one.coverings}
+            return float(shown.isdisjoint(covering.sha256 for covering in other.coverings))
+        case _:
+            return float(one != other)
+
+
+def planned(file: Path) -> PlannedDraws:
+    """The draws of a plan's file, read once a process.
+
+    Raises:
+        PipelineError: when it is not a plan of this version.
+    """
+    return _planned(_edition(file))
+
+
+@cache
+def _planned(file: Edition) -> PlannedDraws:
+    return PlannedDraws(plan.read(file.path))
+
+
+def sha256_of(file: Path) -> str:
+    """By which results name a plan.
+
+    Raises:
+        PipelineError: when the file cannot be read.
+    """
+    return checksum_of(_edition(file))
+
+
+def _edition(file: Path) -> Edition:
+    try:
+        return edition(file)
+    except OSError as error:
+        raise PipelineError(f"cannot be read ({error})", where=file, expected="data/<run>/plan.parquet") from error
+
+
+def _as_test(one: AnyPerturbation) -> dict[str, Value]:
+    """The parameters of a planned draw as a test task has them, where its axis reads them to compare."""
+    match one:
+        case CameraPerturbation():
+            return one.model_dump(exclude={"axis", "component", "level"})
+        case LayoutPerturbation():
+            return {"category": ",".join(added.category for added in one.objects)}
+        case PosePerturbation():
+            return {"target": one.moved, "dx_m": one.dx_m, "dy_m": one.dy_m}
+        case ScenePerturbation():
+            return {"moves": ";".join(f"{move.name}:{move.dx_m},{move.dy_m}" for move in one.moves)}
+        case _:
+            return {}
+
+
+def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:
+    """How close held-out draws come to a plan.
+
+    Args:
+        drawn: the name of each, the draw, and the task that it changes.
+
+    Returns:
+        Axis to how many ``draws`` there are, how many are ``planned``, in how many a plan's draw ``overlaps``, and the
+        ``smallest`` distance with the names of its draw and of its planned episode (``closest``), None where nothing
+        could be compared. ``clearance`` is the least distance that the leakage report allows.
+    """
+    by_axis: dict[str, list[tuple[str, AnyPerturbation, Task]]] = defaultdict(list)
+    for name, one, task in drawn:
+        by_axis[one.axis].append((name, one, task))
+    found = {}
+    for axis, draws in by_axis.items():
+        smallest, episode, name = min((*planned_draws.nearest(one, task), name) for name, one, task in draws)
+        compared = math.isfinite(smallest)
+        found[axis] = {
+            "draws": len(draws),
+            "planned": planned_draws.count(axis),
+            "overlaps": sum(planned_draws.overlap(one, task) for _, one, task in draws),
+            "smallest": smallest if compared else None,
+            "closest": (name, episode) if compared else None,
+            "clearance": draws[0][1].clearance,
+        }
+    return found

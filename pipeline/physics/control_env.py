@@ -1,0 +1,81 @@
+"""LIBERO's environment class imported without OpenGL, and its resets, which draw from NumPy's global generator."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline import gl
+from pipeline.errors import PipelineError
+from pipeline.types import Task
+
+PLACEMENT_TRIES = 50
+"""Resets, of which each draws 5,000 places for an object that finds none."""
+
+
+def control_env() -> Any:
+    """LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner."""
+    logging.disable(logging.WARNING)
+    try:
+        with gl.left_out():
+            if "robosuite" not in sys.modules:
+                _turn_off_rendering()
+            from libero.libero.envs.env_wrapper import ControlEnv
+    finally:
+        logging.disable(logging.NOTSET)
+    return ControlEnv
+
+
+def _turn_off_rendering() -> None:
+    """Unset robosuite's ``MUJOCO_GPU_RENDERING``, by which it loads EGL when it is imported, even where disabled.
+
+    The flag lies in a module of the package, and importing that module would import the package first.
+    """
+    package = find_spec("robosuite")
+    if package is None or package.origin is None:
+        raise PipelineError("robosuite is not installed", remedy="bash setup.sh")
+    spec = spec_from_file_location("robosuite.macros", Path(package.origin).with_name("macros.py"))
+    if spec is None or spec.loader is None:
+        raise PipelineError("robosuite has no macros.py", where=package.origin, remedy="rm -rf .venv && bash setup.sh")
+    macros = module_from_spec(spec)
+    spec.loader.exec_module(macros)
+    macros.MUJOCO_GPU_RENDERING = False  # type: ignore[attr-defined]
+    sys.modules[spec.name] = macros
+
+
+def until_placed(reset: Callable[[], Any], task: Task) -> Any:
+    """Call LIBERO's reset, or its constructor, which resets too, until the random draws give every object a place.
+
+    LIBERO's own wrapper repeats a reset without end, whatever went wrong, and its constructor never.
+
+    Raises:
+        PipelineError: after ``PLACEMENT_TRIES``.
+    """
+    from robosuite.utils.errors import RandomizationError
+
+    for _ in range(PLACEMENT_TRIES):
+        with suppress(RandomizationError):
+            return reset()
+    raise PipelineError(
+        f"LIBERO finds no place for all objects in {PLACEMENT_TRIES} resets",
+        where=task.bddl_file,
+        expected="regions that are large enough for the objects in them",
+    )
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """LIBERO's samplers draw from numpy's global generator: seed it for a moment, then put it back."""
+    saved = np.random.get_state()
+    np.random.seed(seed)
+    try:
+        yield
+    finally:
+        np.random.set_state(saved)

@@ -1,0 +1,150 @@
+"""How a scene is drawn: by MuJoCo as it is. Everything else that draws (``savings.py``) has to give the same pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import mujoco
+import numpy as np
+from mujoco import gl_context
+from numpy.typing import NDArray
+
+from pipeline import gl
+from pipeline.episode_schema import SCHEMA
+from pipeline.rendering.opengl import check, making_context
+from pipeline.types import Frame
+
+MOST_GEOMS = 1000
+"""Geoms, sites and the like of a scene that MuJoCo draws at most; LIBERO's have up to 300."""
+
+
+class Surfaces(NamedTuple):
+    """What each pixel shows, in the orientation of LIBERO's raw observations.
+
+    Attributes:
+        depth_m: (H, W) float32, along the axis that the camera looks along.
+        number, kind: (H, W) the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 for none.
+    """
+
+    depth_m: NDArray[np.float32]
+    number: NDArray[np.int32]
+    kind: NDArray[np.int32]
+
+
+class Drawing(Protocol):
+    """Draws the states of one model at a time; close it before another is made."""
+
+    def adopt(self, model: mujoco.MjModel) -> bool:
+        """Go on with another model; whether that can be. Else nothing is changed, and where it raises, close it."""
+
+    def frame(self, data: mujoco.MjData, camera: str) -> Frame:
+        """(H, W, 3) uint8 RGB in the orientation of LIBERO's raw observations, of data with up-to-date positions."""
+
+    def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
+        """What each pixel of a frame shows."""
+
+    def load(self, textures: Collection[int]) -> None:
+        """Draw with what the model's ``tex_data`` has for these textures now."""
+
+    def close(self) -> None: ...
+
+
+@runtime_checkable
+class SideBySide(Protocol):
+    """A drawing that holds several looks of its textures at once, and draws once what they have in common."""
+
+    def hold(self, textures: Collection[int]) -> Callable[[], None]:
+        """Keep what was loaded for these textures, which have to be loaded again before the next frame.
+
+        Returns:
+            What has the next frames drawn with it.
+        """
+
+    def let_go(self) -> None:
+        """Draw with the textures that were there before anything was held."""
+
+
+class PlainDrawing:
+    """Draws all of a model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in a context of its own.
+
+    Args:
+        model: what to draw.
+
+    Raises:
+        PipelineError: when nothing renders on this machine.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        gl.prepare()
+        height, width, _ = SCHEMA.frame.shape
+        self._model, self._rectangle = model, mujoco.MjrRect(0, 0, width, height)
+        self._gl = gl_context.GLContext(width, height)
+        self._gl.make_current()
+        with making_context():
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
+        self._scene = mujoco.MjvScene(model, MOST_GEOMS)
+        self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        # As robosuite's off-screen context: visual meshes without the collision geometry.
+        self._option.geomgroup[0] = 0
+
+    def adopt(self, model: mujoco.MjModel) -> bool:
+        """Never: each scene gets a context of its own."""
+        return False
+
+    def frame(self, data: mujoco.MjData, camera: str) -> Frame:
+        self._gl.make_current()
+        self._update(data, camera)
+        self._render()
+        return self._pixels()
+
+    def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
+        self._gl.make_current()
+        self._update(data, camera)
+        # A geom's colour is its number in the scene, and one more.
+        flags = self._scene.flags
+        flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1
+        try:
+            self._render()
+        finally:
+            flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 0
+        place = self._pixels().astype(np.uint32) @ np.array([1, 2**8, 2**16], np.uint32)
+        shown = np.full((self._scene.ngeom + 1, 2), -1, np.int32)
+        for geom in self._scene.geoms[: self._scene.ngeom]:
+            if geom.segid >= 0:
+                shown[geom.segid + 1] = geom.objid, geom.objtype
+        buffer = np.empty(place.shape, np.float32)
+        mujoco.mjr_readPixels(None, buffer, self._rectangle, self._context)
+        check("mjr_readPixels")
+        near, far = np.array([self._model.vis.map.znear, self._model.vis.map.zfar]) * self._model.stat.extent
+        # MuJoCo's buffer is 1 at the near plane and 0 at the far one, as mujoco.Renderer inverts it.
+        depth_m = near * far / (near + buffer.astype(float) * (far - near))
+        return Surfaces(depth_m.astype(np.float32), *np.moveaxis(shown[place], -1, 0))
+
+    def load(self, textures: Collection[int]) -> None:
+        self._gl.make_current()
+        for texture in textures:
+            mujoco.mjr_uploadTexture(self._model, self._context, texture)
+            check("mjr_uploadTexture")
+
+    def close(self) -> None:
+        self._gl.free()
+        self._context.free()
+
+    def _update(self, data: mujoco.MjData, camera: str) -> None:
+        self._camera.fixedcamid = self._model.camera(camera).id
+        everything = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, everything, self._scene)
+
+    def _render(self) -> None:
+        mujoco.mjr_render(self._rectangle, self._scene, self._context)
+        check("mjr_render")
+
+    def _pixels(self) -> Frame:
+        frame = np.empty(SCHEMA.frame.shape, np.uint8)
+        mujoco.mjr_readPixels(frame, None, self._rectangle, self._context)
+        check("mjr_readPixels")
+        return frame

@@ -1,0 +1,211 @@
+"""Draws pictures with less work for Mesa, and one scene after the other in one context, with the pixels of MuJoCo's own
+drawing.
+
+* What a picture cannot show is not drawn (``culling.py``).
+* Of large meshes, single faces are drawn (``skins.py``, ``samples.py``).
+* What stands still before a camera is drawn once (``still.py``).
+* Meshes and textures that a scene shares with the one before stay in the context.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.axes.base import FIELDS
+from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.software import mujoco_3_2_7 as private
+from pipeline.rendering.software.culling import Culling, Picture
+from pipeline.rendering.software.mujoco_3_2_7 import Draws, HeldTextures, Layer, Meshes, Pass, Skins
+from pipeline.rendering.software.samples import SAMPLES
+from pipeline.rendering.software.skins import SkinnedMeshes
+from pipeline.rendering.software.still import Still
+from pipeline.types import Frame
+
+LOOK = tuple(name for name in FIELDS if name != "tex_data")
+"""What a picture depends on in a model, of what may change, beside textures and where its geoms and sites are."""
+
+CULLED = mujoco.mjNGROUP - 1
+"""A group of geoms and sites that nothing in LIBERO is in, and that is not drawn."""
+
+
+class Shot(NamedTuple):
+    """A picture to draw: of which state, from which camera, and what has to be drawn for it."""
+
+    data: mujoco.MjData
+    camera: str
+    picture: Picture
+
+
+class SoftwareDrawing(PlainDrawing):
+    """Draws models that are ``possible``.
+
+    Raises:
+        PipelineError: when OpenGL does not do what is asked of it.
+    """
+
+    def __init__(self, model: mujoco.MjModel):
+        # A context is made for what all scenes have alike, and then goes on with this one.
+        bare = private.bare(model)
+        super().__init__(bare)
+        self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
+        self._meshes = Meshes(self._context, bare, [])
+        self._skinned = SkinnedMeshes(self._skins, self._samples, bare, np.zeros(bare.ngeom, np.bool_), self._meshes)
+        self._still: dict[str, Still] = {}
+        self._layers: dict[tuple[str, str], Layer] = {}
+        self._held: HeldTextures | None = None
+        self._show(model)
+
+    @staticmethod
+    def possible(model: mujoco.MjModel) -> bool:
+        """Whether a model has nothing that only a context of its own could show, as LIBERO's have not."""
+        bounded = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] > 0
+        return not model.nhfield and not model.nskin and bool(bounded.all()) and model.vis.quality.offsamples == SAMPLES
+
+    def adopt(self, model: mujoco.MjModel) -> bool:
+        if not self.possible(model) or private.fixed(model) != private.fixed(self._model):
+            return False
+        self._gl.make_current()
+        self._show(model)
+        return True
+
+    def _show(self, model: mujoco.MjModel) -> None:
+        private.adopt_textures(self._context, model, self._model)
+        private.adopt_size(self._context, model)
+        self._model, self._painted = model, np.zeros(model.ngeom, np.bool_)
+        self._culling = Culling(model, np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist())
+        shown = self._culling.shown
+        drawn = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
+        self._meshes = Meshes(self._context, model, drawn, self._meshes)
+        self._skinned = SkinnedMeshes(self._skins, self._samples, model, shown, self._meshes, self._skinned)
+        self._forget_layers()
+
+    def load(self, textures: Collection[int]) -> None:
+        super().load(textures)
+        if textures:
+            self._forget_layers()
+
+    def hold(self, textures: Collection[int]) -> Callable[[], None]:
+        self._gl.make_current()
+        if self._held is None:
+            self._held = HeldTextures(self._context)
+        names = self._held.hold(textures)
+        of_material = np.isin(self._model.mat_texid, [*textures]).reshape(self._model.nmat, -1).any(axis=1)
+        self._painted |= np.append(of_material, False)[self._model.geom_matid]
+        return partial(self._held.show, names)
+
+    def let_go(self) -> None:
+        self._gl.make_current()
+        if self._held is not None:
+            self._held.let_go()
+        self._held, self._painted = None, np.zeros(self._model.ngeom, np.bool_)
+        self._forget_layers()
+
+    def _forget_layers(self) -> None:
+        self._still.clear()
+        for layer in self._layers.values():
+            layer.content = b""
+
+    def frame(self, data: mujoco.MjData, camera: str) -> Frame:
+        self._gl.make_current()
+        shot = Shot(data, camera, self._culling.picture(data, camera))
+        if shot.picture.layered:
+            self._draw_in_layers(shot)
+        else:
+            self._draw(shot, shot.picture.opaque)
+        return self._pixels()
+
+    def _draw_in_layers(self, shot: Shot) -> None:
+        """Draw a picture with a layer of what no held texture is on, or of what stands still."""
+        opaque = shot.picture.opaque & ~shot.picture.mirror
+        painted = opaque & self._painted
+        view, places = self._view(shot), np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1)
+        places = places.astype(np.float32)
+
+        def layer(name: str, geoms: NDArray[np.bool_], draw: Callable[[], None]) -> Layer:
+            """A layer of the camera's pictures; it is drawn if its content is not what it was."""
+            if (shot.camera, name) not in self._layers:
+                height, width = self._rectangle.height, self._rectangle.width
+                self._layers[shot.camera, name] = Layer(self._context, height, width)
+            found, content = self._layers[shot.camera, name], view + geoms.tobytes() + places[geoms].tobytes()
+            if found.content != content:
+                draw()
+                found.keep(content)
+            return found
+
+        def draw_over_still(geoms: NDArray[np.bool_], last: bool) -> None:
+            if shot.camera not in self._still:
+                self._still[shot.camera] = Still(self._model)
+            still = self._still[shot.camera].geoms(view, places, geoms) & geoms
+            behind = layer("still", still, partial(self._draw, shot, still, last=False)) if still.any() else None
+            self._draw(shot, geoms & ~still, behind, last)
+
+        if painted.any():
+            rest = opaque & ~painted
+            behind = layer("not painted", rest, partial(draw_over_still, rest, last=False))
+            self._draw(shot, painted, behind)
+        else:
+            draw_over_still(opaque, last=True)
+
+    def _draw(self, shot: Shot, opaque: NDArray[np.bool_], layer: Layer | None = None, last: bool = True) -> None:
+        """Draw opaque geoms (ngeom,) of a picture, over a layer.
+
+        Args:
+            last: with what no layer has: the mirror and what shows in it, what can be seen through, the sites, the
+                light of lamps with shadows, and the sky.
+        """
+        picture = shot.picture
+        if not last:
+            self._draw_passes(shot, opaque, [Pass(Draws.CAMERA, picture.seen & opaque)], layer, last)
+            return
+        drawn, passes = opaque | picture.mirror | picture.clear, []
+        if picture.mirror.any():
+            # A geom that is there for its image alone is not drawn before the camera.
+            drawn = drawn | picture.images
+            passes.append(Pass(Draws.MIRROR, picture.images | picture.clear))
+        passes.append(Pass(Draws.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear))
+        for lamp in picture.lamps:
+            passes += [Pass(Draws.LAMP_MAP, lamp.casts), Pass(Draws.LAMP_LIGHT, lamp.lights)]
+        self._draw_passes(shot, drawn, passes, layer, last)
+
+    def _draw_passes(
+        self, shot: Shot, drawn: NDArray[np.bool_], passes: Sequence[Pass], layer: Layer | None, last: bool
+    ) -> None:
+        """Draw geoms (ngeom,), of meshes in each pass those that it needs."""
+        model, picture, flags = self._model, shot.picture, self._scene.flags
+        groups, site_groups = model.geom_group.copy(), model.site_group.copy()
+        try:
+            model.geom_group[:] = np.where(drawn, groups, CULLED)
+            model.site_group[:] = np.where(last & picture.sites, site_groups, CULLED)
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = passes[0].draws is Draws.MIRROR
+            # The sky is behind all layers.
+            flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = last
+            super()._update(shot.data, shot.camera)
+            skinned = None
+            if picture.projection is not None:
+                wanted = np.logical_or.reduce([each.geoms for each in passes if each.draws.by_camera])
+                skinned = self._skinned.put(self._scene, shot.data, picture.projection, wanted)
+            self._meshes.show((shot.camera, last), passes, self._scene, skinned, layer)
+            self._render()
+        finally:
+            model.geom_group[:] = groups
+            model.site_group[:] = site_groups
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
+
+    def _update(self, data: mujoco.MjData, camera: str) -> None:
+        """Have everything drawn, as for surfaces."""
+        super()._update(data, camera)
+        everything = Pass(Draws.CAMERA, np.ones(self._model.ngeom, np.bool_))
+        self._meshes.show("everything", [everything], self._scene)
+
+    def _view(self, shot: Shot) -> bytes:
+        """All that a picture depends on beside textures, geoms and sites."""
+        data, number = shot.data, self._model.camera(shot.camera).id
+        fields = [getattr(self._model, name) for name in LOOK]
+        fields += [data.cam_xpos[number], data.cam_xmat[number], data.light_xpos, data.light_xdir]
+        return b"".join(field.tobytes() for field in fields)

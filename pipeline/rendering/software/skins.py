@@ -1,0 +1,90 @@
+"""The large meshes of a model, drawn by those of their faces that a picture can show."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.rendering.software.faces import Faces, faces_of
+from pipeline.rendering.software.mujoco_3_2_7 import OPAQUE, SKINS, Meshes, Skins
+from pipeline.rendering.software.samples import Projection, faces_that_show, room
+
+LEAST_FACES = 256
+"""Smaller meshes are drawn as they are."""
+
+
+class SkinnedMeshes:
+    """Gives each geom of a large mesh a skin, which draws chosen faces of it.
+
+    Args:
+        skins: of a context.
+        samples: (SAMPLES, 2) place of each sample in its pixel.
+        model: whose meshes they are.
+        shown: (ngeom,) which geoms can be drawn.
+        meshes: of the same model, as they are.
+        former: those of the model that the context was for before.
+    """
+
+    def __init__(
+        self,
+        skins: Skins,
+        samples: NDArray[np.float32],
+        model: mujoco.MjModel,
+        shown: NDArray[np.bool_],
+        meshes: Meshes,
+        former: SkinnedMeshes | None = None,
+    ):
+        self._skins, self._samples, self._meshes = skins, samples, meshes
+        self._mesh = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
+        self._skin: NDArray[np.intp] = np.full(model.ngeom, -1, np.intp)
+        self._faces: dict[bytes, Faces] = {}
+        self._faces_of_geom: dict[int, Faces] = {}
+        known = former._faces if former else {}
+        textured, plain = iter(range(SKINS)), iter(range(SKINS, 2 * SKINS))
+        drawn = np.flatnonzero(shown & (self._mesh >= 0))
+        for geom, mesh in zip(drawn.tolist(), self._mesh[drawn].tolist(), strict=True):
+            if model.mesh_facenum[mesh] >= LEAST_FACES:
+                content = meshes.contents[mesh]
+                faces = self._faces.get(content) or known.get(content) or faces_of(model, mesh)
+                self._faces[content] = self._faces_of_geom[geom] = faces
+                self._skin[geom] = next(plain if faces.texture is None else textured, -1)
+                if self._skin[geom] >= 0:
+                    skins.fill_vertices(int(self._skin[geom]), faces, content)
+        # All geoms of a mesh are drawn in one way.
+        self._skin[np.isin(self._mesh, self._mesh[drawn[self._skin[drawn] < 0]])] = -1
+        most = max((room(len(faces.corners)) for faces in self._faces.values()), default=0)
+        self._found: NDArray[np.uint32] = np.empty(most, np.uint32)
+
+    def put(
+        self, scene: mujoco.MjvScene, data: mujoco.MjData, projection: Projection, wanted: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Have the skins follow their meshes in a scene, with the faces that a picture can show.
+
+        Args:
+            scene: of all that is drawn.
+            data: says where the meshes are.
+            projection: of the picture.
+            wanted: (ngeom,) which geoms are looked at.
+
+        Returns:
+            (nmesh,) which meshes have their skins in the scene.
+        """
+        shown, of_mesh = self._skins.meshes_of_scene()
+        geoms = np.where(of_mesh, shown["objid"], 0)
+        skins = np.where(of_mesh, self._skin[geoms], -1)
+        # MuJoCo draws what can be seen through last, and in an order of its own.
+        skins[np.isin(self._mesh[geoms], self._mesh[geoms[of_mesh & (shown["rgba"][:, 3] < OPAQUE)]])] = -1
+        if len(shown) + 2 * np.count_nonzero(skins >= 0) >= scene.maxgeom:
+            skins[:] = -1
+        for geom in geoms[skins >= 0].tolist():
+            count = 0
+            if wanted[geom]:
+                place_m, turn, faces = data.geom_xpos[geom], data.geom_xmat[geom], self._faces_of_geom[geom]
+                count = faces_that_show(projection, place_m, turn, faces, self._samples, self._found)
+            self._skins.fill_faces(int(self._skin[geom]), self._found[:count])
+        having = self._mesh[geoms[skins >= 0]]
+        self._skins.follow(shown, skins, self._meshes.closing[having])
+        skinned = np.zeros(len(self._meshes.closing), np.bool_)
+        skinned[having] = True
+        return skinned

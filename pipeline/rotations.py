@@ -1,0 +1,37 @@
+"""Rotations whose numbers are stored or drawn with: SciPy's differ from these in the last bits."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from pipeline.types import Floats
+
+
+def about(axis: Literal["y", "z"], angle_deg: float) -> Floats:
+    """Unit quaternion (w, x, y, z) of a right-handed rotation about an axis of the world."""
+    half = np.deg2rad(angle_deg) / 2
+    w, s = np.cos(half), np.sin(half)
+    return np.array([w, 0.0, s, 0.0] if axis == "y" else [w, 0.0, 0.0, s])
+
+
+def product(a: Floats, b: Floats) -> Floats:
+    """Hamilton product of two quaternions (w, x, y, z): the rotation ``b`` followed by ``a``."""
+    scalar = a[0] * b[0] - a[1:] @ b[1:]
+    return np.concatenate([[scalar], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
+
+
+def rotate(quat: Floats, vector: Floats) -> Floats:
+    """``vector`` (3,) turned by the unit quaternion ``quat`` (w, x, y, z)."""
+    turned: Floats = vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector)
+    return turned
+
+
+def axis_angle(w: float, xyz: Floats) -> Floats:
+    """Axis times angle (rad) of a unit quaternion, the angle in [0, 2 pi] as robosuite's ``quat2axisangle`` has it."""
+    w = float(np.clip(w, -1.0, 1.0))
+    sine = np.sqrt(1.0 - w * w)
+    if np.isclose(sine, 0.0):
+        return np.zeros(3)
+    return np.asarray(xyz * 2.0 * np.arccos(w) / sine)

@@ -1,0 +1,123 @@
+"""A stage whose outputs are few remembers what it made them from: where that is the same again, it does nothing.
+
+The memory is a file of ``data/<run>/.finished/``. To have a stage work again, delete its output.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+from pydantic import BaseModel
+
+from pipeline.config import Config
+from pipeline.errors import PipelineError
+from pipeline.files import checksum, read_json, write_json
+from pipeline.formats.registry import formats_of
+from pipeline.identity import fingerprint
+from pipeline.run.export import untouched
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.store import TABLE
+from pipeline.stores.trajectory_store import TrajectoryStore
+
+FOLDER = ".finished"
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a stage's outputs were made from.
+
+    Attributes:
+        data: the run's folder.
+        stage: which stage.
+        made_by: the fingerprint of its inputs and recipe; None where an input has changed since it was recorded.
+        outputs: files or folders of ``data``.
+    """
+
+    data: Path
+    stage: str
+    made_by: str | None
+    outputs: Sequence[str]
+
+    def holds(self) -> bool:
+        """Whether the outputs are there as they were made, from the same inputs by the same recipe."""
+        try:
+            return self.made_by is not None and read_json(self._file) == self._now()
+        except (PipelineError, OSError):
+            return False
+
+    def keep(self) -> None:
+        """Remember the outputs as they are."""
+        self._file.unlink(missing_ok=True)
+        if self.made_by is not None:
+            write_json(self._file, self._now())
+
+    @property
+    def _file(self) -> Path:
+        return self.data / FOLDER / f"{self.stage}.json"
+
+    def _now(self) -> dict[str, Any]:
+        listed = [file for name in self.outputs for file in _files(self.data / name)]
+        sums = {file.relative_to(self.data).as_posix(): checksum(file) for file in listed}
+        return {"made_by": self.made_by, "outputs": sums}
+
+
+def of_validate(config: Config) -> Memory:
+    """Of what ``validate`` found: it passed on these contents, of which nothing has changed."""
+    names = ("plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "inputs.json")
+    formats = formats_of(config.data, config.export, config.render.extras)
+    stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
+    files = [
+        *(config.data / name for name in names),
+        *(store.root / TABLE for store in stores),
+        *(one.record_file for one in formats),
+    ]
+    whole = all(store.untouched() for store in stores) and all(untouched(one) for one in formats)
+    settings = [_settings(config.render), _settings(config.export), _settings(config.plan.axes)]
+    made_by = fingerprint("checks", *settings, _contents(files, config.data)) if whole else None
+    return Memory(config.data, "validate", made_by, ["validation.json"])
+
+
+def of_doctor(config: Config, device: str) -> Memory:
+    """Of a trial of this machine, by its name, its kernel, its processor and what renders."""
+    cpu = Path("/proc/cpuinfo")
+    models = {line for line in cpu.read_text().splitlines() if line.startswith("model name")} if cpu.exists() else {}
+    made_by = fingerprint("pixels", device, platform.uname(), sorted(models))
+    return Memory(config.data, "doctor", made_by, ["machine.json"])
+
+
+def of_summary(config: Config) -> Memory:
+    """Of the contact sheets and previews."""
+    frames = FrameStore(config.data / "frames", config.render)
+    files = [*(config.data / name for name in ("plan.parquet", "manifest.parquet", "inputs.json")), frames.root / TABLE]
+    settings = [_settings(config.demos), _settings(config.plan), _settings(config.replay)]
+    made_by = fingerprint("pictures", *settings, _contents(files, config.data)) if frames.untouched() else None
+    return Memory(config.data, "summary", made_by, ["sheets", "previews"])
+
+
+def of_report(config: Config) -> Memory:
+    """Of the report."""
+    frames = FrameStore(config.data / "frames", config.render)
+    names = ("plan.parquet", "manifest.parquet", "leakage.json", "inputs.json")
+    pictures = [file for name in ("sheets", "previews") for file in _files(config.data / name)]
+    files = [*(config.data / name for name in names), frames.root / TABLE, *pictures]
+    settings = _settings(config, {"compute"})
+    made_by = fingerprint("pictures", settings, _contents(files, config.data)) if frames.untouched() else None
+    return Memory(config.data, "report", made_by, ["report.html"])
+
+
+def _contents(files: Sequence[Path], data: Path) -> Mapping[str, str]:
+    return {file.relative_to(data).as_posix(): checksum(file) for file in files if file.exists()}
+
+
+def _settings(section: BaseModel, but: Set[str] = frozenset()) -> object:
+    """JSON-serialisable; of a path the name alone, as ``inputs.json`` tells what lies there."""
+    return json.loads(json.dumps(section.model_dump(exclude=set(but)), default=lambda path: PurePath(path).name))
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]

@@ -1,0 +1,119 @@
+"""What stages behind the frames make of a few small inputs: see ``golden.py``, which records it."""
+
+from __future__ import annotations
+
+import hashlib
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from conftest import STOVE
+from synthetic import IDS, episode, files, write_lerobot, write_rlds
+
+from pipeline.episode_schema import SCHEMA
+from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.settings import Settings, Wanted
+from pipeline.formats.read_back import Copy, sampled
+from pipeline.images.jpeg import decode
+from pipeline.publish import figures
+from pipeline.publish.sheets import Tile, sheet, side_by_side
+from pipeline.seeding import digest
+from pipeline.types import Scene, Trajectory, Verdict
+from pipeline.validation import checks as of_episodes
+from pipeline.validation import rerender
+
+TEMPLATES = ("report.html.j2", "macros.html.j2", "style.css")
+
+
+def rlds() -> str:
+    """All files of a set of six synthetic episodes."""
+    return _written(write_rlds)
+
+
+def lerobot() -> str:
+    """All files of two sets; but for the videos, whose encoder may choose its code by the processor."""
+    return digest(_written(write_lerobot), _written(partial(write_lerobot, frames="images")))[:16]
+
+
+def _written(write: Callable[[Path], Any]) -> str:
+    with tempfile.TemporaryDirectory() as folder:
+        target = write(Path(folder))
+        made = {name: content for name, content in files(target.folder).items() if not name.endswith(".mp4")}
+    return digest({name: hashlib.sha256(content).hexdigest() for name, content in made.items()})[:16]
+
+
+def evaluation() -> dict[str, Any]:
+    """How long episodes may last, and what one is told and observes at its start and after three steps."""
+    (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+    environment = EpisodeEnvironment(Settings())
+    environment.reset(task)
+    seen = [environment.observation(Wanted(images=False))]
+    for _ in range(3):
+        environment.step([0.5, -0.5, 0.5, 0.1, 0.0, 0.0, 1.0])
+        seen.append(environment.observation(Wanted(images=False)))
+    environment.close()
+    states = [np.round(one["states"].astype(float), 5).tolist() for one in seen]
+    told = {one["task_description"] for one in seen}
+    return {"step limits": dict(STEP_LIMITS), "told": sorted(told), "states": states}
+
+
+def checks() -> dict[str, Any]:
+    """Each check to how many faults it finds in a whole copy of an episode, and in one where much is wrong."""
+    made = episode(IDS[0])
+    steps = len(made)
+    states = np.zeros((steps + 1, 10))
+    states[:, 0] = np.arange(steps + 1) / SCHEMA.fps_hz
+    states[3:, 0] += 0.01
+    scene = Scene("", np.zeros(1))
+    trajectory = Trajectory(
+        *("golden", "open_loop", scene, states, made.action.astype(float)),
+        *(np.zeros((steps + 1, 0), np.float32), Verdict(True, "kept")),
+    )
+    row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
+    row |= {"steps": steps + 1, "place": 1, "instruction": "task_1"}
+    view, other = SCHEMA.views
+    shown = {(name, t): decode(made.frames[name][t]) for name in SCHEMA.views for t in sampled(steps)}
+    marks = {"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz}
+    stored = replace(made, instruction="task_1", provenance={name: str(row[name]) for name in SCHEMA.provenance})
+    whole = Copy("whole", stored, ["task_1"] * steps, shown, marks, {"place": 1})
+    wrong = Copy(
+        dataset="wrong",
+        episode=replace(
+            stored,
+            action=made.action + np.float32(0.01),
+            provenance={},
+            frames={},
+            geometry={name: replace(seen, intrinsics=-seen.intrinsics) for name, seen in made.geometry.items()},
+        ),
+        instructions=["something else"] * steps,
+        decoded={**shown, **{(view, t): shown[other, t] for t in sampled(steps)}},
+        marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
+        place={"place": 2},
+    )
+    blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in shown.items()})
+    case = of_episodes.Case(row, made, trajectory, [whole, wrong, blank], None)
+    found = {name: len(list(check(case))) for name, check in of_episodes.CHECKS.items()}
+    limits = {name: value for name, value in vars(of_episodes).items() if isinstance(value, float)}
+    return {"found": found, "limits": limits | {"fresh PSNR dB": rerender.PSNR_DB}}
+
+
+def pictures() -> dict[str, str]:
+    """A contact sheet, a plot, and the templates of the report."""
+    frames = [decode(episode(IDS[0]).frames[view][0]) for view in SCHEMA.views]
+    drawn = sheet("title", [Tile(side_by_side(frames, 64), f"caption {number}") for number in range(5)])
+    plot = figures.histogram("title", {"camera": np.linspace(-1, 1, 50)}, np.linspace(-1, 1, 11), "action", log=True)
+    folder = Path(figures.__file__).parent / "templates"
+    return {
+        "sheet": hashlib.sha256(np.asarray(drawn).tobytes()).hexdigest()[:16],
+        "plot": digest(str(plot))[:16],
+        "templates": digest([(folder / name).read_text() for name in TEMPLATES])[:16],
+    }
+
+
+STEPS: dict[Any, Callable[[], Any]] = {step.__name__: step for step in (rlds, lerobot, evaluation, checks, pictures)}
+"""Step of ``pipeline.identity.RECIPES`` to what it makes, JSON-serialisable."""

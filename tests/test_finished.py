@@ -1,0 +1,137 @@
+"""Stages that are started again do nothing where nothing has changed, and notice what has."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import dvc, rot
+from synthetic import episodes, write_rlds
+
+from pipeline import identity
+from pipeline.config import Config, load
+from pipeline.files import edition
+from pipeline.formats.registry import formats_of
+from pipeline.run import export
+from pipeline.run.finished import Memory, of_report, of_summary, of_validate
+
+REMEMBERED: tuple[Callable[[Config], Memory], ...] = (of_validate, of_summary, of_report)
+
+
+@pytest.fixture
+def clone(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of a finished run, which the process works in."""
+    folder = shutil.copytree(finished.parent.parent, tmp_path / "clone", symlinks=True)
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
+def config(clone: Path) -> Config:
+    return load(Path("configs/tiny.yaml"))
+
+
+def hold(config: Config) -> list[bool]:
+    """Whether ``validate``, ``summary`` and ``report`` would do nothing."""
+    return [of(config).holds() for of in REMEMBERED]
+
+
+def largest(folder: Path) -> Path:
+    return max((file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+
+
+def test_a_finished_run_is_remembered_until_something_changes(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hold(config) == [True, True, True]
+    elsewhere = config.model_copy(update={"compute": config.compute.model_copy(update={"workers": 3})})
+    assert hold(elsewhere) == [True, True, True], "where it is computed changes nothing"
+    cases: dict[identity.Step, list[bool]] = {"checks": [False, True, True], "pictures": [True, False, False]}
+    for step, expected in cases.items():
+        with monkeypatch.context() as patch:
+            identity._parts.cache_clear()
+            patch.setitem(identity.RECIPES, step, identity.RECIPES[step] + 1)
+            assert hold(config) == expected
+        identity._parts.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("rlds", [False, True, True]),
+        ("lerobot", [False, True, True]),
+        ("frames", [False, False, False]),
+        ("trajectories", [False, True, True]),
+        ("manifest.parquet", [False, False, False]),
+        ("counts.json", [False, True, True]),
+        ("validation.json", [False, True, True]),
+        ("sheets", [True, False, False]),
+        ("previews", [True, False, False]),
+        ("report.html", [True, True, False]),
+    ],
+)
+def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[bool]) -> None:
+    file = config.data / name
+    changed = largest(file) if file.is_dir() else file
+    changed.write_bytes(changed.read_bytes() + b"\n")
+    assert hold(config) == expected
+
+
+def test_what_found_something_off_is_not_remembered(config: Config) -> None:
+    rot(largest(config.data / "rlds"))
+    (config.data / "validation.json").unlink()
+    assert not of_validate(config).holds(), "so everything is read again, also what looks unchanged"
+
+
+def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Config) -> None:
+    for one in formats_of(config.data, config.export, config.render.extras):
+        content = {name: (one.folder / name).read_bytes() for name in one.record().files}
+        name = max(content, key=lambda name: len(content[name]))
+        # As in a copy that has the time of the copying.
+        (one.folder / name).write_bytes(content[name])
+        export.settle(one)
+        assert export.untouched(one)
+        (one.folder / name).write_bytes(content[name][:-1])
+        export.settle(one)
+        assert not one.record_file.exists()
+
+
+def test_a_finished_dataset_is_made_anew_only_where_that_was_allowed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, same = write_rlds(tmp_path), episodes()
+    assert not export.outdated(target, same)
+    monkeypatch.setitem(identity.RECIPES, "rlds", identity.RECIPES["rlds"] + 1)
+    identity._parts.cache_clear()
+    number = identity.RECIPES["rlds"]
+    assert not export.is_current(target, same)
+    files = len(target.record().files)
+    assert export.outdated(target, same) == {f"files, made with recipe of rlds {number - 1}, here {number}": files}
+    assert not export.outdated(target, episodes(content="other episodes")), "which somebody asked for"
+    identity._parts.cache_clear()
+
+
+def test_after_a_changed_comment_every_stage_starts_and_none_makes_anything(clone: Path, config: Config) -> None:
+    def made() -> dict[Path, object]:
+        names = ("trajectories", "frames", "rlds", "lerobot", "previews", "sheets")
+        files = [file for name in names for file in (config.data / name).rglob("*") if file.is_file()]
+        return {file: edition(file) for file in (*files, config.data / "validation.json", config.data / "report.html")}
+
+    before = made()
+    with (clone / "pipeline" / "physics" / "success.py").open("a") as module:
+        module.write("# A comment.\n")
+    done = dvc(clone, "repro")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("Running stage") == 14
+    assert made() == before
+
+
+def test_a_lost_shard_and_a_lost_trajectory_are_made_again(clone: Path, config: Config) -> None:
+    shard = largest(config.data / "rlds")
+    trajectory = next((config.data / "trajectories").glob("*.h5"))
+    before = shard.read_bytes(), trajectory.read_bytes()
+    shard.unlink()
+    trajectory.unlink()
+    done = dvc(clone, "repro")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (shard.read_bytes(), trajectory.read_bytes()) == before

@@ -1,0 +1,115 @@
+"""Savings are used where they were tested and give equal pixels; everywhere else MuJoCo draws a scene as it is."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+
+import arenas
+import mujoco
+import numpy as np
+import pytest
+from arenas import TASKS, VIEWS
+
+from pipeline import gl
+from pipeline.rendering import savings
+from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software import trial
+from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.rendering.software.skins import SkinnedMeshes
+
+SCENE = '<mujoco><worldbody><light/><camera name="eye" pos="0 0 3"/><geom size="1" group="1"/></worldbody></mujoco>'
+
+
+@pytest.fixture(autouse=True)
+def asked_anew() -> Iterator[None]:
+    savings.why_plain.cache_clear()
+    savings._say.cache_clear()
+    yield
+    savings.why_plain.cache_clear()
+
+
+def drawn_by() -> type:
+    """The kind of drawing that a scene gets, which draws it."""
+    with closing(Renderer(SCENE)) as renderer:
+        mujoco.mj_forward(renderer.model, renderer.data)
+        assert renderer.frame("eye")[128, 128].max() > 100
+        return type(renderer.drawing)
+
+
+def test_on_a_tested_device_savings_are_used_without_a_word(caplog: pytest.LogCaptureFixture) -> None:
+    assert gl.choose().device.startswith(savings.DEVICE)
+    assert drawn_by() is SoftwareDrawing
+    assert caplog.records == []
+
+
+@pytest.mark.parametrize(
+    ("what", "name", "other"), [(mujoco, "__version__", "3.3.0"), (savings, "DEVICE", "NVIDIA H100")]
+)
+def test_another_version_or_device_draws_plainly_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, what: object, name: str, other: str
+) -> None:
+    monkeypatch.setattr(what, name, other)
+    assert [drawn_by(), drawn_by()] == [PlainDrawing, PlainDrawing]
+    (record,) = caplog.records
+    assert record.levelno == logging.WARNING
+    assert other in record.getMessage()
+
+
+def test_a_scene_that_shares_no_context_is_drawn_plainly(caplog: pytest.LogCaptureFixture) -> None:
+    endless = SCENE.replace("</worldbody>", '<geom type="plane" size="0 0 1" pos="0 0 -1" group="1"/></worldbody>')
+    with closing(Renderer(endless)) as renderer:
+        assert type(renderer.drawing) is PlainDrawing
+    (record,) = caplog.records
+    assert "a floor without bounds" in record.getMessage()
+
+
+def test_other_pixels_of_the_small_scene_draw_plainly(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(trial, "SCENE", trial.SCENE.replace('pos="0.2 0.1 0.1"', 'pos="0.2 0.1 0.2"'))
+    assert trial.fault() is None
+    put = SkinnedMeshes.put
+
+    def wrong(*arguments: object) -> object:
+        skinned = put(*arguments)  # type: ignore[arg-type]
+        arguments[0]._skins.drawn[:] //= 2  # type: ignore[attr-defined]
+        return skinned
+
+    monkeypatch.setattr(SkinnedMeshes, "put", wrong)
+    assert drawn_by() is PlainDrawing
+    assert "frames of a small scene have other pixels" in caplog.text
+
+
+def test_a_variable_forces_plain_and_imports_none_of_the_savings() -> None:
+    program = f"""
+import sys
+from pipeline.rendering.renderer import Renderer
+print(type(Renderer({SCENE!r}).drawing).__name__, [name for name in sys.modules if "software" in name])
+"""
+    environment = os.environ | {savings.PLAIN: "1"}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    assert (done.stdout.strip(), done.stderr) == ("PlainDrawing []", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arena", TASKS)
+def test_plain_frames_and_surfaces_are_those_of_mujocos_renderer(arena: str) -> None:
+    """``mujoco.Renderer`` has the first row at the top."""
+    opened = arenas.renderer(arena)
+    option = mujoco.MjvOption()
+    option.geomgroup[0] = 0
+    theirs = mujoco.Renderer(opened.model, 256, 256, max_geom=1000)
+    with arenas.both_ways(opened) as (_, plain), theirs:
+        for camera in VIEWS:
+            theirs.update_scene(opened.data, camera, option)
+            assert np.array_equal(plain.frame(opened.data, camera), theirs.render()[::-1])
+            _, number, kind = plain.surfaces(opened.data, camera)
+            theirs.enable_segmentation_rendering()
+            assert np.array_equal(np.stack([number, kind], axis=-1), theirs.render()[::-1])
+            theirs.disable_segmentation_rendering()
