@@ -26,7 +26,7 @@ from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.base import Format
-from pipeline.formats.episodes import Episodes
+from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
@@ -93,8 +93,8 @@ def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, f
 
             def write(ids: Sequence[str]) -> int:
                 """Bytes of the dataset."""
-                suites, content = (dict.fromkeys(ids, value) for value in ("libero_spatial", "synthetic"))
-                export(target, Episodes(ids, load, suites, content), run)
+                known = Known("libero_spatial", "synthetic", "", load(ids[0]).instruction, steps)
+                export(target, Episodes(dict.fromkeys(ids, known), load), run)
                 return sum((target.folder / file).stat().st_size for file in target.record().files)
 
             write(ids[:workers])  # imports, in every worker

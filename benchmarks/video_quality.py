@@ -31,7 +31,7 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, DemosConfig, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.lerobot_video import VideoEncoder
+from pipeline.formats.lerobot_video import Video
 from pipeline.images.jpeg import decode, encode, to_policy
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.rendering.renderer import Renderer
@@ -98,11 +98,10 @@ def _measure(frames: Sequence[Frame]) -> NDArray[np.float64]:
     stored = [encode(frame, RenderConfig()) for frame in frames]
     pixels = [decode(packed) for packed in stored]
     with tempfile.TemporaryDirectory() as folder:
-        encoder = VideoEncoder()
-        encoder.start_episode(["shown"], Path(folder))
-        for frame in pixels:
-            encoder.feed_frame("shown", frame)
-        path, _ = encoder.finish_episode()["shown"]
+        path = Path(folder) / "shown.mp4"
+        with Video(path) as made:
+            for step, frame in enumerate(pixels):
+                made.add(frame, first=step == 0)
         with av.open(str(path)) as video:
             played = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
         size = path.stat().st_size / len(frames)

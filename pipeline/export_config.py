@@ -66,7 +66,7 @@ class LeRobotConfig(_Frozen):
 
     Attributes:
         name: of the dataset.
-        parts: pieces written in parallel, then merged.
+        parts: files of each kind, written in parallel, at least; more where one would have more than 200 MB.
         frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
         validation: share of each task's demonstrations whose episodes come last, as the split ``val``.
     """

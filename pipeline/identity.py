@@ -33,7 +33,7 @@ RECIPES: dict[Step, int] = {
     "pixels": 5,
     "encoding": 1,
     "rlds": 2,
-    "lerobot": 4,
+    "lerobot": 5,
     "evaluation": 1,
     "checks": 2,
     "pictures": 1,
@@ -69,7 +69,7 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
     "pixels": ("numba", "pillow"),
     "encoding": ("opencv-python-headless",),
     "rlds": ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy"),
-    "lerobot": ("lerobot", "datasets", "av", "pyarrow", "numpy", "opencv-python-headless"),
+    "lerobot": ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless"),
     "checks": ("tensorflow-datasets", "lerobot", "datasets", "av", "pyarrow"),
     "pictures": ("robouse",),
 }

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig, RldsConfig
-from pipeline.formats.episodes import Episodes
+from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
@@ -101,7 +101,10 @@ def files(folder: Path) -> Tree:
 
 
 def episodes(load: Callable[[str], Episode] = episode, content: str = "first") -> Episodes:
-    return Episodes(IDS, load, dict.fromkeys(IDS, "libero_spatial"), dict.fromkeys(IDS, content))
+    made = {one: episode(one) for one in IDS}
+    return Episodes(
+        {one: Known("libero_spatial", content, "", made[one].instruction, len(made[one])) for one in IDS}, load
+    )
 
 
 def write_rlds(

@@ -25,7 +25,7 @@ from pipeline.axes.light import LightPerturbation
 from pipeline.compute.pool import loop
 from pipeline.config import Config, RenderConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.formats.episodes import Episodes
+from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.planning import plan
@@ -159,10 +159,14 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     plan.write(rows, data / "plan.parquet")
     judged = replay_plan(rows, config.demos, config.replay, data / "trajectories", loop)
     render_plan(rows, config, data / "trajectories", data / "frames", loop)
-    kept = [row.episode_id for row in rows if plan.select(rows, judged)[row.episode_id].kept]
+    outcome = plan.select(rows, judged)
+    kept = [row for row in rows if outcome[row.episode_id].kept]
     load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    known = {
+        row.episode_id: Known(row.suite, "", row.demo_id, row.instruction, len(load(row.episode_id))) for row in kept
+    }
     for target in formats_of(data, config.export, config.render.extras):
-        export(target, Episodes(kept, load, dict.fromkeys(kept, BOWL.suite), dict.fromkeys(kept, "")), loop)
+        export(target, Episodes(known, load), loop)
     (data / "config.json").write_text(config.model_dump_json())
     return data
 

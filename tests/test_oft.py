@@ -21,7 +21,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
 from pipeline.formats import motion_statistics, rlds_write
-from pipeline.formats.episodes import Episodes
+from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
 from pipeline.types import Episode, Geometry
@@ -68,8 +68,8 @@ def grey(jpeg: bytes) -> int:
 
 def write(data: Path, load: Callable[[str], Episode] = episode) -> Path:
     """A run's data folder with one dataset and its statistics; the writer's own check is the caller's to disarm."""
-    suites, content = dict.fromkeys(LENGTHS, "libero_tiny"), dict.fromkeys(LENGTHS, "")
-    export(Rlds(data, RldsConfig(name="libero", shards=2)), Episodes(list(LENGTHS), load, suites, content), loop)
+    known = {name: Known("libero_tiny") for name in LENGTHS}
+    export(Rlds(data, RldsConfig(name="libero", shards=2)), Episodes(known, load), loop)
     episodes = [load(name) for name in LENGTHS]
     figures = motion_statistics.openvla([(made.action, made.state) for made in episodes])
     (data / "dataset_statistics.json").write_text(json.dumps({NAME: figures}))

@@ -437,7 +437,7 @@ def test_openpis_reader_reads_what_lerobot_0_6_edited(data: Path, tmp_path: Path
     assert [after[step]["prompt"] for step in range(0, len(after), 9)] == [
         before[step]["prompt"] for step in range(0, len(before), 9)
     ]
-    copy = lerobot_read.read(root, tmp_path / "cache", IDS[3], ())
+    copy = lerobot_read.read(root, IDS[3], ())
     assert copy is not None
     assert set(copy.instructions) == {episode(IDS[3]).instruction}
 

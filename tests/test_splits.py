@@ -21,7 +21,7 @@ from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, RldsConfig
-from pipeline.formats.episodes import Episodes
+from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, records
@@ -35,7 +35,9 @@ DEMOS = {episode_id: f"libero_spatial/task/demo_{number // 2}" for number, episo
 
 @pytest.fixture(scope="module")
 def episodes() -> Episodes:
-    return Episodes(IDS, episode, dict.fromkeys(IDS, "libero_spatial"), dict.fromkeys(IDS, "content"), DEMOS)
+    made = {one: episode(one) for one in IDS}
+    known = {one: Known("libero_spatial", "content", DEMOS[one], made[one].instruction, len(made[one])) for one in IDS}
+    return Episodes(known, episode)
 
 
 def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
@@ -53,9 +55,8 @@ def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
 def test_as_many_demonstrations_as_a_refusal_asks_for_are_enough_and_one_fewer_is_not(share: float) -> None:
     def splits(demonstrations: int) -> dict[str, list[str]]:
         ids = [f"{number}" for number in range(demonstrations)]
-        demos = {name: f"libero_goal/task/demo_{name}" for name in ids}
-        same = dict.fromkeys(ids, "libero_goal")
-        return Episodes(ids, episode, same, same, demos).by_split(share)
+        known = {name: Known("libero_goal", demo=f"libero_goal/task/demo_{name}") for name in ids}
+        return Episodes(known, episode).by_split(share)
 
     with pytest.raises(PipelineError) as caught:
         splits(1)

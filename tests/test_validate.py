@@ -163,16 +163,20 @@ def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
 def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
     (table_file,) = (root / "data").rglob("*.parquet")
     table = pq.read_table(table_file)
-    found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp", SEEN_FROM)}
+    found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp")}
     of = np.array(table["episode_index"])
     found["action"][np.flatnonzero(of == index[CHANGED])[3], 0] += 0.001
-    found[SEEN_FROM][of == index[BLACK], 3] += 1.0
     # All but the last: there may be no frame behind that.
     found["timestamp"][np.flatnonzero(of == index[LATE])[:-1]] += np.float32(1 / SCHEMA.fps_hz)
     for name, values in found.items():
         place = table.schema.get_field_index(name)
         table = table.set_column(place, table.schema.field(name), pa.array(list(values), table.schema.field(name).type))
     pq.write_table(table, table_file)
+    provenance = root / "meta" / "provenance.parquet"
+    rows = pq.read_table(provenance)
+    matrices = rows.to_pylist()
+    matrices[index[BLACK]][SEEN_FROM][3] += 1.0
+    pq.write_table(pa.Table.from_pylist(matrices, schema=rows.schema), provenance)
     (episodes_file,) = (root / "meta" / "episodes").rglob("*.parquet")
     key = SCHEMA.views["image"].lerobot_key
     (row,) = (row for row in pq.read_table(episodes_file).to_pylist() if row["episode_index"] == index[BLACK])
@@ -180,10 +184,9 @@ def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
     (video_file,) = (root / "videos" / key).rglob("*.mp4")
     with av.open(str(video_file)) as shown:
         frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
-    made = lerobot_video._Video(video_file)
-    for step, frame in enumerate(frames):
-        made.add(np.zeros_like(frame) if begin <= step < end else frame)
-    made.finish()
+    with lerobot_video.Video(video_file) as made:
+        for step, frame in enumerate(frames):
+            made.add(np.zeros_like(frame) if begin <= step < end else frame, first=step == 0)
     info = json.loads((root / "meta" / "info.json").read_text())
     (root / "meta" / "info.json").write_text(json.dumps(info | {"fps": 10}))
 

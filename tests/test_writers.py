@@ -24,7 +24,6 @@ import tensorflow_datasets as tfds
 import tf_readback
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import dataset_to_policy_features
-from lerobot.datasets.video_utils import concatenate_video_files
 from numpy.typing import NDArray
 from synthetic import (
     EXTRAS,
@@ -43,7 +42,8 @@ from synthetic import (
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.formats import lerobot_write, rlds_write
+from pipeline.formats import lerobot as lerobot_format
+from pipeline.formats import rlds_write
 from pipeline.formats.episodes import split
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
@@ -234,11 +234,6 @@ def assert_lerobot_episodes(folder: Path, *, exact: bool = False) -> None:
         for key in ("state", "joint_state", "action"):
             name = key if key == "action" else f"observation.{key}"
             np.testing.assert_array_equal(np.stack([item[name] for item in items]), getattr(source, key))
-        for key, view in (("agent", "image"), ("wrist", "wrist_image")):
-            for name, shape in MATRICES.items():
-                for item in items:
-                    matrix = item[f"camera.{key}.{name}"].numpy().reshape(shape)
-                    np.testing.assert_array_equal(matrix, getattr(source.geometry[view], name))
         for key, view in (("image", "image"), ("image2", "wrist_image")):
             decoded = [item[f"observation.images.{key}"].numpy().transpose(1, 2, 0) * 255 for item in items]
             for shown, frame in zip(decoded, source.frames[view], strict=True):
@@ -274,24 +269,35 @@ def test_lerobot_images_are_the_stored_frames(written: Written) -> None:
 
 
 @pytest.mark.slow
-def test_lerobot_images_read_when_they_spread_over_many_files(tmp_path: Path) -> None:
+@pytest.mark.parametrize("frames", ["video", "images"])
+def test_lerobot_reads_and_merges_many_files(tmp_path: Path, frames: str) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
-        patch.setattr(lerobot_write, "DATA_MB", 0.6)
-        patch.setattr(lerobot_write, "EPISODES_MB", 0.001)
-        target = write_lerobot(tmp_path, frames="images")
-        assert len(list((target.root / "data").rglob("*.parquet"))) > 2
-        assert_lerobot_episodes(target.root, exact=True)
+        patch.setattr(lerobot_format, "FILE_MB", 0.2)
+        target = write_lerobot(tmp_path, frames=frames)
+        numbers = [
+            sorted(file.stem for file in (target.root / kind).rglob("file-*"))
+            for kind in ("data", "meta/episodes", *(["videos/observation.images.image2"] if frames == "video" else []))
+        ]
+        assert len(numbers[0]) > 3
+        assert all(found == numbers[0] for found in numbers), "files of one number hold the same episodes"
+        assert_lerobot_episodes(target.root, exact=frames == "images")
         # Merging finds the files by what the rows of meta/episodes say.
-        assert len(list((target.root / "meta" / "episodes").rglob("*.parquet"))) == 3
         lerobot.datasets.aggregate.aggregate_datasets([REPO], REPO, roots=[target.root], aggr_root=tmp_path / "again")
-        assert_lerobot_episodes(tmp_path / "again", exact=True)
+        assert_lerobot_episodes(tmp_path / "again", exact=frames == "images")
 
 
 def test_lerobot_provenance_has_a_row_for_each_episode(written: Written) -> None:
     for target in (written.lerobot, written.images):
         rows = pq.read_table(target.root / "meta" / "provenance.parquet").to_pylist()
-        assert rows == [{"episode_index": k, **episode(episode_id).provenance} for k, episode_id in enumerate(IDS)]
+        assert [{name: row[name] for name in ("episode_index", *SCHEMA.provenance)} for row in rows] == [
+            {"episode_index": k, **episode(episode_id).provenance} for k, episode_id in enumerate(IDS)
+        ]
+        for row, source in zip(rows, map(episode, IDS), strict=True):
+            for key, view in (("agent", "image"), ("wrist", "wrist_image")):
+                for name, shape in MATRICES.items():
+                    matrix = np.array(row[f"camera.{key}.{name}"], np.float32).reshape(shape)
+                    np.testing.assert_array_equal(matrix, getattr(source.geometry[view], name))
     assert "level" in rows[0]
 
 
@@ -326,35 +332,6 @@ def test_lerobot_statistics_are_exact(written: Written) -> None:
         for row, shown in zip(pq.read_table(target.root / "meta" / "episodes").to_pylist(), frames, strict=True):
             of_episode = {name.rpartition("/")[2]: value for name, value in row.items() if "image/" in name}
             assert_statistics(of_episode, shown, (0, 1, 2))
-
-
-@pytest.mark.slow
-def test_lerobot_reads_when_videos_spread_over_many_files(written: Written, tmp_path: Path) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lerobot.datasets.aggregate, "DEFAULT_VIDEO_FILE_SIZE_IN_MB", 0.15)
-        target = write_lerobot(tmp_path)
-    assert len(list(target.root.rglob("*.mp4"))) > 2
-    assert_lerobot_episodes(target.root)
-
-
-@pytest.mark.slow
-def test_no_video_is_written_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """lerobot appends an episode to a file by writing all of the file again."""
-    views = []
-
-    def join(paths: Sequence[Path], joined: Path) -> None:
-        assert len(set(paths)) == len(IDS)
-        views.append(joined.parents[1].name)
-        concatenate_video_files(paths, joined)
-
-    def refuse(*_: object) -> None:
-        raise AssertionError("an episode was appended")
-
-    monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", tmp_path / "cache")
-    monkeypatch.setattr(lerobot.datasets.lerobot_dataset, "concatenate_video_files", refuse)
-    monkeypatch.setattr(lerobot_write, "concatenate_video_files", join)
-    write_lerobot(tmp_path)
-    assert sorted(views) == sorted(view.lerobot_key for view in SCHEMA.views.values())
 
 
 def test_formats_carry_the_same_numbers(written: Written) -> None:

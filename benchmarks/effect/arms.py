@@ -72,7 +72,7 @@ def write_small(source: Path, rows: Sequence[EpisodeRow], out: Path, frame_px: i
     # lerobot takes seconds to import.
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from pipeline.formats.lerobot_write import local_only
+    from pipeline.formats.lerobot_read import local_only
 
     views = [view.lerobot_key for view in SCHEMA.views.values()]
     vectors = [SCHEMA.state, SCHEMA.action]

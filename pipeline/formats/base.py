@@ -17,7 +17,7 @@ import pyarrow as pa
 from pydantic import BaseModel
 
 from pipeline.errors import PipelineError
-from pipeline.formats.episodes import Episodes, Load
+from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
 from pipeline.identity import Step
 from pipeline.types import Extra
@@ -112,14 +112,11 @@ class Format(ABC, Generic[Options]):
     # Writing: pieces in parallel, each whole or not there, then what joins them.
 
     @abstractmethod
-    def pieces(self, episodes: Episodes) -> dict[str, list[str]]:
-        """Path of each piece below the work folder to the ids of its episodes.
-
-        Pieces below ``dataset/`` already lie where the finished dataset has them.
-        """
+    def pieces(self, episodes: Episodes) -> list[Piece]:
+        """What each worker writes. Pieces below ``dataset/`` already lie where the finished dataset has them."""
 
     @abstractmethod
-    def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
+    def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         """Write a file or a folder, in a worker; one episode at a time is in memory.
 
         Raises:
@@ -127,7 +124,7 @@ class Format(ABC, Generic[Options]):
         """
 
     @abstractmethod
-    def assemble(self, work: Path, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
+    def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
         """Finish ``work/dataset``, which becomes ``folder``, from the pieces.
 
         Returns:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import held_out, too_few
@@ -17,22 +17,63 @@ Load = Callable[[str], Episode]
 
 
 @dataclass(frozen=True)
+class Piece:
+    """Some episodes of a dataset, in a row, which one worker writes.
+
+    Attributes:
+        path: of its file or folder, below the work folder.
+        ids: of its episodes.
+        split: of its episodes.
+        number: how many pieces come before.
+        first_episode, first_step: how many episodes and steps of the dataset come before.
+        steps: of its episodes.
+        tasks: each of its instructions to the number of it among the dataset's.
+    """
+
+    path: str
+    ids: Sequence[str]
+    split: str = "train"
+    number: int = 0
+    first_episode: int = 0
+    first_step: int = 0
+    steps: int = 0
+    tasks: Mapping[str, int] = field(default_factory=dict)
+
+
+class Known(NamedTuple):
+    """What is known of an episode before it is loaded.
+
+    Attributes:
+        suite: LIBERO suite.
+        content: changes with anything that ``load`` would return.
+        demo: its demonstration, ``<suite>/<task>/<key>``.
+        instruction: the text that the policy is prompted with.
+        steps: its length.
+    """
+
+    suite: str
+    content: str = ""
+    demo: str = ""
+    instruction: str = ""
+    steps: int = 0
+
+
+@dataclass(frozen=True)
 class Episodes:
     """What a dataset is made of.
 
     Attributes:
-        ids: in the order in which they are written: shuffled, because readers walk a dataset in order.
+        known: episode id to what is known of it, in the order in which they are written: shuffled, because readers walk
+            a dataset in order.
         load: reads one episode.
-        suites: episode id to LIBERO suite.
-        content: episode id to a token that changes with anything ``load`` would return.
-        demos: episode id to its demonstration, ``<suite>/<task>/<key>``.
     """
 
-    ids: Sequence[str]
+    known: Mapping[str, Known]
     load: Load
-    suites: Mapping[str, str]
-    content: Mapping[str, str]
-    demos: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def ids(self) -> list[str]:
+        return list(self.known)
 
     def by_split(self, validation: float) -> dict[str, list[str]]:
         """``train``, and ``val`` where a share is held out, to their episodes in the order of ``ids``.
@@ -50,7 +91,7 @@ class Episodes:
             return {"train": list(self.ids)}
         by_task: dict[str, set[str]] = {}
         for episode_id in self.ids:
-            demo = self.demos[episode_id]
+            demo = self.known[episode_id].demo
             by_task.setdefault(demo.rpartition("/")[0], set()).add(demo)
         chosen = {
             demo
@@ -61,12 +102,12 @@ class Episodes:
             raise too_few(validation, "export.<format>.validation")
         splits: dict[str, list[str]] = {"train": [], "val": []}
         for episode_id in self.ids:
-            splits["val" if self.demos[episode_id] in chosen else "train"].append(episode_id)
+            splits["val" if self.known[episode_id].demo in chosen else "train"].append(episode_id)
         return splits
 
     def slices(self, members: Sequence[str], pieces: int) -> list[list[str]]:
         """Some of the episodes in slices (see ``split``): as many of ``pieces`` as they are of all, at least one."""
-        return split(members, max(1, round(pieces * len(members) / len(self.ids))))
+        return split(members, max(1, round(pieces * len(members) / len(self.known))))
 
 
 def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
@@ -75,15 +116,12 @@ def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
     There are ``pieces`` of them, or one per episode when there are fewer episodes than that.
 
     Raises:
-        PipelineError: when there is nothing to write, an id comes twice or ``pieces`` is not positive.
+        PipelineError: when there is nothing to write, or ``pieces`` is not positive.
     """
     if not episode_ids:
         raise PipelineError(
             "no episodes to write", expected="1 or more", remedy="read in the manifest why all were dropped"
         )
-    twice = [episode_id for episode_id, times in Counter(episode_ids).items() if times > 1]
-    if twice:
-        raise PipelineError(f"{len(twice)} episodes come twice, such as {twice[0]}", expected="unique ids")
     if pieces < 1:
         raise PipelineError(f"{pieces} output files were asked for", expected="1 or more")
     count = min(pieces, len(episode_ids))

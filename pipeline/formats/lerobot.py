@@ -1,9 +1,10 @@
-"""LeRobotDataset v3.0, written and read back by lerobot 0.4.4 itself."""
+"""LeRobotDataset v3.0, written directly, and checked by lerobot itself."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from math import ceil
 from pathlib import Path
 from typing import ClassVar
 
@@ -12,14 +13,15 @@ import pyarrow as pa
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig
 from pipeline.formats.base import Format, Row
-from pipeline.formats.episodes import Episodes, Load
+from pipeline.formats.episodes import Episodes, Load, Piece, split
+from pipeline.formats.lerobot_columns import FILE_MB
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.identity import Step
 from pipeline.tables import column
 
 
 class LeRobot(Format[LeRobotConfig]):
-    """Parts are datasets of their own, written in parallel; lerobot merges them."""
+    """Files of one number hold the same episodes: of data, of each video and of ``meta/episodes``."""
 
     name: ClassVar[Step] = "lerobot"
     title: ClassVar = "LeRobot"
@@ -36,32 +38,47 @@ class LeRobot(Format[LeRobotConfig]):
         """For ``LeRobotDataset(repo_id, root=root)``."""
         return self.folder / self.options.name
 
-    def pieces(self, episodes: Episodes) -> dict[str, list[str]]:
-        # lerobot's splits are ranges of episodes, so each split has parts of its own, one after the other.
-        return {
-            f"parts/{split_name}-{part:05d}": ids
-            for split_name, members in episodes.by_split(self.options.validation).items()
-            for part, ids in enumerate(episodes.slices(members, self.options.parts))
-        }
+    def pieces(self, episodes: Episodes) -> list[Piece]:
+        """A piece is one file of each kind; lerobot's splits are ranges of episodes, one after the other."""
+        pieces: list[Piece] = []
+        tasks: dict[str, int] = {}
+        for split_name, members in episodes.by_split(self.options.validation).items():
+            share = round(self.options.parts * len(members) / len(episodes.known))
+            least = ceil(sum(episodes.known[one].steps for one in members) / self._steps_of_a_file())
+            for ids in split(members, max(1, share, least)):
+                instructions = dict.fromkeys(episodes.known[one].instruction for one in ids)
+                before = pieces[-1] if pieces else Piece("", ())
+                pieces.append(
+                    Piece(
+                        f"files/{len(pieces):05d}",
+                        ids,
+                        split_name,
+                        len(pieces),
+                        before.first_episode + len(before.ids),
+                        before.first_step + before.steps,
+                        sum(episodes.known[one].steps for one in ids),
+                        {text: tasks.setdefault(text, len(tasks)) for text in instructions},
+                    )
+                )
+        return pieces
 
-    def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
+    def _steps_of_a_file(self) -> int:
+        """So many steps make a file of ``FILE_MB`` at most; sizes as in ``benchmarks/disk.py``, rounded up."""
+        views = len(SCHEMA.views)
+        maps_kb = sum({"depth": 42.0, "segmentation": 4.0}.get(extra, 0.0) for extra in self.extras)
+        data_kb = 0.5 + views * (maps_kb + (40.0 if self.options.frames == "images" else 0.0))
+        return int(1000 * FILE_MB / max(data_kb, 12.0))
+
+    def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats import lerobot_write
 
-        lerobot_write.write_part(
-            path, episode_ids, load, repo_id=self.options.name, frames=self.options.frames, extras=self.extras
-        )
+        lerobot_write.write_piece(path, piece, load, self.options.frames, self.extras)
 
-    def assemble(self, work: Path, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, int]]:
+    def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, int]]:
         from pipeline.formats import lerobot_write
 
-        root = work / "dataset" / self.options.name
-        lerobot_write.merge([work / piece for piece in pieces], root, work / "cache", repo_id=self.options.name)
-        lengths: dict[str, int] = {}
-        for piece, members in pieces.items():
-            split_name = Path(piece).name.partition("-")[0]
-            lengths[split_name] = lengths.get(split_name, 0) + len(members)
-        lerobot_write.name_splits(root, lengths)
-        ids = [episode_id for piece in pieces.values() for episode_id in piece]
+        lerobot_write.finish(work, work / "dataset" / self.options.name, pieces, self.options.frames, self.extras)
+        ids = [episode_id for piece in pieces for episode_id in piece.ids]
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
@@ -72,7 +89,7 @@ class LeRobot(Format[LeRobotConfig]):
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_read
 
-        return lerobot_read.read(self.root, cache, row["episode_id"], self.extras)
+        return lerobot_read.read(self.root, row["episode_id"], self.extras)
 
     def repository_path(self, file: str) -> str:
         # lerobot looks at the root of the repository.

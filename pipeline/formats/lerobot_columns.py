@@ -1,11 +1,11 @@
-"""The columns of a LeRobot dataset, as lerobot describes them. Light to import."""
+"""The columns of a LeRobot v3.0 dataset. Light to import."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from typing import Any, Literal
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MatrixSpec, PosesSpec, named
+from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, MatrixSpec, PosesSpec
 from pipeline.types import Extra
 
 Frames = Literal["video", "images"]
@@ -16,41 +16,46 @@ EPISODE_ID = "episode_id"
 ``meta/provenance.parquet`` behind: with it, an episode is still found in the manifest."""
 
 INSTANCES, OBJECT_POSES = "instances", "object_poses"
-"""Columns of every frame with extras: a JSON list of names, and the poses of what it names, row by row."""
+"""With extras: a JSON list of names in ``meta/provenance.parquet``, and in every frame the poses of what it names."""
+
+FILE_MB = 200
+"""About as large as a file of data or video may become."""
+
+COUNTERS = ("frame_index", "episode_index", "index", "task_index")
+"""lerobot's own columns of every frame, beside ``timestamp``."""
 
 
 def camera_column(view: str, name: str) -> str:
-    """The column of every frame with a matrix (row by row) or a map (PNG in base64) of a view.
+    """The column with a view's matrix (row by row, in ``meta/provenance.parquet``) or map (PNG in base64, every frame).
 
     Maps are text, and no name begins with ``observation``, because lerobot's policies take such columns and all images.
     """
     return f"{SCHEMA.views[view].lerobot_camera}.{name}"
 
 
-def geometry_columns(extras: Collection[Extra] = ()) -> dict[str, dict[str, Any]]:
-    """lerobot's description of the columns of cameras and extras."""
-    columns: dict[str, dict[str, Any]] = {}
-    text = {"dtype": "string", "shape": (1,), "names": None}
-    for view in SCHEMA.views:
-        columns |= {camera_column(view, name): _flat(getattr(SCHEMA, name)) for name in MATRICES}
-        columns |= {camera_column(view, name): dict(text) for name in MAPS if name in extras}
-    if "object_poses" in extras:
-        columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
-    return columns | ({INSTANCES: text} if named(extras) else {})
-
-
-def _flat(spec: MatrixSpec) -> dict[str, Any]:
-    rows, columns = spec.shape
-    heads = spec.names if isinstance(spec, PosesSpec) else range(columns)
-    names = [f"{row}_{head}" for row in range(rows) for head in heads]
-    return {"dtype": spec.dtype, "shape": (rows * columns,), "names": names}
+def matrix_columns() -> dict[str, MatrixSpec]:
+    """The columns of ``meta/provenance.parquet`` with what an episode's cameras have once."""
+    return {camera_column(view, name): getattr(SCHEMA, name) for view in SCHEMA.views for name in MATRICES}
 
 
 def features(frames: Frames, extras: Collection[Extra] = ()) -> dict[str, dict[str, Any]]:
-    """lerobot's description of the columns."""
+    """The columns of every frame, as ``meta/info.json`` describes them."""
     dtype = {"video": "video", "images": "image"}[frames]
     frame = {"dtype": dtype, "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
-    columns = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
-    for vector in (SCHEMA.state, SCHEMA.joint_state, SCHEMA.action):
-        columns[vector.lerobot_key] = {"dtype": vector.dtype, "shape": vector.shape, "names": list(vector.names)}
-    return columns | {EPISODE_ID: {"dtype": "string", "shape": (1,), "names": None}} | geometry_columns(extras)
+    text: dict[str, Any] = {"dtype": "string", "shape": (1,), "names": None}
+    columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
+    for name in MOTION:
+        spec = getattr(SCHEMA, name)
+        columns[spec.lerobot_key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
+    columns[EPISODE_ID] = dict(text)
+    columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in MAPS if name in extras}
+    if "object_poses" in extras:
+        columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
+    columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}
+    return columns | {name: {"dtype": "int64", "shape": (1,), "names": None} for name in COUNTERS}
+
+
+def _flat(spec: PosesSpec) -> dict[str, Any]:
+    rows, columns = spec.shape
+    names = [f"{row}_{name}" for row in range(rows) for name in spec.names]
+    return {"dtype": spec.dtype, "shape": (rows * columns,), "names": names}

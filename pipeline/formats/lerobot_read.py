@@ -1,4 +1,4 @@
-"""LeRobot datasets read back through lerobot itself, without the hub."""
+"""LeRobot datasets read back: each episode by pyarrow and PyAV; as a whole, and in samples, by lerobot."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
+from unittest import mock
 
 import av
 import datasets
-import lerobot.datasets.video_utils
+import huggingface_hub.constants
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
-import torchvision
 from datasets.exceptions import DatasetsError
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from numpy.typing import NDArray
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Row
-from pipeline.formats.lerobot_columns import INSTANCES, OBJECT_POSES, camera_column, geometry_columns
-from pipeline.formats.lerobot_write import local_only, temporarily
+from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, camera_column
 from pipeline.formats.read_back import Copy, Fault, sampled
-from pipeline.types import Episode, Extra, Geometry
+from pipeline.images.jpeg import decode
+from pipeline.types import Episode, Extra, Frame, Geometry
 
 UNREADABLE = (
     AssertionError,
@@ -40,66 +40,89 @@ UNREADABLE = (
     RuntimeError,
     TypeError,
     ValueError,
+    av.error.FFmpegError,
+    pa.ArrowException,
 )
-"""What lerobot raises on files that are damaged, missing or do not belong together."""
+"""What is raised on files that are damaged, missing or do not belong together."""
 
 MARKS = ("frame_index", "timestamp")
 """LeRobot's columns that tell steps apart."""
 
+BY_LEROBOT = 8
+"""So many episodes are read by lerobot too, spread over the dataset."""
 
-@dataclass(frozen=True)
-class LeRobotSet:
-    """A LeRobot dataset opened.
-
-    Attributes:
-        data: as lerobot opens it.
-        provenance: episode id to its row of ``meta/provenance.parquet``, ``episode_index`` included.
-    """
-
-    data: LeRobotDataset
-    provenance: Mapping[str, Mapping[str, Any]]
+SAME_LEVELS = 1
+"""Largest difference of a decoded frame between PyAV and what lerobot decodes with."""
 
 
 def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str, Any]) -> Iterator[tuple[str, Fault]]:
-    """Frame rate, robot, the columns' names and shapes, the videos' own frame rate; as many episodes as were kept.
+    """What lerobot finds: frame rate, robot, the columns' names and shapes, as many episodes as were kept, and in
+    samples the very numbers and frames that ``read`` finds; and the videos' own frame rate.
 
     Raises:
         PipelineError: when the dataset cannot be opened.
     """
-    with _readable(root):
-        opened = _open(root, cache)
-        meta = opened.data.meta
+    with _readable(root), local_only(cache):
+        # lerobot decodes through it, and each worker would print that it will go.
+        warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
+        data = LeRobotDataset(root.name, root=root, video_backend="pyav")
+        meta = data.meta
         read: dict[str, Any] = {"fps": meta.fps, "robot_type": meta.robot_type}
         wanted: dict[str, Any] = {"fps": SCHEMA.fps_hz, "robot_type": SCHEMA.robot_type}
         for key, spec in columns.items():
             has = meta.features.get(key, {})
             read[key] = (has.get("dtype"), tuple(has.get("shape", ())), tuple(has.get("names") or ()))
             wanted[key] = (spec["dtype"], tuple(spec["shape"]), tuple(spec["names"] or ()))
-        for file in sorted(meta.root.glob("videos/**/*.mp4")):
-            name = str(file.relative_to(meta.root))
+        for file in sorted(root.glob("videos/**/*.mp4")):
+            name = str(file.relative_to(root))
             with av.open(str(file)) as video:
                 read[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
-        stored = (meta.total_episodes, opened.data.num_frames)
+        stored = (meta.total_episodes, data.num_frames)
+        strangers = sorted(_rows(root).keys() - kept.keys())
+        samples = list(_samples(root, data))
     for key, expected in wanted.items():
         if read[key] != expected:
             yield "format", Fault("lerobot", None, f"{key} is {read[key]}", f"{expected}")
+    for episode_id, key in samples:
+        yield "format", Fault("lerobot", episode_id, f"lerobot reads another {key}", "what its files hold")
     steps = sum(row["steps"] for row in kept.values())
     if stored != (len(kept), steps):
         yield "ids", Fault("lerobot", None, f"{stored[0]} episodes of {stored[1]} steps", f"{len(kept)} of {steps}")
     # One that is missing is told where it is looked for.
-    for episode_id in sorted(opened.provenance.keys() - kept.keys()):
+    for episode_id in strangers:
         yield "ids", Fault("lerobot", episode_id, "is in the dataset", "kept episodes alone")
 
 
-def read(root: Path, cache: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
+def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
     """An episode with these extras; None when the dataset does not have it.
 
     Raises:
         PipelineError: when it cannot be read.
     """
-    with _readable(root), temporarily(lerobot.datasets.video_utils, "torchvision", _TORCHVISION):
-        opened = _open(root, cache)
-        return _copy(opened, episode_id, extras) if episode_id in opened.provenance else None
+    with _readable(root):
+        row = _rows(root).get(episode_id)
+        return None if row is None else _copy(root, row, extras)
+
+
+def _samples(root: Path, data: LeRobotDataset) -> Iterator[tuple[str, str]]:
+    """Episode and column where lerobot hands out something else than ``read`` at the sampled steps."""
+    rows = sorted(_rows(root).values(), key=lambda row: row["episode_index"])
+    for place in sorted({round(k) for k in np.linspace(0, len(rows) - 1, BY_LEROBOT)}):
+        row = rows[place]
+        copy = _copy(root, row, ())
+        for step in sampled(row["length"]):
+            item = data[row["dataset_from_index"] + step]
+            for name in MOTION:
+                key = getattr(SCHEMA, name).lerobot_key
+                if not np.array_equal(item[key].numpy(), getattr(copy.episode, name)[step]):
+                    yield row[EPISODE_ID], key
+            for view, spec in SCHEMA.views.items():
+                # lerobot hands out floats in [0, 1], channels first.
+                shown = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
+                if np.abs(shown - copy.decoded[view, step]).max() > SAME_LEVELS:
+                    yield row[EPISODE_ID], spec.lerobot_key
+            if item["task"] != copy.instructions[step]:
+                yield row[EPISODE_ID], "task"
 
 
 @contextmanager
@@ -108,110 +131,122 @@ def _readable(root: Path) -> Iterator[None]:
         yield
     except UNREADABLE as error:
         raise PipelineError(
-            f"{type(error).__name__}: {error}", where=root, expected="what lerobot reads", remedy="dvc repro"
+            f"{type(error).__name__}: {error}", where=root, expected="a LeRobot v3.0 dataset", remedy="dvc repro"
         ) from error
 
 
-def _open(root: Path, cache: Path) -> LeRobotSet:
-    return _opened(root, cache, (root / "meta" / "info.json").stat().st_mtime_ns)
+@contextmanager
+def local_only(cache: Path) -> Iterator[None]:
+    """Keep the copies that ``datasets`` makes of what lerobot reads out of the home folder, and lerobot off the hub."""
+    with (
+        mock.patch.object(datasets.config, "HF_DATASETS_CACHE", cache),
+        mock.patch.object(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
+    ):
+        datasets.disable_progress_bars()
+        yield
+
+
+def _rows(root: Path) -> dict[str, dict[str, Any]]:
+    """Episode id to its rows of ``meta/episodes`` and of ``meta/provenance.parquet``."""
+    return _opened(root, (root / "meta" / "info.json").stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=1)
-def _opened(root: Path, cache: Path, modified_ns: int) -> LeRobotSet:
-    datasets.disable_progress_bars()
-    # lerobot decodes through it, and each worker would print that it will go.
-    warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
-    with local_only(cache):
-        data = LeRobotDataset(root.name, root=root, video_backend="pyav")
-    rows = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
-    return LeRobotSet(data, {row["episode_id"]: row for row in rows})
+def _opened(root: Path, modified_ns: int) -> dict[str, dict[str, Any]]:
+    files = sorted((root / "meta" / "episodes").rglob("*.parquet"))
+    names = [name for name in pq.read_schema(files[0]).names if not name.startswith("stats/")]
+    episodes = [row for file in files for row in pq.read_table(file, columns=names).to_pylist()]
+    provenance = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
+    firsts: dict[tuple[int, int], int] = {}
+    for row in episodes:
+        row["first_row"] = row["dataset_from_index"] - firsts.setdefault(_file(row), row["dataset_from_index"])
+    return {also[EPISODE_ID]: row | also for row, also in zip(episodes, provenance, strict=True)}
 
 
-class _KeptOpen:
-    """A video file that stays open when lerobot closes it: it opens the file anew for each frame that it decodes, which
-    takes 14 times as long as the frame where the file has 200 MB."""
-
-    def __init__(self, file: Any):
-        self._file = file
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
-
-    def close(self) -> None:
-        pass
-
-
-def _video(path: str, stream: str) -> torchvision.io.VideoReader:
-    return _opened_video(path, stream, Path(path).stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=4)
-def _opened_video(path: str, stream: str, modified_ns: int) -> torchvision.io.VideoReader:
-    reader = torchvision.io.VideoReader(path, stream)
-    reader.container = _KeptOpen(reader.container)
-    return reader
-
-
-_TORCHVISION = SimpleNamespace(io=SimpleNamespace(VideoReader=_video), set_video_backend=torchvision.set_video_backend)
-"""What lerobot uses of torchvision to decode."""
+def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
+    return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
 
 
 @lru_cache(maxsize=1)
-def _steps(data: LeRobotDataset, extras: tuple[Extra, ...]) -> datasets.Dataset:
-    """The rows of all steps, without the images where they are not videos."""
-    vectors = [getattr(SCHEMA, name).lerobot_key for name in MOTION]
-    plain = [*vectors, "episode_index", "task_index", *MARKS, *geometry_columns(extras)]
-    return data.hf_dataset.select_columns(plain).with_format("numpy")
+def _info(root: Path, modified_ns: int) -> dict[str, Any]:
+    info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text())
+    tasks = pq.read_table(root / "meta" / "tasks.parquet").to_pylist()
+    return info | {"tasks": {row["task_index"]: row["task"] for row in tasks}}
 
 
-def _copy(opened: LeRobotSet, episode_id: str, extras: tuple[Extra, ...]) -> Copy:
-    data = opened.data
-    provenance = opened.provenance[episode_id]
-    index = provenance["episode_index"]
-    rows = data.meta.episodes[index]
-    start, stop = rows["dataset_from_index"], rows["dataset_to_index"]
-    table = _steps(data, extras)[start:stop]
-    if set(table["episode_index"].tolist()) != {index} or len(table["action"]) != rows["length"]:
-        raise ValueError(f"rows {start} to {stop} are not the {rows['length']} steps of episode {index}")
-    decoded = {}
-    for step in sampled(stop - start):
-        item = data[start + step]
-        for view, spec in SCHEMA.views.items():
-            # lerobot hands out floats in [0, 1], channels first.
-            pixels = np.rint(item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255)
-            decoded[view, step] = np.ascontiguousarray(pixels, np.uint8)
-    instructions = [str(data.meta.tasks.iloc[task].name) for task in table["task_index"].tolist()]
+def _copy(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy:
+    index, steps = row["episode_index"], row["length"]
+    info = _info(root, (root / "meta" / "info.json").stat().st_mtime_ns)
+    chunk, number = _file(row)
+    table = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
+    if table["episode_index"].to_pylist() != [index] * steps:
+        raise ValueError(f"rows {row['first_row']} of data file {number} are not the {steps} steps of episode {index}")
+    instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
     episode = Episode(
-        episode_id=episode_id,
+        episode_id=row[EPISODE_ID],
         frames={},
-        **{name: table[getattr(SCHEMA, name).lerobot_key] for name in MOTION},
+        **{name: _matrix(table, getattr(SCHEMA, name).lerobot_key) for name in MOTION},
         instruction=instructions[0],
-        provenance=provenance,
-        geometry={view: _geometry(table, view, extras) for view in SCHEMA.views},
-        object_poses=table[OBJECT_POSES].reshape(-1, *SCHEMA.object_poses.shape) if OBJECT_POSES in table else None,
-        instances=json.loads(_constant(table, INSTANCES)) if named(extras) else (),
+        provenance=row,
+        geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},
+        object_poses=_matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
+        if "object_poses" in extras
+        else None,
+        instances=json.loads(row[INSTANCES]) if named(extras) else (),
     )
     return Copy(
         dataset="lerobot",
         episode=episode,
         instructions=instructions,
-        decoded=decoded,
-        marks={name: table[name] for name in MARKS},
+        decoded={key: frame for view in SCHEMA.views for key, frame in _decoded(root, info, row, table, view)},
+        marks={name: table[name].to_numpy() for name in MARKS},
         place={"lerobot_episode_index": index},
     )
 
 
-def _geometry(table: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
+def _steps(path: Path, first: int, steps: int) -> pa.Table:
+    """Rows of a data file, from the row groups that have them: where we wrote the file, that is one."""
+    with pq.ParquetFile(path) as file:
+        ends = np.cumsum([file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)])
+        groups = range(
+            int(np.searchsorted(ends, first, "right")), int(np.searchsorted(ends, first + steps - 1, "right")) + 1
+        )
+        before = int(ends[groups[0] - 1]) if groups[0] else 0
+        return file.read_row_groups(list(groups)).slice(first - before, steps)
+
+
+def _matrix(table: pa.Table, column: str) -> NDArray[Any]:
+    """(T, D) of a column of vectors."""
+    values = table[column].combine_chunks()
+    return np.asarray(values.flatten().to_numpy().reshape(len(values), -1))
+
+
+def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
     matrices = {
-        name: _constant(table, camera_column(view, name)).reshape(getattr(SCHEMA, name).shape) for name in MATRICES
+        name: np.array(row[camera_column(view, name)], np.float32).reshape(getattr(SCHEMA, name).shape)
+        for name in MATRICES
     }
-    texts = {name: table[camera_column(view, name)] for name in MAPS if name in extras}
+    texts = {name: table[camera_column(view, name)].to_pylist() for name in MAPS if name in extras}
     return Geometry(**matrices, maps={name: list(map(base64.b64decode, files)) for name, files in texts.items()})
 
 
-def _constant(table: Mapping[str, Any], column: str) -> Any:
-    """What a column has at every step of an episode."""
-    first, *others = table[column]
-    if any(np.any(other != first) for other in others):
-        raise ValueError(f"{column} is not the same at every step")
-    return first
+def _decoded(
+    root: Path, info: Mapping[str, Any], row: Mapping[str, Any], table: pa.Table, view: str
+) -> Iterator[tuple[tuple[str, int], Frame]]:
+    """The frames of a view at the sampled steps."""
+    key = SCHEMA.views[view].lerobot_key
+    if info["features"][key]["dtype"] == "image":
+        for step in sampled(row["length"]):
+            yield (view, step), decode(table[key][step]["bytes"].as_py())
+        return
+    chunk, number = _file(row, f"videos/{key}")
+    path = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
+    with av.open(str(root / path)) as video:
+        stream = video.streams.video[0]
+        for step in sampled(row["length"]):
+            at = round((row[f"videos/{key}/from_timestamp"] + step / SCHEMA.fps_hz) / float(stream.time_base or 1))
+            video.seek(at, stream=stream)
+            found = next(frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at)
+            if found.pts != at:
+                raise ValueError(f"{path} has no frame at {at * float(stream.time_base or 1):.3f} s")
+            yield (view, step), np.asarray(found.to_ndarray(format="rgb24"), np.uint8)

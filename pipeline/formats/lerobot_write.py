@@ -1,286 +1,298 @@
-"""The parts of a LeRobot dataset, and their merge, by lerobot 0.4.4 itself.
+"""LeRobot v3.0 as its files are published, without lerobot, which only reads and checks them here.
 
-Two things of lerobot's are replaced: its video encoder (see ``lerobot_video``), and its statistics: of frames (see
-``image_statistics``), and in ``meta/stats.json``, where merged quantiles are averages of per-episode quantiles
-(huggingface/lerobot#3804). Beside lerobot's own files there is ``meta/provenance.parquet``, one row per episode.
+A worker writes the files of some episodes in a row: one of data, one of each video, one of ``meta/episodes``. They are
+final, as the number of steps before them is known. Files of the same number hold the same episodes. What is about all
+episodes comes at the end: tasks, splits, exact statistics, and ``meta/provenance.parquet`` with a row for each episode,
+which lerobot passes by.
+
+lerobot's own writer appends by writing whole files again, and its statistics are averages of per-episode quantiles
+(huggingface/lerobot#3804) from a sample of the frames.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import partial
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import av
-import cv2
 import datasets
-import huggingface_hub.constants
-import lerobot.datasets.aggregate
-import lerobot.datasets.lerobot_dataset
-import lerobot.utils.utils
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
-from lerobot.datasets.aggregate import aggregate_datasets
-from lerobot.datasets.compute_stats import compute_episode_stats
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import get_file_size_in_mb, write_info, write_stats
-from lerobot.datasets.video_utils import concatenate_video_files
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MATRICES, SCHEMA, check
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, check, named
 from pipeline.errors import PipelineError
-from pipeline.formats.episodes import Load
+from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
-from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, Frames, camera_column, features
-from pipeline.formats.lerobot_video import VideoEncoder
+from pipeline.formats.lerobot_columns import (
+    EPISODE_ID,
+    FILE_MB,
+    INSTANCES,
+    OBJECT_POSES,
+    Frames,
+    camera_column,
+    features,
+    matrix_columns,
+)
+from pipeline.formats.lerobot_video import INFO, Video
 from pipeline.formats.motion_statistics import describe
-from pipeline.types import Episode, Extra, Floats, Frame
+from pipeline.images.jpeg import decode
+from pipeline.types import Episode, Extra
 
-PART_VIDEO_MB = 1e-6
-"""A file for each episode's video: lerobot rewrites a file for each that it appends. The merge fills its own 200 MB."""
+FILES_OF_A_CHUNK, PLACE = 1000, "chunk-{chunk_index:03d}/file-{file_index:03d}"
 
-DATA_MB = 25
-"""Size of the data files: lerobot's merge has one in memory over and over, 1.4 GB of images at its own 100 MB."""
+DATA, EPISODES, PROVENANCE, LEVELS = "data.parquet", "episodes.parquet", "provenance.parquet", "levels.json"
+"""In a piece's folder, beside ``<view>.mp4``."""
 
-EPISODES_MB = 2
-"""Size of the files in ``meta/episodes``, which the merge rewrites for each part: an episode is 1 kB in the file and
-more than 100 in memory."""
-
-
-SUMMARY, DATASET = "summary.json", "dataset"
-"""In a part's folder: what the merge needs beside the dataset, and the dataset."""
+ENTRIES = 16
+"""Of a column so many entries are in memory at a time: 300 MB for 28,000 episodes."""
 
 
-def write_part(
-    path: Path, episode_ids: Sequence[str], load: Load, *, repo_id: str, frames: Frames, extras: tuple[Extra, ...] = ()
-) -> None:
-    """Write a dataset of some of the episodes, and a summary; a process writes one at a time.
+def file_path(kind: str, number: int, suffix: str) -> str:
+    """Path of a dataset's file below its root; ``kind`` is ``data``, ``meta/episodes`` or ``videos/<key>``."""
+    chunk, file = divmod(number, FILES_OF_A_CHUNK)
+    return f"{kind}/{PLACE.format(chunk_index=chunk, file_index=file)}{suffix}"
+
+
+def write_piece(path: Path, piece: Piece, load: Load, frames: Frames, extras: tuple[Extra, ...]) -> None:
+    """Write the files of some episodes into a new folder; one episode at a time is in memory.
 
     The bytes, videos included, depend on the episodes, their order and the encoder's version alone.
-
-    Args:
-        path: new folder.
-        episode_ids: ids of the episodes to write.
-        load: reads one episode; one at a time is in memory.
-        repo_id: the dataset's name, as on the hub; nothing is sent or fetched.
-        frames: how frames are stored.
-        extras: what the episodes have beside them.
 
     Raises:
         PipelineError: when an episode breaks the schema.
     """
-    datasets.disable_progress_bars()
-    av.logging.set_libav_level(av.logging.ERROR)  # lerobot restores FFmpeg's own log, which tells of every append
     path.mkdir()
-    dataset = LeRobotDataset.create(
-        repo_id,
-        SCHEMA.fps_hz,
-        features(frames, extras),
-        root=path / DATASET,
-        robot_type=SCHEMA.robot_type,
-        use_videos=frames == "video",
-        video_backend="pyav",
-        vcodec="h264",
-    )
-    dataset.meta.update_chunk_settings(data_files_size_in_mb=DATA_MB, video_files_size_in_mb=PART_VIDEO_MB)
-    # The slot that streaming_encoding=True fills; it has no public name.
-    dataset._streaming_encoder = VideoEncoder() if frames == "video" else None
-    provenance = []
-    counts: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
-    try:
-        for episode_id in episode_ids:
+    levels: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
+    rows, provenance = [], []
+    first_step = piece.first_step
+    with ExitStack() as opened:
+        data = opened.enter_context(pq.ParquetWriter(path / DATA, _schema(features(frames, extras))))
+        videos = {view: opened.enter_context(Video(path / f"{view}.mp4")) for view in SCHEMA.views if frames == "video"}
+        for index, episode_id in enumerate(piece.ids, piece.first_episode):
             episode = load(episode_id)
             check(episode, extras)
-            for view, counted in _add(dataset, episode).items():
-                counts[view] += counted
-            provenance.append(dict(episode.provenance))
-    finally:
-        dataset.finalize()
-    levels = {view: counted.tolist() for view, counted in counts.items()}
-    (path / SUMMARY).write_text(json.dumps({"provenance": provenance, "levels": levels}))
+            shown = {view: _show(episode, view, videos.get(view)) for view in SCHEMA.views}
+            numbers = _numbers(episode, index, first_step, piece.tasks[episode.instruction])
+            columns = {name: pa.array(list(values)) for name, values in numbers.items()} | _texts(episode)
+            if not videos:
+                columns |= _images(episode)
+            # A row group for each episode, so that one is read without the others.
+            data.write_table(pa.table({name: columns[name] for name in data.schema.names}).cast(data.schema))
+            rows.append(_row(episode, piece, index, first_step, frames) | _described(numbers, shown))
+            provenance.append(_provenance(episode, index))
+            levels = {view: counts + shown[view] for view, counts in levels.items()}
+            first_step += len(episode)
+    pq.write_table(pa.Table.from_pylist(rows), path / EPISODES)
+    pq.write_table(pa.Table.from_pylist(provenance, schema=_provenance_schema(extras)), path / PROVENANCE)
+    (path / LEVELS).write_text(json.dumps({view: counts.tolist() for view, counts in levels.items()}))
 
 
-def merge(parts: Sequence[Path], root: Path, cache: Path, *, repo_id: str) -> None:
-    """Merge parts, in their order, into a dataset with exact statistics and a table of provenance.
-
-    Args:
-        parts: folders of ``write_part``.
-        root: new folder of the dataset.
-        cache: folder for the copies that ``datasets`` makes of what lerobot reads.
-        repo_id: as of the parts.
-    """
-    with (
-        local_only(cache),
-        temporarily(lerobot.datasets.aggregate, "DEFAULT_DATA_FILE_SIZE_IN_MB", EPISODES_MB),
-        _videos_joined_once(),
-    ):
-        aggregate_datasets(
-            [repo_id] * len(parts),
-            repo_id,
-            roots=[part / DATASET for part in parts],
-            aggr_root=root,
-            data_files_size_in_mb=DATA_MB,
-        )
-    _number_episode_files(root)
-    summaries = [json.loads((part / SUMMARY).read_text()) for part in parts]
-    counts = {view: np.sum([summary["levels"][view] for summary in summaries], axis=0) for view in SCHEMA.views}
-    _write_statistics(root, counts)
-    _write_provenance(root, [row for summary in summaries for row in summary["provenance"]])
+def finish(work: Path, root: Path, pieces: Sequence[Piece], frames: Frames, extras: tuple[Extra, ...]) -> None:
+    """Put the files of all pieces in their places below ``root``, and write what is about all of them."""
+    for piece in pieces:
+        places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
+        places |= {f"{view}.mp4": (f"videos/{of.lerobot_key}", ".mp4") for view, of in SCHEMA.views.items()}
+        for name, (kind, suffix) in places.items():
+            if (made := work / piece.path / name).exists():
+                _link(made, root / file_path(kind, piece.number, suffix))
+    tables = [pq.read_table(work / piece.path / PROVENANCE) for piece in pieces]
+    pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
+    tasks = list(dict.fromkeys(task for piece in pieces for task in piece.tasks))
+    tasks.sort(key={task: number for piece in pieces for task, number in piece.tasks.items()}.__getitem__)
+    # lerobot finds a task by the table's index.
+    numbered = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task"))
+    numbered.to_parquet(root / "meta" / "tasks.parquet")
+    columns = features(frames, extras)
+    levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
+    counts = {view: np.sum([of_piece[view] for of_piece in levels], axis=0) for view in SCHEMA.views}
+    figures = {of.lerobot_key: statistics(counts[view]) for view, of in SCHEMA.views.items()}
+    figures |= {name: _exact(root, name, of["shape"][0]) for name, of in columns.items() if _is_number(of)}
+    _write_json(root / "meta" / "stats.json", {name: _listed(figures[name]) for name in columns if name in figures})
+    _write_json(root / "meta" / "info.json", _info(pieces, columns, len(tasks), frames))
 
 
-def name_splits(root: Path, lengths: Mapping[str, int]) -> None:
-    """Write into ``meta/info.json`` which episodes each split has: ranges, one after the other.
-
-    Args:
-        root: of a dataset, as merged.
-        lengths: split to its number of episodes.
-    """
-    file = root / "meta" / "info.json"
-    info = json.loads(file.read_text())
-    ends = np.cumsum(list(lengths.values())).tolist()
-    info["splits"] = {name: f"{end - length}:{end}" for (name, length), end in zip(lengths.items(), ends, strict=True)}
-    write_info(info, root)
+def _link(made: Path, place: Path) -> None:
+    """Have a file in a second place too: the first stays, for a call that goes on where this one is killed."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(made, place)
+    except OSError:  # a file system without links
+        shutil.copyfile(made, place)
 
 
-def _add(dataset: LeRobotDataset, episode: Episode) -> dict[str, Counts]:
-    """Save an episode, and return the levels of each view's frames."""
-    steps = len(episode)
-    columns = dataset.create_episode_buffer()
-    columns |= {"size": steps, "task": [episode.instruction] * steps}
-    columns |= {"frame_index": list(range(steps)), "timestamp": [t / SCHEMA.fps_hz for t in range(steps)]}
-    columns[EPISODE_ID] = [episode.episode_id] * steps
-    for name in ("state", "joint_state", "action"):
-        columns[getattr(SCHEMA, name).lerobot_key] = list(getattr(episode, name))
-    for view_name, seen in episode.geometry.items():
-        columns |= {camera_column(view_name, name): [getattr(seen, name).ravel()] * steps for name in MATRICES}
-        for name, files in seen.maps.items():
-            columns[camera_column(view_name, name)] = [base64.b64encode(file).decode() for file in files]
-    if episode.object_poses is not None:
-        columns[OBJECT_POSES] = [poses.ravel() for poses in episode.object_poses]
-    if episode.instances:
-        columns[INSTANCES] = [json.dumps(list(episode.instances))] * steps
-    encoder = dataset._streaming_encoder
-    if encoder is None:
-        # ``datasets``, which lerobot hands the columns to, takes a whole image file for an image.
-        columns |= {view.lerobot_key: episode.frames[name] for name, view in SCHEMA.views.items()}
-    else:
-        encoder.start_episode([view.lerobot_key for view in SCHEMA.views.values()], dataset.root)
-    counts: dict[str, Counts] = {}
-    for name, view in SCHEMA.views.items():
-        counts[name] = np.zeros((3, 256), np.int64)
-        for t in range(steps):
-            pixels = _pixels(episode, name, t)
-            counts[name] += count(pixels)
-            if encoder is not None:
-                encoder.feed_frame(view.lerobot_key, pixels)
-    ours = {view.lerobot_key: statistics(counts[name]) for name, view in SCHEMA.views.items()}
-    described = partial(_episode_statistics, frames=ours)
-    saving = lerobot.datasets.lerobot_dataset
-    # The columns hold whole files already; lerobot would go through all rows of each episode to look for paths.
-    with (
-        temporarily(saving, "compute_episode_stats", described),
-        temporarily(saving, "embed_images", lambda columns: columns),
-    ):
-        dataset.save_episode(columns)
+def _is_number(column: Mapping[str, Any]) -> bool:
+    return column["dtype"] in ("float32", "int64")
+
+
+def _schema(columns: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
+    """Of the data files, with what ``datasets`` and the hub's viewer know images by."""
+    stored: dict[str, Any] = {}
+    for name, of in columns.items():
+        if of["dtype"] == "image":
+            stored[name] = datasets.Image()
+        elif of["dtype"] != "video":
+            value = datasets.Value(of["dtype"])
+            stored[name] = value if of["shape"] == (1,) else datasets.Sequence(value, length=of["shape"][0])
+    return datasets.Features(stored).arrow_schema
+
+
+def _show(episode: Episode, view: str, video: Video | None) -> Counts:
+    """Append a view's frames to its video, and return their levels."""
+    counts = np.zeros((3, 256), np.int64)
+    for t, packed in enumerate(episode.frames[view]):
+        try:
+            pixels = decode(packed)
+        except ValueError as error:
+            raise PipelineError(f"{view} frame {t}: {error}", where=f"episode {episode.episode_id}") from error
+        counts += count(pixels)
+        if video is not None:
+            video.add(pixels, first=t == 0)
     return counts
 
 
-def _pixels(episode: Episode, view: str, t: int) -> Frame:
-    pixels = cv2.imdecode(np.frombuffer(episode.frames[view][t], np.uint8), cv2.IMREAD_COLOR_RGB)
-    if pixels is None:
-        raise PipelineError(f"{view} frame {t} cannot be decoded", where=f"episode {episode.episode_id}")
-    return pixels.astype(np.uint8, copy=False)
+def _numbers(episode: Episode, index: int, first_step: int, task: int) -> dict[str, NDArray[Any]]:
+    """Column to what it has at each step, (T,) or (T, D)."""
+    steps = np.arange(len(episode))
+    numbers: dict[str, NDArray[Any]] = {getattr(SCHEMA, name).lerobot_key: getattr(episode, name) for name in MOTION}
+    if episode.object_poses is not None:
+        numbers[OBJECT_POSES] = episode.object_poses.reshape(len(steps), -1)
+    return numbers | {
+        "timestamp": (steps / SCHEMA.fps_hz).astype(np.float32),
+        "frame_index": steps,
+        "episode_index": np.full_like(steps, index),
+        "index": first_step + steps,
+        "task_index": np.full_like(steps, task),
+    }
 
 
-def _episode_statistics(
-    columns: dict[str, Any], features: dict[str, Any], *, frames: Mapping[str, Any]
-) -> dict[str, Any]:
-    """lerobot's statistics of an episode, with ``frames`` in place of its own for the cameras."""
-    vectors = {name: values for name, values in columns.items() if name not in frames}
-    return {**compute_episode_stats(vectors, features), **frames}
+def _texts(episode: Episode) -> dict[str, pa.Array]:
+    texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
+    for view, seen in episode.geometry.items():
+        for name, files in seen.maps.items():
+            texts[camera_column(view, name)] = [base64.b64encode(file).decode() for file in files]
+    return {name: pa.array(values) for name, values in texts.items()}
 
 
-def _column_statistics(values: Floats) -> dict[str, NDArray[Any]]:
-    """lerobot's statistics of a (N, D) column, each (D,); ``count`` is (1,)."""
+def _images(episode: Episode) -> dict[str, pa.Array]:
+    kind = datasets.Image().pa_type
+    return {
+        view.lerobot_key: pa.array([{"bytes": packed, "path": None} for packed in episode.frames[name]], kind)
+        for name, view in SCHEMA.views.items()
+    }
+
+
+def _row(episode: Episode, piece: Piece, index: int, first_step: int, frames: Frames) -> dict[str, Any]:
+    """Of ``meta/episodes``: where an episode lies."""
+    chunk, file = divmod(piece.number, FILES_OF_A_CHUNK)
+    steps = len(episode)
+    row = {
+        "episode_index": index,
+        "tasks": [episode.instruction],
+        "length": steps,
+        "data/chunk_index": chunk,
+        "data/file_index": file,
+        "dataset_from_index": first_step,
+        "dataset_to_index": first_step + steps,
+        "meta/episodes/chunk_index": chunk,
+        "meta/episodes/file_index": file,
+    }
+    before = first_step - piece.first_step
+    for view in SCHEMA.views.values() if frames == "video" else ():
+        row |= {
+            f"videos/{view.lerobot_key}/chunk_index": chunk,
+            f"videos/{view.lerobot_key}/file_index": file,
+            f"videos/{view.lerobot_key}/from_timestamp": before / SCHEMA.fps_hz,
+            f"videos/{view.lerobot_key}/to_timestamp": (before + steps) / SCHEMA.fps_hz,
+        }
+    return row
+
+
+def _described(numbers: Mapping[str, NDArray[Any]], shown: Mapping[str, Counts]) -> dict[str, Any]:
+    """Of ``meta/episodes``: an episode's statistics, which lerobot's tools for editing put together again."""
+    figures = {name: _statistics(values.reshape(len(values), -1)) for name, values in numbers.items()}
+    figures |= {SCHEMA.views[view].lerobot_key: statistics(counts) for view, counts in shown.items()}
+    return {f"stats/{name}/{of}": values for name, found in figures.items() for of, values in _listed(found).items()}
+
+
+def _statistics(values: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """lerobot's statistics of (N, D) numbers, each (D,); ``count`` is (1,)."""
     return describe(values, QUANTILES) | {"count": np.array([len(values)])}
 
 
-def _number_episode_files(root: Path) -> None:
-    """Have each row of ``meta/episodes`` name its own file: lerobot 0.4.4 names the one before where it begins one."""
-    for file in (root / "meta" / "episodes").rglob("*.parquet"):
-        table = pq.read_table(file)
-        for name, part in (("chunk_index", file.parent.name), ("file_index", file.stem)):
-            column = f"meta/episodes/{name}"
-            number = pa.array([int(part.rpartition("-")[2])] * len(table), pa.int64())
-            table = table.set_column(table.schema.get_field_index(column), column, number)
-        pq.write_table(table, file)
+def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
+    """lerobot's statistics of a column over all steps of the dataset, ``ENTRIES`` of its entries at a time."""
+    found = []
+    for first in range(0, width, ENTRIES):
+        values = np.concatenate([_entries(file, column)[:, first : first + ENTRIES] for file in _data_files(root)])
+        found.append([describe(entry[:, None], QUANTILES) for entry in values.T])
+    entries = [entry for block in found for entry in block]
+    together = {name: np.concatenate([entry[name] for entry in entries]) for name in entries[0]}
+    return together | {"count": np.array([len(values)])}
 
 
-def _write_statistics(root: Path, counts: Mapping[str, Counts]) -> None:
-    """Write ``meta/stats.json`` over lerobot's, from every row and every pixel."""
-    exact = {view.lerobot_key: statistics(counts[name]) for name, view in SCHEMA.views.items()}
-    data = pq.ParquetDataset(root / "data")
-    texts = {field.name for field in data.schema if field.type in (pa.string(), pa.large_string())}
-    for column in [name for name in data.schema.names if name not in {*exact, *texts}]:
-        values = data.read(columns=[column])[column].combine_chunks()
-        flat = values.flatten() if pa.types.is_nested(values.type) else values
-        exact[column] = _column_statistics(flat.to_numpy().astype(np.float64).reshape(len(values), -1))
-    write_stats(exact, root)
+def _data_files(root: Path) -> list[Path]:
+    return sorted((root / "data").rglob("*.parquet"))
 
 
-def _write_provenance(root: Path, rows: Sequence[Mapping[str, str]]) -> None:
-    """Write ``meta/provenance.parquet``: one row per episode; lerobot reads the files it knows and passes this by."""
-    columns: dict[str, Any] = {"episode_index": pa.array(range(len(rows)), pa.int64())}
-    columns |= {column: pa.array([row[column] for row in rows], pa.string()) for column in SCHEMA.provenance}
-    pq.write_table(pa.table(columns), root / "meta" / "provenance.parquet")
+def _entries(file: Path, column: str) -> NDArray[Any]:
+    """(N, D) of a file's column."""
+    values = pq.read_table(file, columns=[column])[column].combine_chunks()
+    flat = values.flatten() if pa.types.is_fixed_size_list(values.type) else values
+    return np.asarray(flat.to_numpy(zero_copy_only=False).reshape(len(values), -1))
 
 
-@contextmanager
-def _videos_joined_once() -> Iterator[None]:
-    """Write each video file of a merge in one go: lerobot rewrites it for each source that it appends."""
-    sources: defaultdict[Path, list[Path]] = defaultdict(list)
-    # Of the files with sources: to add up the sources' again for each that comes would take time with their square.
-    sizes_mb: dict[Path, float] = {}
-
-    def size_mb(file: Path) -> float:
-        return sizes_mb[file] if file in sizes_mb else float(get_file_size_in_mb(file))
-
-    def append(paths: Sequence[Path], joined: Path) -> None:
-        sizes_mb[joined] = size_mb(joined) + size_mb(paths[-1])
-        sources[joined].append(paths[-1])
-
-    merging = lerobot.datasets.aggregate
-    with temporarily(merging, "concatenate_video_files", append), temporarily(merging, "get_file_size_in_mb", size_mb):
-        yield
-    for joined, rest in sources.items():
-        concatenate_video_files([joined, *rest], joined)
+def _listed(figures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    return {name: values.tolist() for name, values in figures.items()}
 
 
-@contextmanager
-def local_only(cache: Path) -> Iterator[None]:
-    """Keep the copies that ``datasets`` makes of what lerobot reads out of the home folder, and lerobot off the hub."""
-    with (
-        temporarily(datasets.config, "HF_DATASETS_CACHE", cache),
-        temporarily(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
-        # lerobot would turn the bars of ``datasets`` on after each file that it reads.
-        temporarily(lerobot.utils.utils, "enable_progress_bar", datasets.disable_progress_bars),
-    ):
-        datasets.disable_progress_bars()
-        yield
+def _provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
+    columns = {"episode_index": pa.int64()} | dict.fromkeys(SCHEMA.provenance, pa.string())
+    columns |= {name: pa.list_(pa.float32(), spec.shape[0] * spec.shape[1]) for name, spec in matrix_columns().items()}
+    return pa.schema(columns | ({INSTANCES: pa.string()} if named(extras) else {}))
 
 
-@contextmanager
-def temporarily(owner: object, name: str, value: object) -> Iterator[None]:
-    """Give an attribute another value for a while: where a library has no argument for it."""
-    saved = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, saved)
+def _provenance(episode: Episode, index: int) -> dict[str, Any]:
+    row: dict[str, Any] = {"episode_index": index, **episode.provenance}
+    for view, seen in episode.geometry.items():
+        row |= {camera_column(view, name): getattr(seen, name).ravel().tolist() for name in MATRICES}
+    return row | ({INSTANCES: json.dumps(list(episode.instances))} if episode.instances else {})
+
+
+def _info(
+    pieces: Sequence[Piece], columns: Mapping[str, Mapping[str, Any]], tasks: int, frames: Frames
+) -> dict[str, Any]:
+    """``meta/info.json``; a split is a range of episodes, in the order of the pieces."""
+    splits: dict[str, tuple[int, int]] = {}
+    for piece in pieces:
+        first, _ = splits.get(piece.split, (piece.first_episode, 0))
+        splits[piece.split] = (first, piece.first_episode + len(piece.ids))
+    last = pieces[-1]
+    return {
+        "codebase_version": "v3.0",
+        "robot_type": SCHEMA.robot_type,
+        "total_episodes": last.first_episode + len(last.ids),
+        "total_frames": last.first_step + last.steps,
+        "total_tasks": tasks,
+        "chunks_size": FILES_OF_A_CHUNK,
+        "data_files_size_in_mb": FILE_MB,
+        "video_files_size_in_mb": FILE_MB,
+        "fps": SCHEMA.fps_hz,
+        "splits": {name: f"{first}:{end}" for name, (first, end) in splits.items()},
+        "data_path": f"data/{PLACE}.parquet",
+        "video_path": f"videos/{{video_key}}/{PLACE}.mp4" if frames == "video" else None,
+        "features": {
+            name: {**of, **({"info": INFO} if of["dtype"] == "video" else {})} for name, of in columns.items()
+        },
+    }
+
+
+def _write_json(file: Path, content: Mapping[str, Any]) -> None:
+    file.write_text(json.dumps(content, indent=4) + "\n")

@@ -11,7 +11,7 @@ import pyarrow as pa
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Format, Row
-from pipeline.formats.episodes import Episodes, Load
+from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, by_suite, dataset_of, shard_path
 from pipeline.identity import Step
@@ -30,24 +30,26 @@ class Rlds(Format[RldsConfig]):
     keys: ClassVar = {view: view for view in SCHEMA.views} | {v: v for v in ("state", "joint_state", "action")}
     clients: ClassVar = ("openvla_oft",)
 
-    def pieces(self, episodes: Episodes) -> dict[str, list[str]]:
-        pieces: dict[str, list[str]] = {}
+    def pieces(self, episodes: Episodes) -> list[Piece]:
+        pieces = []
         for split_name, members in episodes.by_split(self.options.validation).items():
-            for name, ids in by_suite(members, episodes.suites, self.options.name).items():
+            suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
+            for name, ids in by_suite(members, suites, self.options.name).items():
                 slices = episodes.slices(ids, self.options.shards)
                 for shard, slice_ids in enumerate(slices):
-                    pieces[f"dataset/{shard_path(name, split_name, shard, len(slices))}"] = slice_ids
+                    path = shard_path(name, split_name, shard, len(slices))
+                    pieces.append(Piece(f"dataset/{path}", slice_ids, split_name))
         return pieces
 
-    def write_piece(self, path: Path, episode_ids: Sequence[str], load: Load) -> None:
+    def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats import rlds_write
 
-        rlds_write.write_shard(path, episode_ids, load, self.extras)
+        rlds_write.write_shard(path, piece.ids, load, self.extras)
 
-    def assemble(self, work: Path, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
+    def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
         from pipeline.formats import rlds_write
 
-        shards = {work / piece: ids for piece, ids in pieces.items()}
+        shards = {work / piece.path: piece.ids for piece in pieces}
         for folder in dict.fromkeys(path.parent for path in shards):
             lengths = {path: len(ids) for path, ids in shards.items() if path.parent == folder}
             rlds_write.write_metadata(folder, lengths, self.extras)

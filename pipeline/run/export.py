@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -20,7 +20,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
 from pipeline.formats.base import Export, Format
-from pipeline.formats.episodes import Episodes, Load
+from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
 from pipeline.run import outcome
 from pipeline.run.episode_loader import EpisodeLoader
@@ -44,13 +44,13 @@ def export_run(target: Format[Any], config: Config) -> None:
 def kept_episodes(config: Config) -> Episodes:
     """The kept episodes of a run, in the order they are written."""
     run = outcome.read(config)
-    return Episodes(
-        ids=run.kept,
-        load=EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render),
-        suites={row.episode_id: row.suite for row in run.rows},
-        content=run.contents(),
-        demos={row.episode_id: row.demo_id for row in run.rows},
-    )
+    rows, contents = {row.episode_id: row for row in run.rows}, run.contents()
+    known = {}
+    for episode_id in run.kept:
+        row = rows[episode_id]
+        steps = run.trajectories[row.trajectory_id]["steps"]
+        known[episode_id] = Known(row.suite, contents[episode_id], row.demo_id, row.instruction, steps)
+    return Episodes(known, EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render))
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:
@@ -63,14 +63,14 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
         SCHEMA.model_dump(mode="json"),
         target.options.model_dump(mode="json"),
         target.extras,
-        list(target.pieces(episodes).items()),
-        [episodes.content[episode_id] for episode_id in episodes.ids],
+        [[piece.path, piece.ids] for piece in target.pieces(episodes)],
+        [known.content for known in episodes.known.values()],
     )[:16]
 
 
 def asked(target: AnyFormat, episodes: Episodes) -> str:
     """A short digest of what of it was asked for: the episodes with all that they are, and the options."""
-    content = [episodes.content[episode_id] for episode_id in episodes.ids]
+    content = [known.content for known in episodes.known.values()]
     return digest(target.options.model_dump(mode="json"), target.extras, content)[:16]
 
 
@@ -164,13 +164,13 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     _clear_work(target)
 
 
-def _write_pieces(target: AnyFormat, work: Path, pieces: Mapping[str, Sequence[str]], load: Load, run: Run) -> None:
-    paths = {work / name: ids for name, ids in pieces.items()}
+def _write_pieces(target: AnyFormat, work: Path, pieces: Sequence[Piece], load: Load, run: Run) -> None:
+    paths = {work / piece.path: piece for piece in pieces}
     whole = {path for path in paths if path.exists()}
     keep_below(work, whole)
     for folder in {path.parent for path in paths}:
         folder.mkdir(parents=True, exist_ok=True)
-    todo = [(path, ids) for path, ids in paths.items() if path not in whole]
+    todo = [(path, piece) for path, piece in paths.items() if path not in whole]
     run(_PieceJob(target, load), todo, f"{target.title} pieces")
 
 
@@ -179,10 +179,10 @@ class _PieceJob:
     target: AnyFormat
     load: Load
 
-    def __call__(self, piece: tuple[Path, Sequence[str]]) -> None:
-        path, episode_ids = piece
+    def __call__(self, todo: tuple[Path, Piece]) -> None:
+        path, piece = todo
         with replaced(path) as temporary:
-            self.target.write_piece(temporary, episode_ids, self.load)
+            self.target.write_piece(temporary, piece, self.load)
 
 
 @dataclass(frozen=True)
@@ -190,9 +190,9 @@ class _Assembly:
     target: AnyFormat
     work: Path
 
-    def __call__(self, pieces: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
+    def __call__(self, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
         # Without what a worker made that was lost in the middle of it.
-        keep_below(self.work, {self.work / name for name in pieces})
+        keep_below(self.work, {self.work / piece.path for piece in pieces})
         return self.target.assemble(self.work, pieces)
 
 

@@ -27,8 +27,6 @@ VIDEO_KB = 15.0
 """One step in LeRobot, both views as video."""
 IN_TEXT = 1.2
 """How much larger LeRobot's columns of base64 are than the PNG files in them."""
-MERGE = {"video": 2.1, "images": 3.8}
-"""What lies there while LeRobot's parts are merged, in multiples of the dataset: the parts and copies of rows too."""
 TRAJECTORY_KB, STATE_KB = 100.0, 1.2
 """A trajectory, and each step of it."""
 EPISODE_KB = 50.0
@@ -41,7 +39,7 @@ PUBLISHED = 50
 
 
 def needed_mb(config: Config) -> dict[str, float]:
-    """Folder of a run to the megabytes that it takes; ``.work`` is empty again when LeRobot's parts are merged.
+    """Folder of a run to the megabytes that it takes.
 
     Every planned episode counts as kept, and so does the clean twin of every demonstration.
     """
@@ -55,15 +53,13 @@ def needed_mb(config: Config) -> dict[str, float]:
     map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
     poses_kb = POSES_KB if "object_poses" in extras else 0.0
     shown_kb = VIDEO_KB if config.export.lerobot.frames == "video" else views * frame_kb + MOTION_KB
-    lerobot = steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
     needed_kb = {
         "trajectories": (twins + own.trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
         "frames": (views * twin_steps + own.frames * mean_steps) * frame_kb
         + (views * twin_steps + own.maps * mean_steps) * map_kb
         + steps * (poses_kb + MOTION_KB),
         "rlds": steps * (views * (frame_kb + map_kb) + poses_kb + MOTION_KB) + episodes * EPISODE_KB,
-        "lerobot": lerobot,
-        ".work": lerobot * (MERGE[config.export.lerobot.frames] - 1),
+        "lerobot": steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB,
     }
     return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
 

@@ -20,7 +20,7 @@ from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Row
-from pipeline.formats.episodes import Episodes
+from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
@@ -150,8 +150,7 @@ def _rebuild(
         return None, next(iter(rejected.values()))
     load = EpisodeLoader(plan_file, frames, settings.render)
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)
-    episode_id = row["episode_id"]
-    export(rebuilt, Episodes([episode_id], load, {episode_id: row["suite"]}, {episode_id: "regenerated"}), loop)
+    export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")
     return _Record.read(shard, 0), "kept"
 
