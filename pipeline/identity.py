@@ -47,7 +47,7 @@ lamps are changed from where changes show, and added objects that do not show ar
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
 5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
-2 of it: joint angles are held against the replay's. ``pictures``: the sheets and previews of ``summary``, the report."""
+2 of it: joint angles are held against the replay's. ``pictures``: what ``summary`` draws, and the report."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),

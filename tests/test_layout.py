@@ -21,6 +21,7 @@ from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.starts import HOME_RAD, recorded_start
 from pipeline.libero.tasks import tasks
 from pipeline.physics.environment import Environment
+from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
 from pipeline.physics.roll_out import roll_out
 from pipeline.rendering.renderer import Renderer
@@ -79,6 +80,13 @@ def test_the_level_is_the_number_of_objects() -> None:
     for level in (1, 2, 3, 4, 5):
         drawn = LayoutAxis(levels=(level,)).sample(seeding.rng(level), PLATE, 0)
         assert (drawn.level, len(drawn.objects)) == (level, level)
+
+
+def test_added_objects_are_among_what_a_rollout_met(changed: Scene) -> None:
+    reference = Reference.of(changed.model_xml, np.stack([changed.state] * 2), np.zeros((1, 7)))
+    added = [name for name in reference.poses if name.startswith("layout")]
+    assert len(added) == 3
+    assert not any(reference.held[name].any() for name in added)
 
 
 def test_a_model_comes_twice_as_often_as_in_the_test_set() -> None:

@@ -26,10 +26,11 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay, verdict
 from pipeline.planning import plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.replay import ReplayJob, replay_plan
 from pipeline.scenes.noops import NOOP_NORM, kept_actions
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Demo, Floats, RollOut, Scene, Task, Trajectory
+from pipeline.types import Demo, Floats, RollOut, Scene, Task, Trajectory, Verdict
 
 ACTIONS = st.lists(st.tuples(st.sampled_from([0.0, 5e-5, 0.3]), st.sampled_from([-1.0, 1.0])), min_size=1, max_size=30)
 
@@ -162,6 +163,17 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+def test_what_misses_once_settled_is_tracked_along_its_unsettled_replay(tmp_path: Path) -> None:
+    """Of a starter demonstration no states are recorded that could be followed instead."""
+    demos = DemosConfig(tasks=("libero_10/LIVING_ROOM_SCENE1_*",))
+    (entry,) = demos.index().entries
+    job = ReplayJob("twin", entry.demo_id, entry.sha256, "[]", "twin", demos, ReplayConfig(mode="open_loop"), tmp_path)
+    assert job() == Verdict(False, "goal_not_reached")
+    assert replace(job, config=ReplayConfig(mode="auto"))() == Verdict(True, "kept")
+    assert TrajectoryStore(tmp_path).load("twin").mode == "tracked"
+
+
 def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> None:
     environment = Environment(STOVE)
     np.random.seed(5)

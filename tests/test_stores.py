@@ -498,10 +498,12 @@ def test_states_are_those_of_the_replay_where_a_worker_was_lost_over_other_strea
     """What is stored for a lost worker has no states, and is joined with what is rendered later."""
     twin = rows[0]
     task, streams = find_task(twin.suite, twin.task), tuple(streams_of(twin.perturbations).values())
-    device = gl.choose().device
-    parts = (twin.trajectory_id, task), (twin.demo_steps, replayed, tmp_path, config.render, device)
-    RenderJob(*parts[0], streams[:1], *parts[1]).lost()
-    RenderJob(*parts[0], streams, *parts[1])()
+    job = RenderJob(
+        *(twin.trajectory_id, task, streams, twin.demo_steps),
+        *(replayed, tmp_path, config.render, gl.choose().device),
+    )
+    replace(job, streams=streams[:1]).lost()
+    job()
     made = FrameStore(tmp_path, config.render).load(twin.trajectory_id, [streams[1].stream_id])
     states = TrajectoryStore(replayed).load(twin.trajectory_id).states
     # Of a state: the time, then seven joints of the arm, then the fingers.

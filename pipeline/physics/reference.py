@@ -113,7 +113,8 @@ def _contacts(
 ) -> _Contacts:
     """Read the contacts at each of K+1 states; ``poses`` and ``places`` are those of ``Reference``."""
     steps, robot = len(partners), int(model.body("robot0_base").rootid[0])
-    free = {int(model.body(f"{name}_main").rootid[0]): name for name in poses}
+    # By the joint: bodies of added objects have names of another kind.
+    free = {int(model.body_rootid[model.joint(f"{name}_joint0").bodyid[0]]): name for name in poses}
     things = free | {int(model.body(f"{name}_main").id): name for name in places if f"{name}_main" in _roots(model)}
     regions = [name for name in places if name not in things.values()]
     busy, engaged = np.zeros(steps, bool), np.zeros(steps, bool)

@@ -66,7 +66,10 @@ class ReplayJob:
                 if (followed := _twin(edition(twin))) is not None:
                     return followed
             if demo.states is None:
-                return None
+                # The way the hand went when it was recorded, before anything settled.
+                unsettled = self.config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
+                recorded = replay(environment, demo, self.trajectory_id, unsettled)
+                return _followed(recorded)
             mask = kept_actions(demo.actions, self.config.noops)
             # The state after the last action is not recorded: as if the hand rested.
             states = np.vstack([demo.states[mask], demo.states[-1:]])
@@ -165,7 +168,11 @@ def _replay(
 @lru_cache(maxsize=1)
 def _twin(file: Edition) -> Reference | None:
     """What a twin did, if it reached its goal."""
-    trajectory = TrajectoryStore(file.path.parent).load(file.path.stem)
+    return _followed(TrajectoryStore(file.path.parent).load(file.path.stem))
+
+
+def _followed(trajectory: Trajectory) -> Reference | None:
+    """What a replay did, if it reached its goal."""
     if not trajectory.verdict.kept:
         return None
     return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
