@@ -149,5 +149,4 @@ def test_lerobots_tools_keep_the_episodes_ids(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "halves")
     seen = with_extras(IDS[3]).geometry["image"]
     for step in (0, 7):
-        assert np.array_equal(merged[step]["camera.agent.extrinsics"].reshape(4, 4), seen.extrinsics)
         assert base64.b64decode(merged[step]["camera.agent.depth"]) == seen.maps["depth"][step]
