@@ -161,27 +161,29 @@ def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
 
 
 def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
-    (table_file,) = (root / "data").rglob("*.parquet")
-    table = pq.read_table(table_file)
-    found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp")}
-    of = np.array(table["episode_index"])
-    found["action"][np.flatnonzero(of == index[CHANGED])[3], 0] += 0.001
-    # All but the last: there may be no frame behind that.
-    found["timestamp"][np.flatnonzero(of == index[LATE])[:-1]] += np.float32(1 / SCHEMA.fps_hz)
-    for name, values in found.items():
-        place = table.schema.get_field_index(name)
-        table = table.set_column(place, table.schema.field(name), pa.array(list(values), table.schema.field(name).type))
-    pq.write_table(table, table_file)
+    for file in (root / "data").rglob("*.parquet"):
+        table = pq.read_table(file)
+        found = {name: np.array(table[name].to_pylist(), np.float32) for name in ("action", "timestamp")}
+        of = np.array(table["episode_index"])
+        found["action"][np.flatnonzero(of == index[CHANGED])[3:4], 0] += 0.001
+        # All but the last: there may be no frame behind that.
+        found["timestamp"][np.flatnonzero(of == index[LATE])[:-1]] += np.float32(1 / SCHEMA.fps_hz)
+        for name, values in found.items():
+            place, field = table.schema.get_field_index(name), table.schema.field(name)
+            table = table.set_column(place, field, pa.array(list(values), field.type))
+        pq.write_table(table, file)
     provenance = root / "meta" / "provenance.parquet"
     rows = pq.read_table(provenance)
     matrices = rows.to_pylist()
     matrices[index[BLACK]][SEEN_FROM][3] += 1.0
     pq.write_table(pa.Table.from_pylist(matrices, schema=rows.schema), provenance)
-    (episodes_file,) = (root / "meta" / "episodes").rglob("*.parquet")
     key = SCHEMA.views["image"].lerobot_key
-    (row,) = (row for row in pq.read_table(episodes_file).to_pylist() if row["episode_index"] == index[BLACK])
+    episodes = [
+        row for file in (root / "meta" / "episodes").rglob("*.parquet") for row in pq.read_table(file).to_pylist()
+    ]
+    (row,) = (row for row in episodes if row["episode_index"] == index[BLACK])
     begin, end = (round(row[f"videos/{key}/{name}_timestamp"] * SCHEMA.fps_hz) for name in ("from", "to"))
-    (video_file,) = (root / "videos" / key).rglob("*.mp4")
+    video_file = root / "videos" / key / "chunk-000" / f"file-{row[f'videos/{key}/file_index']:03d}.mp4"
     with av.open(str(video_file)) as shown:
         frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
     with lerobot_video.Video(video_file) as made:

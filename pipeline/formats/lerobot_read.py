@@ -244,9 +244,11 @@ def _decoded(
     with av.open(str(root / path)) as video:
         stream = video.streams.video[0]
         for step in sampled(row["length"]):
-            at = round((row[f"videos/{key}/from_timestamp"] + step / SCHEMA.fps_hz) / float(stream.time_base or 1))
+            # By the time that stands at the step, as lerobot does.
+            at_s = row[f"videos/{key}/from_timestamp"] + table["timestamp"][step].as_py()
+            at = round(at_s / float(stream.time_base or 1))
             video.seek(at, stream=stream)
             found = next(frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at)
             if found.pts != at:
-                raise ValueError(f"{path} has no frame at {at * float(stream.time_base or 1):.3f} s")
+                raise ValueError(f"{path} has no frame at {at_s:.3f} s")
             yield (view, step), np.asarray(found.to_ndarray(format="rgb24"), np.uint8)
