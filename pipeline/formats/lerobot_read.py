@@ -62,10 +62,11 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str
     Raises:
         PipelineError: when the dataset cannot be opened.
     """
-    with _readable(root), local_only(cache):
-        # lerobot decodes through it, and each worker would print that it will go.
-        warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
-        data = LeRobotDataset(root.name, root=root, video_backend="pyav")
+    # lerobot decodes through it, and each worker would print that it will go.
+    warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
+    with _readable(root):
+        with local_only(cache):
+            data = LeRobotDataset(root.name, root=root, video_backend="pyav")
         meta = data.meta
         read: dict[str, Any] = {"fps": meta.fps, "robot_type": meta.robot_type}
         wanted: dict[str, Any] = {"fps": SCHEMA.fps_hz, "robot_type": SCHEMA.robot_type}
