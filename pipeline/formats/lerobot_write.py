@@ -105,10 +105,9 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], frames: Frames, extr
                 _link(made, root / file_path(kind, piece.number, suffix))
     tables = [pq.read_table(work / piece.path / PROVENANCE) for piece in pieces]
     pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
-    tasks = list(dict.fromkeys(task for piece in pieces for task in piece.tasks))
-    tasks.sort(key={task: number for piece in pieces for task, number in piece.tasks.items()}.__getitem__)
-    # lerobot finds a task by the table's index.
-    numbered = pd.DataFrame({"task_index": range(len(tasks))}, index=pd.Index(tasks, name="task"))
+    # In order, as numbers were given when a text first came. lerobot finds a task by the table's index.
+    tasks = {task: number for piece in pieces for task, number in piece.tasks.items()}
+    numbered = pd.DataFrame({"task_index": list(tasks.values())}, index=pd.Index(list(tasks), name="task"))
     numbered.to_parquet(root / "meta" / "tasks.parquet")
     columns = features(frames, extras)
     levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
