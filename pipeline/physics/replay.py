@@ -58,7 +58,7 @@ def replay(
     followed = reference() if config.mode == "tracked" else None
     if followed is None:
         opened = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
-        if config.mode == "open_loop" or opened.verdict.kept or refused:
+        if config.mode != "auto" or opened.verdict.kept or refused:
             return opened
         followed = reference()
         if followed is None:
