@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import threading
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -18,12 +19,14 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import REPOSITORY as REPOSITORY_FOLDER
 from conftest import dvc, rot, served
+from huggingface_hub.utils import reset_sessions
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
 from synthetic import SET, write_lerobot, write_rlds
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
 from pipeline.files import replaced
+from pipeline.formats import lerobot_read
 from pipeline.formats.registry import formats_of
 from pipeline.publish import push
 from pipeline.publish.card import REPORTS
@@ -301,6 +304,18 @@ def test_what_arrives_is_the_dataset_and_a_second_time_nothing(hub: Hub, made: P
     assert (hub.sent, hub.commits) == ([], 1)
     assert hub.files == expected(upload)
     assert set(hub.tags) == ({CODEBASE_VERSION} if kind == "lerobot" else set())
+
+
+def test_the_hub_is_in_reach_after_a_dataset_was_found_damaged(hub: Hub, data: Path, tmp_path: Path) -> None:
+    """lerobot looks on the hub for the files that a dataset lacks; ``validate`` keeps it off, and nothing else."""
+    upload = prepare(data, "rlds")
+    root = data / "lerobot" / NAME
+    shutil.rmtree(root / "meta" / "episodes")
+    reset_sessions()  # as in a process that has not spoken with the hub
+    with pytest.raises(PipelineError, match=re.escape(str(root))):
+        list(lerobot_read.check(root, tmp_path / "cache", {}, {}))
+    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    assert hub.files == expected(upload)
 
 
 def test_goes_on_after_the_network_broke(hub: Hub, made: Path) -> None:

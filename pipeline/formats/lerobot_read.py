@@ -19,6 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
+from huggingface_hub.utils import reset_sessions
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 
@@ -144,7 +145,12 @@ def local_only(cache: Path) -> Iterator[None]:
         mock.patch.object(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
     ):
         datasets.disable_progress_bars()
-        yield
+        # A session is kept for its thread and stays on or off the hub as it was made.
+        reset_sessions()
+        try:
+            yield
+        finally:
+            reset_sessions()
 
 
 def _rows(root: Path) -> dict[str, dict[str, Any]]:
