@@ -28,8 +28,8 @@ from pipeline.evaluation.simulator import Simulator  # noqa: E402
 from pipeline.evaluation.tasks import libero_states  # noqa: E402
 from pipeline.libero import bddl  # noqa: E402
 from pipeline.libero.tasks import tasks  # noqa: E402
-from pipeline.publish.seen import Look, spread  # noqa: E402
 from pipeline.rendering.renderer import Renderer  # noqa: E402
+from pipeline.report.seen import Look, spread  # noqa: E402
 from pipeline.testset import benchmark  # noqa: E402
 from pipeline.testset.benchmark import TestTask  # noqa: E402
 from pipeline.types import Task  # noqa: E402

@@ -68,7 +68,7 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 def _preview(arguments: argparse.Namespace) -> int:
     """draw what an axis does to a task: its first frame, and eleven draws over the components and levels"""
-    from pipeline.publish import preview
+    from pipeline.report import preview
 
     config = load(arguments.config)
     tasks = select_tasks([arguments.task])
@@ -124,7 +124,7 @@ def _evaluation_report(arguments: argparse.Namespace) -> int:
     Two different results of one episode are an error. The last line is JSON.
     """
     from pipeline.evaluation.results import read
-    from pipeline.publish import evaluation_report
+    from pipeline.report import evaluation_report
 
     print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
     return 0
@@ -132,7 +132,7 @@ def _evaluation_report(arguments: argparse.Namespace) -> int:
 
 def _check_oft(arguments: argparse.Namespace) -> int:
     """read a run's RLDS as OpenVLA-OFT's loader does, and print what it would train on as one line of JSON"""
-    from pipeline.validation import oft_check
+    from pipeline.clients import oft_check
 
     found = oft_check.check_run(arguments.data)
     print(json.dumps(found))
@@ -145,7 +145,7 @@ def _coverage(arguments: argparse.Namespace) -> int:
     First looks, how far the hand and the targets are moved, where objects are added, how much of a view changes, grey
     levels and words, axis by axis. The last line is JSON: number, tenth, fiftieth and ninetieth percentile of each.
     """
-    from pipeline.publish import seen
+    from pipeline.report import seen
 
     measures = seen.measure(owned(arguments.config or _chosen()), benchmark.load())
     Console().print(seen.table(measures))

@@ -1,7 +1,7 @@
 """Stage recipe: the fine-tuning recipe, and what each policy's code needs to train on the datasets as they are."""
 
+from pipeline.clients.recipe import build, write
 from pipeline.config import Config
-from pipeline.publish.recipe import build, write
 from pipeline.run import manifest
 from pipeline.run.stage import main
 

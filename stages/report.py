@@ -9,7 +9,7 @@ def run(config: Config) -> None:
     file = config.data / "report.html"
     memory = finished.of_report(config)
     if not memory.holds():
-        from pipeline.publish import pages, report
+        from pipeline.report import pages, report
         from pipeline.testset import benchmark
 
         pages.write(report.page(config, benchmark.load()), file)

@@ -34,7 +34,7 @@ def run(config: Config) -> None:
 def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
     from pipeline import gl
     from pipeline.compute.pool import runner
-    from pipeline.publish import preview, sheets
+    from pipeline.report import preview, sheets
     from pipeline.run.episode_loader import EpisodeLoader
 
     load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)

@@ -20,8 +20,8 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.formats.read_back import Copy, sampled
 from pipeline.images.jpeg import decode
-from pipeline.publish import figures
-from pipeline.publish.sheets import Tile, sheet, side_by_side
+from pipeline.report import figures
+from pipeline.report.sheets import Tile, sheet, side_by_side
 from pipeline.seeding import digest
 from pipeline.types import Scene, Trajectory, Verdict
 from pipeline.validation import checks as of_episodes

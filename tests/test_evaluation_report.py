@@ -20,7 +20,7 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import compare, mcnemar, paired
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
-from pipeline.publish import evaluation_report
+from pipeline.report import evaluation_report
 from pipeline.seeding import digest
 
 

@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from pipeline import seeding
+from pipeline.clients import oft, oft_check
 from pipeline.compute.pool import loop
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
@@ -25,7 +26,6 @@ from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
 from pipeline.types import Episode, Geometry
-from pipeline.validation import oft, oft_check
 
 NAME = "libero_tiny"
 LENGTHS = {"a": 30, "b": 8, "c": 19}

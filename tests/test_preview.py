@@ -26,9 +26,9 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.environment import Environment
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
-from pipeline.publish import preview, sheets
 from pipeline.rendering.last_scene import scene_of_process
 from pipeline.rendering.render import render
+from pipeline.report import preview, sheets
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, RollOut, Scene, Task, Trajectory, Verdict

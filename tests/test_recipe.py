@@ -23,11 +23,11 @@ import yaml
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from synthetic import IDS, REPO, episode, write_lerobot
 
+from pipeline.clients.recipe import build, check, write
+from pipeline.clients.templates.lerobot_v3 import LeRobotV3
+from pipeline.clients.templates.run_openvla_oft import read_schedule, set_optimiser
 from pipeline.errors import PipelineError
 from pipeline.formats import lerobot_read
-from pipeline.publish.recipe import build, check, write
-from pipeline.publish.templates.lerobot_v3 import LeRobotV3
-from pipeline.publish.templates.run_openvla_oft import read_schedule, set_optimiser
 
 NAME = "libero_tiny"
 SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}

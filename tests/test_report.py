@@ -26,8 +26,8 @@ from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode
 from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
-from pipeline.publish import clips, coverage, figures, pages, report, yields
-from pipeline.publish.coverage import Draw
+from pipeline.report import clips, coverage, figures, pages, report, yields
+from pipeline.report.coverage import Draw
 from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.tables import write_table

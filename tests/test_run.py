@@ -22,6 +22,7 @@ from PIL import Image
 from synthetic import records
 
 from pipeline.axes import from_json
+from pipeline.clients import oft_check
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import decode
@@ -31,7 +32,6 @@ from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.finished import FOLDER
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.validation import oft_check
 
 
 @pytest.fixture(scope="session")

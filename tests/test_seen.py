@@ -20,7 +20,7 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig, load
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.planning import plan
-from pipeline.publish import seen
+from pipeline.report import seen
 from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.stores.frame_store import FrameStore

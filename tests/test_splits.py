@@ -19,14 +19,14 @@ from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, spli
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
 
+from pipeline.clients import recipe
+from pipeline.clients.templates.lerobot_v3 import LeRobotV3
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, records
-from pipeline.publish import recipe
-from pipeline.publish.templates.lerobot_v3 import LeRobotV3
 from pipeline.run.export import export
 
 DEMOS = {episode_id: f"libero_spatial/task/demo_{number // 2}" for number, episode_id in enumerate(IDS)}

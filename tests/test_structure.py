@@ -12,9 +12,11 @@ from conftest import REPOSITORY
 FLOORS = (
     "__main__",
     "publish",
+    "report",
     "validation",
     "evaluation",
     "run",
+    "clients",
     "rendering",
     "formats",
     "physics",

@@ -21,7 +21,8 @@ from pipeline.axes.language import load_bank
 from pipeline.catalogue.objects import models
 from pipeline.episode_schema import SCHEMA, SCHEMA_FILE
 from pipeline.files import schema_file
-from pipeline.publish import card, recipe
+from pipeline.clients import recipe
+from pipeline.publish import card
 from pipeline.run import manifest
 
 assert SCHEMA.fps_hz == 20 and manifest.schema().names and load_bank() and models(("libero",))

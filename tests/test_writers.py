@@ -40,6 +40,7 @@ from synthetic import (
     write_rlds,
 )
 
+from pipeline.clients import oft
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats import lerobot as lerobot_format
@@ -49,7 +50,6 @@ from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import columns
 from pipeline.types import Episode
-from pipeline.validation import oft
 
 MIN_PSNR_DB = 36.0
 

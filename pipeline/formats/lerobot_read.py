@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
-from huggingface_hub.utils import reset_sessions
+from huggingface_hub import configure_http_backend
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 
@@ -146,11 +146,11 @@ def local_only(cache: Path) -> Iterator[None]:
     ):
         datasets.disable_progress_bars()
         # A session is kept for its thread and stays on or off the hub as it was made.
-        reset_sessions()
+        configure_http_backend()
         try:
             yield
         finally:
-            reset_sessions()
+            configure_http_backend()
 
 
 def _rows(root: Path) -> dict[str, dict[str, Any]]:

@@ -1,1 +1,1 @@
-"""What a finished run is shown and shared by: report, card, fine-tuning recipe, upload."""
+"""What is sent: the card of a dataset, what it owes to whom, and the upload."""

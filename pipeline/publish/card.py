@@ -21,7 +21,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, replaced
 from pipeline.formats.base import Format
 from pipeline.publish.attribution import attributions
-from pipeline.publish.yields import LEVELS
+from pipeline.report.yields import LEVELS
 from pipeline.run import manifest
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")

@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.clients import oft_check
 from pipeline.files import read_json
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Fault
 from pipeline.planning import plan
 from pipeline.run import manifest
-from pipeline.validation import oft_check
 
 
 def counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:

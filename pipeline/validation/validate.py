@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pipeline.clients import oft
 from pipeline.compute.pool import Run
 from pipeline.config import Config
 from pipeline.errors import PipelineError
@@ -23,7 +24,7 @@ from pipeline.rendering.last_scene import scene_of_process
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.validation import oft, run_checks
+from pipeline.validation import run_checks
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import rendered, witnesses
 

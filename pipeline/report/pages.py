@@ -8,13 +8,13 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.files import replaced
-from pipeline.publish import figures
+from pipeline.report import figures
 
 
 def render(template: str, **values: Any) -> str:
     """A page; names that ``values`` lacks are an error, and what they hold is escaped."""
     environment = Environment(
-        loader=PackageLoader("pipeline.publish"),
+        loader=PackageLoader("pipeline.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

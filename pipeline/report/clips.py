@@ -14,7 +14,7 @@ from PIL import Image
 
 from pipeline.images.jpeg import decode
 from pipeline.images.mp4 import mp4
-from pipeline.publish.sheets import MOMENT
+from pipeline.report.sheets import MOMENT
 from pipeline.types import Frame
 
 PICTURE_PX, PICTURE_QUALITY = 1100, 80

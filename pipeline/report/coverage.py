@@ -22,7 +22,7 @@ from pipeline.axes.scene import ScenePerturbation, displacements
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
-from pipeline.publish.figures import Groups, Panel, bars, histogram, scatter, strips
+from pipeline.report.figures import Groups, Panel, bars, histogram, scatter, strips
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 

@@ -18,12 +18,12 @@ from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.libero.tasks import find_task
 from pipeline.planning.streams import streams_of
-from pipeline.publish import clips, coverage, figures, pages, seen, yields
-from pipeline.publish.clips import Clip
-from pipeline.publish.coverage import AxisPlots, Draw
-from pipeline.publish.figures import Panel
-from pipeline.publish.sheets import describe
-from pipeline.publish.yields import Rows, Table
+from pipeline.report import clips, coverage, figures, pages, seen, yields
+from pipeline.report.clips import Clip
+from pipeline.report.coverage import AxisPlots, Draw
+from pipeline.report.figures import Panel
+from pipeline.report.sheets import describe
+from pipeline.report.yields import Rows, Table
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.frame_store import FrameStore

@@ -35,9 +35,9 @@ from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import first_look, roll_out
 from pipeline.planning.plan import draws_of
-from pipeline.publish.sheets import Tile, describe, sheet, side_by_side
 from pipeline.rendering.frames import frames_of
 from pipeline.rendering.last_scene import LastScene, scene_of_process
+from pipeline.report.sheets import Tile, describe, sheet, side_by_side
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task

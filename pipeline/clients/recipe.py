@@ -13,13 +13,13 @@ import numpy as np
 import pyarrow.parquet as pq
 import yaml
 
+from pipeline.clients.templates.lerobot_v3 import trained_on
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import known_to_oft
 from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats import motion_statistics
 from pipeline.formats.rlds_layout import dataset_of
-from pipeline.publish.templates.lerobot_v3 import trained_on
 
 SCHEMA_FILE = schema_file("finetune.json")
 TEMPLATES = Path(__file__).parent / "templates"

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from pipeline.clients import oft
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats import motion_statistics
-from pipeline.validation import oft
 
 SAME = 1e-9
 """Largest difference between statistics read back and those stored; both are computed in double precision."""

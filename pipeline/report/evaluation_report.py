@@ -13,9 +13,9 @@ from pipeline.evaluation.findings import FAILURES, findings
 from pipeline.evaluation.results import Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
 from pipeline.files import replaced
-from pipeline.publish import clips, figures, pages
-from pipeline.publish.figures import Panel, Share
-from pipeline.publish.yields import Cell, Table
+from pipeline.report import clips, figures, pages
+from pipeline.report.figures import Panel, Share
+from pipeline.report.yields import Cell, Table
 
 TITLES = {
     "libero_plus": "LIBERO-Plus's test tasks",
