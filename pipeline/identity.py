@@ -36,7 +36,7 @@ RECIPES: dict[Step, int] = {
     "lerobot": 5,
     "evaluation": 1,
     "checks": 2,
-    "pictures": 1,
+    "pictures": 2,
 }
 """2 of ``physics``: tracking keeps to a place until what is put there is let go; added objects show in the agent view.
 3: a stored scene names its files by package; states and actions are those of 2. 4: scenes settle before the first
@@ -47,7 +47,8 @@ lamps are changed from where changes show, and added objects that do not show ar
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
 5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
-2 of it: joint angles are held against the replay's. ``pictures``: what ``summary`` draws, and the report."""
+2 of it: joint angles are held against the replay's. ``pictures``: what ``summary`` draws, and the report.
+2 of it: a contact sheet is spread over the run, and shows other starts at the first frame."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),

@@ -21,7 +21,7 @@ from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.formats.read_back import Copy, sampled
 from pipeline.images.jpeg import decode
 from pipeline.report import figures
-from pipeline.report.sheets import Tile, sheet, side_by_side
+from pipeline.report.sheets import Tile, sheet, side_by_side, spread
 from pipeline.seeding import digest
 from pipeline.types import Scene, Trajectory, Verdict
 from pipeline.validation import checks as of_episodes
@@ -108,9 +108,11 @@ def pictures() -> dict[str, str]:
     frames = [decode(episode(IDS[0]).frames[view][0]) for view in SCHEMA.views]
     drawn = sheet("title", [Tile(side_by_side(frames, 64), f"caption {number}") for number in range(5)])
     plot = figures.histogram("title", {"camera": np.linspace(-1, 1, 50)}, np.linspace(-1, 1, 11), "action", log=True)
+    rows = [{"component": n % 2, "suite": n // 10, "level": n % 5, "task": n // 4} for n in range(40)]
     folder = Path(figures.__file__).parent / "templates"
     return {
         "sheet": hashlib.sha256(np.asarray(drawn).tobytes()).hexdigest()[:16],
+        "spread": digest([rows.index(row) for row in spread(rows, 16)])[:16],
         "plot": digest(str(plot))[:16],
         "templates": digest([(folder / name).read_text() for name in TEMPLATES])[:16],
     }

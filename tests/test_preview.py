@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -246,3 +247,22 @@ def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 def test_a_value_is_not_parted_from_its_name() -> None:
     lines = sheets._wrapped("level 3: azimuth_deg\N{NO-BREAK SPACE}12.5, elevation_deg\N{NO-BREAK SPACE}7", 120)
     assert lines == ["level 3:", "azimuth_deg 12.5,", "elevation_deg 7"]
+
+
+def test_a_sheet_of_a_large_run_shows_every_component_suite_and_level() -> None:
+    """The first sixteen rows of this plan are of one suite, one component and one task."""
+    combinations = itertools.product(range(3), range(4), range(1, 6), range(10), range(2))
+    rows = [
+        {"component": f"component {component}", "suite": f"suite {suite}", "level": level, "task": f"{suite}.{task}"}
+        for component, suite, level, task, _ in combinations
+    ]
+    shown = sheets.spread(rows, 16)
+    counts = {column: Counter(row[column] for row in shown) for column in ("component", "suite", "level", "task")}
+    assert {column: sorted(count.values()) for column, count in counts.items()} == {
+        "component": [5, 5, 6],
+        "suite": [4, 4, 4, 4],
+        "level": [3, 3, 3, 3, 4],
+        "task": [1] * 16,
+    }
+    few = sheets.spread(rows[:3], 16)
+    assert sorted(map(str, few)) == sorted(map(str, rows[:3]))

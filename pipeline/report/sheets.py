@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -11,7 +12,7 @@ from typing import Any
 from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.axes import from_json
-from pipeline.axes.base import Perturbation
+from pipeline.axes.base import Layer, Perturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Frame
@@ -29,6 +30,9 @@ PAIR_SIDE_PX = 192
 HEADER = "in each pair: the clean twin on the left, the perturbed episode on the right"
 MOMENT = 0.35
 """Share of the episode after which it is shown: the arm is in view and the objects have not been moved together yet."""
+
+SPREAD = ("component", "suite", "level", "task")
+"""Columns over which the episodes of a sheet are spread, the most important first."""
 
 
 @dataclass(frozen=True)
@@ -58,26 +62,39 @@ def draw(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], 
     with replaced(folder) as temporary:
         temporary.mkdir()
         for axis, rows in by_axis.items():
-            # One of each component in turn, so that a sheet shows them all.
-            rows = sorted(rows, key=lambda row: (_before(rows, row), row["component"]))
-            tiles = [_pair(row, load) for row in rows[: 4 * COLUMNS]]
+            tiles = [_pair(row, load) for row in spread(rows, 4 * COLUMNS)]
             sheet(f"{axis}; {HEADER}", tiles).save(temporary / f"{axis}.png")
             drawn[axis] = folder / f"{axis}.png"
     return drawn
 
 
-def _before(rows: Sequence[Mapping[str, Any]], row: Mapping[str, Any]) -> int:
-    """How many of ``rows`` that stand before ``row`` have its component."""
-    return sum(other["component"] == row["component"] for other in rows[: rows.index(row)])
+def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
+    """At most so many rows, chosen so that each component, suite, level and task is among them as often as others.
+
+    Each is the row whose component was chosen least often so far; then suite, level and task decide, then the order.
+    """
+    chosen: list[Mapping[str, Any]] = []
+    left = list(rows)
+    counts = {column: Counter[Any]() for column in SPREAD}
+    while left and len(chosen) < most:
+        row = min(left, key=lambda row: [counts[column][row[column]] for column in SPREAD])
+        left.remove(row)
+        chosen.append(row)
+        for column in SPREAD:
+            counts[column][row[column]] += 1
+    return chosen
 
 
 def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
-    """The twin and the perturbed episode beside it, at the same step."""
+    """The twin and the perturbed episode beside it, at the same moment."""
+    perturbations = from_json(row["perturbations"])
+    # The arm is back on the demonstration's path soon after another start.
+    moment = 0 if any(perturbation.layer is Layer.PHYSICS for perturbation in perturbations) else MOMENT
     shown = []
     for episode_id in (row["twin_id"], row["episode_id"]):
         frames = load(episode_id).frames["image"]
-        shown.append(decode(frames[int(MOMENT * len(frames))]))
-    changes = "; ".join(describe(perturbation) for perturbation in from_json(row["perturbations"]))
+        shown.append(decode(frames[int(moment * len(frames))]))
+    changes = "; ".join(map(describe, perturbations))
     return Tile(side_by_side(shown, PAIR_SIDE_PX), f"{row['suite']}: {changes}")
 
 
