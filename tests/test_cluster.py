@@ -136,8 +136,8 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     address = cluster((1, {}), (1, {"PYTHONPATH": str(edited)}), (2, {}), (1, other))
     # Every process has its own folder at this path.
     folder = Path("/proc/self/cwd") / "data"
-    with pytest.raises(PipelineError) as caught, runner(ComputeConfig(cluster=address), folder):
-        pass
+    with pytest.raises(PipelineError) as caught, runner(ComputeConfig(cluster=address), folder) as work:
+        work(str, [0], "none")
     message = str(caught.value)
     assert "4 of 4 workers" in message
     assert f"does not see {folder}" in message
