@@ -4,7 +4,7 @@ from pipeline.config import Config
 from pipeline.files import write_json
 from pipeline.formats import motion_statistics, registry
 from pipeline.formats.rlds_layout import by_suite
-from pipeline.run import manifest, outcome
+from pipeline.run import counts, manifest, outcome
 from pipeline.run.stage import main
 from pipeline.stores.frame_store import FrameStore
 
@@ -30,7 +30,7 @@ def run(config: Config) -> None:
         for name, members in sets.items()
     }
     write_json(data / "dataset_statistics.json", figures)
-    write_json(data / "counts.json", manifest.counts(table.to_pylist()))
+    write_json(data / "counts.json", counts.by_axis_and_suite(table.to_pylist()))
 
 
 if __name__ == "__main__":

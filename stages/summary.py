@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.config import Config
-from pipeline.run import finished, manifest
+from pipeline.run import counts, finished, manifest
 from pipeline.run.stage import main
 
 
@@ -17,7 +17,7 @@ def run(config: Config) -> None:
     from rich.console import Console
 
     console = Console()
-    console.print(manifest.counts_table(rows))
+    console.print(counts.shown(rows))
     sheets, previews = sorted((config.data / "sheets").iterdir()), sorted((config.data / "previews").iterdir())
     made = {
         "RLDS": config.data / "rlds",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Annotated, Any, Literal
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import ValidationError
-from rich.table import Table
 
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
@@ -73,7 +71,7 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
         places: episode id to where it lies in the datasets, for every kept episode.
         columns: those of ``places``.
     """
-    shared = {version_column(name): version for name, version in versions().items()}
+    own_versions = {version_column(name): version for name, version in versions().items()}
     table = []
     for row in run.rows:
         verdict = run.verdicts[row.episode_id]
@@ -87,7 +85,7 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
             resolved=replayed.get("resolved"),
             gl_device=rendered.device if rendered else None,
         )
-        table.append({**asdict(row), **asdict(result), **places.get(row.episode_id, {}), **shared})
+        table.append({**asdict(row), **asdict(result), **places.get(row.episode_id, {}), **own_versions})
     return pa.Table.from_pylist(table, schema=schema(columns))
 
 
@@ -153,57 +151,3 @@ def made_with(row: Mapping[str, Any]) -> dict[str, str]:
         for column, version in row.items()
         if column.endswith("_version")
     }
-
-
-def asked(manifest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The rows that were tried: all but the reserves that were not needed."""
-    return [row for row in manifest if row["reason"] != "reserve_not_needed"]
-
-
-def tally(manifest: Sequence[Mapping[str, Any]], column: str) -> dict[str, Counter[str]]:
-    """Axis to how often each value of a column occurs on it."""
-    found: dict[str, Counter[str]] = {}
-    for row in manifest:
-        found.setdefault(row["axis"], Counter())[row[column]] += 1
-    return found
-
-
-def counts(manifest: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, int]]]:
-    """Axis to suite to the number of episodes planned, replayed and kept.
-
-    A reserve counts as planned once it was needed, so that ``planned - kept`` is what was lost on the way.
-    """
-    table: dict[str, dict[str, dict[str, int]]] = {}
-    for row in asked(manifest):
-        cell = table.setdefault(row["axis"], {}).setdefault(row["suite"], {"planned": 0, "replayed": 0, "kept": 0})
-        cell["planned"] += 1
-        cell["replayed"] += bool(row["steps"])
-        cell["kept"] += row["kept"]
-    return table
-
-
-def counts_table(manifest: Sequence[Mapping[str, Any]]) -> Table:
-    """``counts`` as a table for people, with a line of totals."""
-    cells = counts(manifest)
-    suites = list(dict.fromkeys(row["suite"] for row in manifest))
-    table = Table(
-        "axis", *(suite.removeprefix("libero_") for suite in suites), "all", title="planned/replayed/kept episodes"
-    )
-    for cells_of in table.columns[1:]:
-        cells_of.justify, cells_of.no_wrap = "right", True
-    for axis, by_suite in cells.items():
-        shown = [by_suite.get(suite, {}) for suite in suites]
-        # A combination's name may break behind a +.
-        table.add_row(axis.replace("+", "+ "), *map(_cell, shown), _cell(_sum(shown)))
-    columns = [_sum([by_suite.get(suite, {}) for by_suite in cells.values()]) for suite in suites]
-    table.add_section()
-    table.add_row("all", *map(_cell, columns), _cell(_sum(columns)))
-    return table
-
-
-def _sum(cells: Sequence[Mapping[str, int]]) -> dict[str, int]:
-    return {name: sum(cell.get(name, 0) for cell in cells) for name in ("planned", "replayed", "kept")}
-
-
-def _cell(cell: Mapping[str, int]) -> str:
-    return "/".join(map(str, cell.values())) or "-"

@@ -12,7 +12,7 @@ from pipeline.files import read_json
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Fault
 from pipeline.planning import plan
-from pipeline.run import manifest
+from pipeline.run.counts import by_axis_and_suite
 
 
 def counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
@@ -28,7 +28,7 @@ def counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
         left = any(row["reason"] in ("reserve_not_needed", "not_replayed") for row in members)
         if kept > wanted or (kept < wanted and left):
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
-    if read_json(data / "counts.json") != manifest.counts(rows):
+    if read_json(data / "counts.json") != by_axis_and_suite(rows):
         yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
 
 
