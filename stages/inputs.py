@@ -10,10 +10,10 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 def run(config: Config) -> None:
     inputs.write(inputs.listing(config), config.data / "inputs.json")
-    TrajectoryStore(config.data / "trajectories").settle()
-    FrameStore(config.data / "frames", config.render).settle()
+    TrajectoryStore(config.data / "trajectories").notice_changes()
+    FrameStore(config.data / "frames", config.render).notice_changes()
     for one in formats_of(config.data, config.export, config.render.extras):
-        export.settle(one)
+        export.notice_changes(one)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped.
 
-Where frames are refused, it replays the reserves that take their place, as the stage replay does.
+Where frames are rejected, it replays the reserves that take their place, as the stage replay does.
 """
 
 from pipeline import gl
@@ -27,16 +27,16 @@ def run(config: Config) -> None:
     replayed = int(read_json(config.data / "replay.json")["replayed"])
     trajectories = TrajectoryStore(config.data / "trajectories")
     frames = FrameStore(config.data / "frames", config.render)
-    with runner(config.compute, config.data, gl.Shared) as workers:
+    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
         rejected: dict[str, str] | None = None
-        while (refused := rejections(rows, shown_of(frames.rows()))) != rejected:
-            rejected = refused
+        while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
+            rejected = known
             verdicts = Replays(config.demos, config.replay, trajectories.root, workers).of(rows, rejected)
             rendered = render_plan(rows, config, trajectories.root, frames.root, workers)
             frames.keep(rendered)
     trajectories.keep(verdicts)
     if further := len(verdicts) - replayed:
-        print(f"replayed {further} reserves, as frames before them were refused")
+        print(f"replayed {further} reserves, as frames before them were rejected")
     print(f"{len(rendered)} files of frames are in {frames.root}")
 
 

@@ -17,7 +17,7 @@ def run(config: Config) -> None:
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:
         verdicts = Replays(config.demos, config.replay, folder, workers).of(rows)
-    # Of the reserves, those too that the stage render replayed because frames were refused.
+    # Of the reserves, those too that the stage render replayed because frames were rejected.
     TrajectoryStore(folder).keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
     write_json(config.data / "replay.json", {"replayed": len(verdicts), "kept": kept})

@@ -39,7 +39,7 @@ def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
 
     load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
     sheets.draw(rows, load, config.data / "sheets")
-    with runner(config.compute, config.data, gl.Shared) as workers:
+    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
         preview.for_run(config, config.data / "previews", workers)
 
 

@@ -283,10 +283,10 @@ def test_the_table_no_longer_tells_of_files_that_are_gone_or_changed(trajectorie
     """DVC looks at the table alone, and starts the stage that makes the file again."""
     store, table = TrajectoryStore(trajectories), trajectories / TABLE
     before = table.read_bytes()
-    store.settle()
+    store.notice_changes()
     assert table.read_bytes() == before
     change(next(trajectories.glob("*.h5")))
-    store.settle()
+    store.notice_changes()
     assert table.read_bytes() != before
     assert not store.rows()
 

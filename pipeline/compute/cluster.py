@@ -106,7 +106,7 @@ def setup() -> dict[str, str]:
 
 
 @contextmanager
-def joined(client: Any, folder: Path) -> Iterator[Workplace]:
+def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
     """Check every worker that a Dask client has now; later ones are checked when they get their first work.
 
     Args:

@@ -13,7 +13,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
 
-from pipeline.compute.cluster import InPlace, Workplace, joined
+from pipeline.compute.cluster import InPlace, Workplace, workplace_of
 from pipeline.compute.local import local_cluster
 from pipeline.compute.progress import progress_of
 from pipeline.compute.slurm import slurm_cluster
@@ -60,7 +60,7 @@ class Expendable(Generic[Item, Result]):
         return self.fn(item)
 
 
-class Run(Protocol):
+class Workers(Protocol):
     """Apply ``fn`` to every item, in any order and place; the results come back in the order of the items.
 
     A worker that dies is replaced, and its item is done again. An item over which workers die again and again ends the
@@ -88,7 +88,7 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 @contextmanager
 def runner(
     config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None = None
-) -> Iterator[Run]:
+) -> Iterator[Workers]:
     """Yield the function that runs work on what ``config.cluster`` names. Nothing is started before there is work.
 
     With the first work comes a ``PipelineError`` when no scheduler answers, or a worker cannot work for this run.
@@ -96,7 +96,7 @@ def runner(
     Args:
         config: where to run.
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
-        opengl: for work that renders, ``gl.Shared``: gives what each local worker calls with its number.
+        opengl: for work that renders, ``gl.WorkerSetup``: gives what each local worker calls with its number.
     """
     if config.cluster == "loop":
         yield loop
@@ -139,7 +139,7 @@ def _started(
     elif config.cluster == "slurm":
         with slurm_cluster(config, folder) as cluster, Client(cluster) as client:
             client.wait_for_workers(1)
-            with joined(client, folder) as workplace:
+            with workplace_of(client, folder) as workplace:
                 # Jobs that end are asked for again; they may wait in the queue for hours.
                 yield _Workers(client, workplace, partial(cluster.scale, config.workers), patience_s=inf)
     else:
@@ -151,7 +151,7 @@ def _started(
                 where=config.cluster,
                 remedy="start one, or set compute.cluster: local",
             ) from error
-        with client, joined(client, folder) as workplace:
+        with client, workplace_of(client, folder) as workplace:
             yield _Workers(client, workplace)
 
 

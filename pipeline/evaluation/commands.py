@@ -151,7 +151,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     evaluation = Evaluation(settings, config, config.identity(), arguments.out, **given("videos", "archive"))
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
-    with runner(compute, arguments.out, gl.Shared) as run:
+    with runner(compute, arguments.out, gl.WorkerSetup) as run:
         found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
     return 0

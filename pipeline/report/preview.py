@@ -23,7 +23,7 @@ from pipeline.axes import (
     PhysicsPerturbation,
     of_layer,
 )
-from pipeline.compute.pool import Run
+from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
@@ -176,7 +176,7 @@ def draw(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
     return sheet(f"{demo.demo_id}, first state; axis {name}, seed {seed}; {', '.join(views)}", tiles)
 
 
-def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
+def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:
     """Draw every configured axis that applies on the first task of each suite that the run is about.
 
     Returns:
@@ -189,7 +189,7 @@ def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
     with replaced(folder) as temporary:
         jobs = [(tasks, config, temporary / suite, test) for suite, tasks in by_suite.items()]
         try:
-            run(_draw_all, jobs, "previews")
+            workers(_draw_all, jobs, "previews")
         finally:
             scene_of_process().close()
     return {suite: folder / suite for suite in by_suite}

@@ -19,7 +19,7 @@ from pipeline.axes import Axes
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.catalogue.scene_files import portable
-from pipeline.compute.pool import Run
+from pipeline.compute.pool import Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.identity import refuse_unasked
 from pipeline.libero import hdf5
@@ -62,7 +62,7 @@ class Expansion:
     short: dict[str, int] = field(default_factory=dict)
 
 
-def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSet, run: Run) -> Expansion:
+def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSet, workers: Workers) -> Expansion:
     """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
     Every candidate is a demonstration whose arm starts elsewhere and, where the task moves an object, whose target
@@ -77,7 +77,7 @@ def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSe
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     result = Expansion()
     while True:
-        verdicts = Replays(demos, REPLAY, store.root, run).of(rows)
+        verdicts = Replays(demos, REPLAY, store.root, workers).of(rows)
         outcome = plan.select(rows, verdicts)
         kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
         faults = _faults(kept, rows, store)

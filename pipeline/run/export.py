@@ -14,7 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.compute.pool import Run, runner
+from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
@@ -68,7 +68,7 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
     )[:16]
 
 
-def asked(target: AnyFormat, episodes: Episodes) -> str:
+def request(target: AnyFormat, episodes: Episodes) -> str:
     """A short digest of what of it was asked for: the episodes with all that they are, and the options."""
     content = [known.content for known in episodes.known.values()]
     return digest(target.options.model_dump(mode="json"), target.extras, content)[:16]
@@ -80,7 +80,7 @@ def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
         record = target.record()
     except PipelineError:
         return Counter()
-    if record.asked != asked(target, episodes) or record.identity == identity(target, episodes):
+    if record.asked != request(target, episodes) or record.identity == identity(target, episodes):
         return Counter()
     return Counter({f"files, made with {differences(record.made_with, _made_with(target))}": len(record.files)})
 
@@ -111,7 +111,7 @@ def untouched(target: AnyFormat) -> bool:
         return False
 
 
-def settle(target: AnyFormat) -> None:
+def notice_changes(target: AnyFormat) -> None:
     """Where files of a finished dataset are gone or have changed, have it count as not there."""
     if not target.record_file.exists() or untouched(target):
         return
@@ -125,16 +125,16 @@ def settle(target: AnyFormat) -> None:
         target.record_file.unlink()
 
 
-def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
+def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     """Write a dataset, replacing the one before, and go on where a killed call with the same episodes was.
 
-    The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``run``, and not
-    on how often the work was interrupted.
+    The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``workers``, and
+    not on how often the work was interrupted.
 
     Args:
         target: the format.
         episodes: what to write.
-        run: spreads the work; one call for each piece.
+        workers: do the work; one call for each piece.
 
     Raises:
         PipelineError: when an episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that
@@ -145,16 +145,16 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     keep_only(target.work, {work.name})
     finished = work / "record.json"
     if not finished.is_file():
-        _write_pieces(target, work, pieces, episodes.load, run)
+        _write_pieces(target, work, pieces, episodes.load, workers)
         # In a worker, which has the format's packages loaded already.
-        (places,) = run(_Assembly(target, work), [pieces], f"{target.title} assembly")
+        (places,) = workers(_Assembly(target, work), [pieces], f"{target.title} assembly")
         dataset = work / "dataset"
         sync(dataset)
         paths = sorted(file for file in dataset.rglob("*") if file.is_file())
-        checksums = run(checksum, paths, f"{target.title} checksums")
+        checksums = workers(checksum, paths, f"{target.title} checksums")
         files = {path.relative_to(dataset).as_posix(): sha256 for path, sha256 in zip(paths, checksums, strict=True)}
         with replaced(finished) as temporary:
-            record = Export(work.name, files, places, asked(target, episodes), _made_with(target))
+            record = Export(work.name, files, places, request(target, episodes), _made_with(target))
             temporary.write_text(json.dumps(asdict(record), indent=0) + "\n")
     target.record_file.unlink(missing_ok=True)  # It is about the dataset before.
     if (work / "dataset").is_dir():
@@ -164,14 +164,14 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     _clear_work(target)
 
 
-def _write_pieces(target: AnyFormat, work: Path, pieces: Sequence[Piece], load: Load, run: Run) -> None:
+def _write_pieces(target: AnyFormat, work: Path, pieces: Sequence[Piece], load: Load, workers: Workers) -> None:
     paths = {work / piece.path: piece for piece in pieces}
     whole = {path for path in paths if path.exists()}
     keep_below(work, whole)
     for folder in {path.parent for path in paths}:
         folder.mkdir(parents=True, exist_ok=True)
     todo = [(path, piece) for path, piece in paths.items() if path not in whole]
-    run(_PieceJob(target, load), todo, f"{target.title} pieces")
+    workers(_PieceJob(target, load), todo, f"{target.title} pieces")
 
 
 @dataclass(frozen=True)

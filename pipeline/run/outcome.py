@@ -69,7 +69,7 @@ def replayed(
     store = TrajectoryStore(folder)
     trajectories = store.rows()
     needed = plan.pending(rows, verdicts_of(trajectories), rejected)
-    # What takes the place of refused frames, only the stage render replays.
+    # What takes the place of rejected frames, only the stage render replays.
     _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline import gl
-from pipeline.compute.pool import Expendable, Run
+from pipeline.compute.pool import Expendable, Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row, select
@@ -46,7 +46,7 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
     return [portion for portion in wanted if portion]
 
 
-def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, run: Run) -> set[str]:
+def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, workers: Workers) -> set[str]:
     """Render the streams of every kept episode that ``folder`` does not hold yet.
 
     Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing that
@@ -86,7 +86,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
         jobs = [RenderJob(*portion, trajectories, folder, config.render, device) for portion in in_turn]
         work = Expendable(RenderJob.__call__, RenderJob.limit_s, RenderJob.lost, RenderJob.frames_at_most)
         try:
-            run(work, jobs, "render, frames")
+            workers(work, jobs, "render, frames")
         finally:
             scene_of_process().close()
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.compute.pool import Expendable, Run
+from pipeline.compute.pool import Expendable, Workers
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.planning.plan import Row, pending
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
@@ -20,13 +20,13 @@ class Replays:
     Attributes:
         demos, config: sections of the run's configuration.
         folder: of the trajectory store.
-        run: where the work is done.
+        workers: do the work.
     """
 
     demos: DemosConfig
     config: ReplayConfig
     folder: Path
-    run: Run
+    workers: Workers
 
     def of(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
         """Have what a plan needs in the store; reserves only where a candidate failed.
@@ -64,5 +64,5 @@ class Replays:
         # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
         in_turn = sorted(map(row_of.__getitem__, missing), key=lambda row: row.demo_id)
         jobs = [ReplayJob(row, twin_of[row.demo_id], self.demos, self.config, self.folder) for row in in_turn]
-        judged = self.run(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
+        judged = self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
         return {job.row.trajectory_id: verdict for job, verdict in zip(jobs, judged, strict=True)}

@@ -169,7 +169,7 @@ class Store:
         """Whether the table tells of every file that is there, and none has changed since."""
         return self._rows()[1]
 
-    def settle(self) -> None:
+    def notice_changes(self) -> None:
         """Where files are gone or have changed since the table was written, have it tell so."""
         if (self.root / TABLE).exists() and self._believed()[1]:
             self.refresh()
