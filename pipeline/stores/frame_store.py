@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.identity import fingerprint, made_with
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
@@ -28,14 +27,6 @@ from pipeline.types import Geometry, Rendered
 
 _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 """The schema's parts that say what files of a store hold."""
-
-_COLUMNS = {
-    "device": pa.string(),
-    "replay_mode": pa.string(),
-    "steps": pa.int64(),
-    "streams": pa.list_(pa.string()),
-    "rejected": pa.string(),
-}
 
 
 @dataclass(frozen=True)
@@ -67,12 +58,28 @@ class FrameStore(Store):
         config: how frames are encoded; what was encoded otherwise counts as missing.
     """
 
+    step, stage, pattern = "encoding", "render", "*/*.h5"
+    columns: ClassVar = {
+        "device": pa.string(),
+        "replay_mode": pa.string(),
+        "steps": pa.int64(),
+        "streams": pa.list_(pa.string()),
+        "rejected": pa.string(),
+    }
+
     def __init__(self, root: Path, config: RenderConfig):
         shown = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        settings = config.model_dump(mode="json")
-        made_by = fingerprint("encoding", settings, shown)
-        here = {**made_with("encoding"), "episode schema": digest(shown)[:8]}
-        super().__init__(root, made_by, here, settings, "render", _COLUMNS, _describe, files="*/*.h5")
+        super().__init__(root, config.model_dump(mode="json"), {"episode schema": shown})
+
+    @staticmethod
+    def describe(file: SealedFile) -> dict[str, Any]:
+        return {
+            "device": file.attributes["device"],
+            "replay_mode": file.attributes["replay_mode"],
+            "steps": file.length("action"),
+            "streams": file.groups("streams"),
+            "rejected": file.attributes["rejected"],
+        }
 
     def folder(self, trajectory_id: str) -> Path:
         return self.root / trajectory_id
@@ -149,7 +156,7 @@ class FrameStore(Store):
         for name in self._files_of(trajectory_id):
             try:
                 with self.opened(name) as file:
-                    row = _describe(file)
+                    row = self.describe(file)
                     here = missing & stream_ids(row) if row["device"] == device else set()
                     if here:
                         frames = here & set(row["streams"])
@@ -251,13 +258,3 @@ def _frames(file: SealedFile, stream: str) -> list[bytes]:
     packed = file.array(f"{stream}/bytes").tobytes()
     ends = file.array(f"{stream}/ends").tolist()
     return [packed[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
-
-
-def _describe(file: SealedFile) -> dict[str, Any]:
-    return {
-        "device": file.attributes["device"],
-        "replay_mode": file.attributes["replay_mode"],
-        "steps": file.length("action"),
-        "streams": file.groups("streams"),
-        "rejected": file.attributes["rejected"],
-    }

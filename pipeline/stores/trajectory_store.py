@@ -4,25 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
 
 from pipeline.catalogue.scene_files import located, portable
-from pipeline.identity import fingerprint, made_with
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
 from pipeline.types import Scene, Trajectory, Verdict
-
-_COLUMNS = {
-    "kept": pa.bool_(),
-    "reason": pa.string(),
-    "mode": pa.string(),
-    "steps": pa.int64(),
-    "resolved": pa.string(),
-}
 
 
 class TrajectoryStore(Store):
@@ -34,8 +24,24 @@ class TrajectoryStore(Store):
     A file holds no path of the machine, so that it is the same, and can be read, wherever the packages are installed.
     """
 
-    def __init__(self, root: Path):
-        super().__init__(root, fingerprint("physics"), made_with("physics"), None, "render", _COLUMNS, _describe)
+    step, stage = "physics", "render"
+    columns: ClassVar = {
+        "kept": pa.bool_(),
+        "reason": pa.string(),
+        "mode": pa.string(),
+        "steps": pa.int64(),
+        "resolved": pa.string(),
+    }
+
+    @staticmethod
+    def describe(file: SealedFile) -> dict[str, Any]:
+        return {
+            "kept": file.attributes["kept"],
+            "reason": file.attributes["reason"],
+            "mode": file.attributes["mode"],
+            "steps": file.length("actions"),
+            "resolved": file.attributes["resolved"],
+        }
 
     def save(self, trajectory: Trajectory) -> None:
         attributes = {
@@ -82,13 +88,3 @@ class TrajectoryStore(Store):
 def verdicts_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Verdict]:
     """Trajectory id to verdict, from the rows of the table."""
     return {trajectory_id: Verdict(row["kept"], row["reason"]) for trajectory_id, row in rows.items()}
-
-
-def _describe(file: SealedFile) -> dict[str, Any]:
-    return {
-        "kept": file.attributes["kept"],
-        "reason": file.attributes["reason"],
-        "mode": file.attributes["mode"],
-        "steps": file.length("actions"),
-        "resolved": file.attributes["resolved"],
-    }
