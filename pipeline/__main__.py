@@ -105,11 +105,12 @@ def _expand(arguments: argparse.Namespace) -> int:
     reach the goal in LIBERO's own HDF5 layout (states, actions and scenes; no images). They are marked as expanded in
     the files and in every dataset made from them.
     """
-    from pipeline.run.expand import expand
+    from pipeline.run.expand import candidates, expand
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
-    with runner(ComputeConfig(), arguments.out) as run:
-        made = expand(arguments.out, demos, arguments.per_task, arguments.seed, benchmark.load(), run)
+    rows = candidates(demos, arguments.per_task, arguments.seed, benchmark.load())
+    with runner(ComputeConfig(), arguments.out) as workers:
+        made = expand(arguments.out, demos, rows, arguments.per_task, workers)
     print(
         f"{made.written} demonstrations in {len(made.files)} files: set demos.source: hdf5 and {arguments.out} as root"
     )
