@@ -19,15 +19,12 @@ def run(config: Config) -> None:
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 
-    rows = {row.episode_id: row for row in episodes.rows}
-    frames = FrameStore(data / "frames", config.render)
-    motions = {
-        name: frames.motion(name) for name in dict.fromkeys(rows[episode].trajectory_id for episode in episodes.kept)
-    }
-    sets = by_suite(episodes.kept, {episode: row.suite for episode, row in rows.items()}, config.export.rlds.name)
+    frames, row_of = FrameStore(data / "frames", config.render), episodes.row_of
+    motions = {name: frames.motion(name) for name in {row_of[episode].trajectory_id for episode in episodes.kept}}
+    suites = {episode: row.suite for episode, row in row_of.items()}
     figures = {
-        name: motion_statistics.openvla([motions[rows[episode].trajectory_id] for episode in members])
-        for name, members in sets.items()
+        name: motion_statistics.openvla([motions[row_of[episode].trajectory_id] for episode in members])
+        for name, members in by_suite(episodes.kept, suites, config.export.rlds.name).items()
     }
     write_json(data / "dataset_statistics.json", figures)
     write_json(data / "counts.json", counts.by_axis_and_suite(table.to_pylist()))

@@ -281,15 +281,12 @@ def _result(outcome: Result | Exception) -> Result:
     from distributed import KilledWorker
 
     if isinstance(outcome, KilledWorker):
-        raise _killed(outcome)
+        raise PipelineError(
+            f"one piece of work ended {outcome.allowed_failures + 1} workers",
+            where=f"the last was {outcome.last_worker.address}",
+            expected="workers that live: the system may have ended them because memory ran out",
+            remedy=f"see the system's log, use fewer workers, and {GO_ON}",
+        )
     if isinstance(outcome, Exception):
         raise outcome
     return outcome
-
-
-def _killed(error: Any) -> PipelineError:
-    return PipelineError(
-        f"one piece of work ended {error.allowed_failures + 1} workers, the last on {error.last_worker.address}",
-        expected="workers that live: the system may have ended them because memory ran out",
-        remedy=f"see the system's log, use fewer workers, and {GO_ON}",
-    )

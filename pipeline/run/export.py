@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -44,10 +45,9 @@ def export_run(target: Format[Any], config: Config) -> None:
 def kept_episodes(config: Config) -> Episodes:
     """The kept episodes of a run, in the order they are written."""
     run = outcome.read(config)
-    rows, contents = {row.episode_id: row for row in run.rows}, run.contents()
-    known = {}
+    contents, known = run.contents(), {}
     for episode_id in run.kept:
-        row = rows[episode_id]
+        row = run.row_of[episode_id]
         steps = run.trajectories[row.trajectory_id]["steps"]
         known[episode_id] = Known(row.suite, contents[episode_id], row.demo_id, row.instruction, steps)
     return Episodes(known, EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render))
@@ -147,7 +147,7 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, workers)
         # In a worker, which has the format's packages loaded already.
-        (places,) = workers(_Assembly(target, work), [pieces], f"{target.title} assembly")
+        (places,) = workers(partial(_assembled, target, work), [pieces], f"{target.title} assembly")
         dataset = work / "dataset"
         sync(dataset)
         paths = sorted(file for file in dataset.rglob("*") if file.is_file())
@@ -171,29 +171,19 @@ def _write_pieces(target: AnyFormat, work: Path, pieces: Sequence[Piece], load: 
     for folder in {path.parent for path in paths}:
         folder.mkdir(parents=True, exist_ok=True)
     todo = [(path, piece) for path, piece in paths.items() if path not in whole]
-    workers(_PieceJob(target, load), todo, f"{target.title} pieces")
+    workers(partial(_write_piece, target, load), todo, f"{target.title} pieces")
 
 
-@dataclass(frozen=True)
-class _PieceJob:
-    target: AnyFormat
-    load: Load
-
-    def __call__(self, todo: tuple[Path, Piece]) -> None:
-        path, piece = todo
-        with replaced(path) as temporary:
-            self.target.write_piece(temporary, piece, self.load)
+def _write_piece(target: AnyFormat, load: Load, todo: tuple[Path, Piece]) -> None:
+    path, piece = todo
+    with replaced(path) as temporary:
+        target.write_piece(temporary, piece, load)
 
 
-@dataclass(frozen=True)
-class _Assembly:
-    target: AnyFormat
-    work: Path
-
-    def __call__(self, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
-        # Without what a worker made that was lost in the middle of it.
-        keep_below(self.work, {self.work / piece.path for piece in pieces})
-        return self.target.assemble(self.work, pieces)
+def _assembled(target: AnyFormat, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
+    # Without what a worker made that was lost in the middle of it.
+    keep_below(work, {work / piece.path for piece in pieces})
+    return target.assemble(work, pieces)
 
 
 def _clear_work(target: AnyFormat) -> None:

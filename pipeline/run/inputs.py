@@ -6,8 +6,6 @@ the list: a changed file is noticed, and the same list runs nothing again.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.config import Config
-from pipeline.files import replaced
+from pipeline.files import checksum
 
 HASHED_BYTES = 16_000_000
 """Files up to this size are listed by their content; larger ones by size and time of change, as hashing takes long."""
@@ -32,11 +30,6 @@ def listing(config: Config) -> dict[str, list[str | int]]:
         for field, path in _paths(dict(config))
         for file in sorted(_files(path))
     }
-
-
-def write(listed: Mapping[str, list[str | int]], path: Path) -> None:
-    with replaced(path) as temporary:
-        temporary.write_text(json.dumps(listed, indent=0) + "\n")
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:
@@ -68,5 +61,5 @@ def _files(path: Path) -> Iterator[Path]:
 def _state(file: Path) -> list[str | int]:
     status = file.stat()
     if status.st_size <= HASHED_BYTES:
-        return [hashlib.sha256(file.read_bytes()).hexdigest()]
+        return [checksum(file)]
     return [status.st_size, status.st_mtime_ns]

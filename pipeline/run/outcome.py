@@ -40,17 +40,19 @@ class Outcome:
         ids = [row.episode_id for row in self.rows if self.verdicts[row.episode_id].kept]
         return sorted(ids, key=lambda episode_id: digest("order", episode_id))
 
+    @cached_property
+    def row_of(self) -> dict[str, plan.Row]:
+        """Episode id to its row of the plan."""
+        return {row.episode_id: row for row in self.rows}
+
     def contents(self) -> dict[str, str]:
         """Kept episode id to a short name of its content: equal names, equal bytes in a dataset."""
-        rows = {row.episode_id: row for row in self.rows}
-        return {
-            episode_id: digest(asdict(rows[episode_id]), *self._made_by(rows[episode_id]))[:16]
-            for episode_id in self.kept
-        }
-
-    def _made_by(self, row: plan.Row) -> tuple[object, ...]:
-        frames = self.frames[row.trajectory_id]
-        return frames.made_by, frames.device, frames.replay_mode
+        named = {}
+        for episode_id in self.kept:
+            row = self.row_of[episode_id]
+            frames = self.frames[row.trajectory_id]
+            named[episode_id] = digest(asdict(row), frames.made_by, frames.device, frames.replay_mode)[:16]
+        return named
 
 
 def replayed(

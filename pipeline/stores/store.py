@@ -146,8 +146,12 @@ class Store(ABC):
 
     def row(self, name: str) -> dict[str, Any] | None:
         """One row, read from the file; None when that is missing, damaged or not current."""
-        path = self.path(name)
-        return self._read(name, path.stat().st_size) if path.exists() else None
+        try:
+            with self.opened(name) as file:
+                described = self.describe(file)
+        except PipelineError:
+            return None
+        return {"file": name, "made_by": self.made_by, "bytes": self.path(name).stat().st_size, **described}
 
     def _table(self) -> tuple[dict[str, dict[str, Any]], int]:
         """The rows that were written last, and when; none when the table is missing or damaged."""
@@ -157,14 +161,6 @@ class Store(ABC):
             return {row["file"]: row for row in table.to_pylist()}, path.stat().st_mtime_ns
         except PipelineError:
             return {}, 0
-
-    def _read(self, name: str, size: int) -> dict[str, Any] | None:
-        try:
-            with self.opened(name) as file:
-                described = self.describe(file)
-        except PipelineError:
-            return None
-        return {"file": name, "made_by": self.made_by, "bytes": size, **described}
 
     def untouched(self) -> bool:
         """Whether the table tells of every file that is there, and none has changed since."""
