@@ -37,7 +37,7 @@ def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
     from pipeline.report import preview, sheets
     from pipeline.run.episode_loader import EpisodeLoader
 
-    load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
+    load = EpisodeLoader(config.data, config.render)
     sheets.draw(rows, load, config.data / "sheets")
     with runner(config.compute, config.data, gl.WorkerSetup) as workers:
         preview.for_run(config, config.data / "previews", workers)

@@ -161,7 +161,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     render_plan(rows, config, data / "trajectories", data / "frames", loop)
     outcome = plan.select(rows, judged)
     kept = [row for row in rows if outcome[row.episode_id].kept]
-    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    load = EpisodeLoader(data, config.render)
     known = {
         row.episode_id: Known(row.suite, "", row.demo_id, row.instruction, len(load(row.episode_id))) for row in kept
     }
@@ -174,7 +174,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cases(data: Path) -> list[Case]:
     """Every episode, as the store and both datasets have it."""
     config = Config.model_validate_json((data / "config.json").read_text())
-    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    load = EpisodeLoader(data, config.render)
     rows = {row.episode_id: vars(row) for row in plan.read(data / "plan.parquet")}
     formats = formats_of(data, config.export, config.render.extras)
     places: dict[str, dict[str, Any]] = {}

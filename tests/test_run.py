@@ -40,7 +40,7 @@ def rows(finished: Path) -> list[dict[str, Any]]:
 
 
 def loader(data: Path) -> EpisodeLoader:
-    return EpisodeLoader(data / "plan.parquet", data / "frames", RenderConfig())
+    return EpisodeLoader(data, RenderConfig())
 
 
 def test_every_planned_episode_is_accounted_for(finished: Path, rows: list[dict[str, Any]]) -> None:

@@ -55,7 +55,7 @@ def page(config: Config, test: TestSet) -> str:
     data = config.data
     rows: Rows = manifest.read(data / "manifest.parquet")
     leakage = read_json(data / "leakage.json")
-    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    load = EpisodeLoader(data, config.render)
     tried = counts.tried(rows)
     kept = [row for row in tried if row["kept"]]
     if not kept:

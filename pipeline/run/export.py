@@ -50,7 +50,7 @@ def kept_episodes(config: Config) -> Episodes:
         row = run.row_of[episode_id]
         steps = run.trajectories[row.trajectory_id]["steps"]
         known[episode_id] = Known(row.suite, contents[episode_id], row.demo_id, row.instruction, steps)
-    return Episodes(known, EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render))
+    return Episodes(known, EpisodeLoader(config.data, config.render))
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:

@@ -120,11 +120,11 @@ def _rebuild(
             where=row["demo_id"],
             expected=f"content with the hash {row['demo_sha256']}",
         )
-    plan_file, trajectories, frames = out / "plan.parquet", out / "trajectories", out / "frames"
+    trajectories, frames = out / "trajectories", out / "frames"
     planned, planned_twin = (
         plan.Row(**{column.name: each[column.name] for column in fields(plan.Row)}) for each in (row, twin)
     )
-    plan.write([planned], plan_file)
+    plan.write([planned], out / "plan.parquet")
 
     def replay(each: plan.Row) -> Verdict:
         return ReplayJob(each, planned_twin.trajectory_id, demos, settings.replay, trajectories)()
@@ -139,7 +139,7 @@ def _rebuild(
     RenderJob(planned, streams, trajectories, frames, settings.render, gl.choose().device)()
     if rejected := shown_of(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected:
         return None, next(iter(rejected.values()))
-    load = EpisodeLoader(plan_file, frames, settings.render)
+    load = EpisodeLoader(out, settings.render)
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)
     export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")

@@ -163,7 +163,7 @@ class EpisodesJob:
         results.note("readable", unreadable)
         language = self.config.plan.axes.language
         try:
-            made = EpisodeLoader(self.data / "plan.parquet", self.data / "frames", self.config.render)(episode_id)
+            made = EpisodeLoader(self.data, self.config.render)(episode_id)
             trajectory = TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"])
         except PipelineError as error:
             results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])
