@@ -265,8 +265,15 @@ def select(
 def _verdicts(
     rows: Iterable[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None
 ) -> Iterator[tuple[Row, Verdict | None]]:
-    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed."""
-    for group in _groups(rows):
+    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
+
+    The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
+    """
+    quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        quotas[row.axis, row.suite, row.task].append(row)
+    for quota in quotas.values():
+        group = sorted(quota, key=lambda row: row.rank)
         need = sum(row.wanted for row in group)
         for row in group:
             verdict = verdicts.get(row.trajectory_id)
@@ -277,11 +284,3 @@ def _verdicts(
             # Until it is known, it is hoped for.
             need -= verdict is None or verdict.kept
             yield row, verdict
-
-
-def _groups(rows: Iterable[Row]) -> list[list[Row]]:
-    """Rows that fill one quota: the twins and each axis or combination, task by task, in order of rank."""
-    groups: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[row.axis, row.suite, row.task].append(row)
-    return [sorted(group, key=lambda row: row.rank) for group in groups.values()]

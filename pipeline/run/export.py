@@ -19,7 +19,7 @@ from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
+from pipeline.files import checksum, keep_below, put_in_place, remove, remove_if_empty, replaced, sync
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
@@ -142,7 +142,7 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     """
     pieces = target.pieces(episodes)
     work = target.work / identity(target, episodes)
-    keep_only(target.work, {work.name})
+    keep_below(target.work, {work})
     finished = work / "record.json"
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, workers)

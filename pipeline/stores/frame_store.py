@@ -157,7 +157,8 @@ class FrameStore(Store):
             try:
                 with self.opened(name) as file:
                     row = self.describe(file)
-                    here = missing & stream_ids(row) if row["device"] == device else set()
+                    told = {*row["streams"], *json.loads(row["rejected"])}
+                    here = missing & told if row["device"] == device else set()
                     if here:
                         frames = here & set(row["streams"])
                         part = _rendered(file, frames, {streams[stream] for stream in frames})
@@ -196,11 +197,6 @@ class FrameStore(Store):
 def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
     """Of the file that holds these streams of a trajectory, or says that they were rejected."""
     return f"{trajectory_id}/{digest(*sorted(streams))[:16]}"
-
-
-def stream_ids(row: Mapping[str, Any]) -> set[str]:
-    """The streams that a row of the table accounts for: rendered, or rejected."""
-    return {*row["streams"], *json.loads(row["rejected"])}
 
 
 def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
