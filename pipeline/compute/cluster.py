@@ -55,15 +55,15 @@ class Workplace:
         global _entered
         if _entered == self:
             return
-        if faults := self.faults():
+        from distributed import get_worker
+
+        if faults := self.faults(get_worker()):
             raise _refusal(f"worker on {platform.node()}", faults)
         _forget()
         _entered = self
 
-    def faults(self) -> list[str]:
-        """In a worker: why it cannot work for the run."""
-        from distributed import get_worker
-
+    def faults(self, dask_worker: Any) -> list[str]:
+        """In a worker, which Dask fills in by the argument's name: why it cannot work for the run."""
         found = []
         if not (self.token.is_file() and self.folder.is_dir()):
             found.append(f"does not see {self.token.parent}, or another folder lies at that path there")
@@ -71,7 +71,7 @@ class Workplace:
         for name, version_of_run in self.setup.items():
             if here.get(name) != version_of_run:
                 found.append(f"has {name} {here.get(name, 'not installed')}, the run has {version_of_run}")
-        if (threads := get_worker().state.nthreads) != 1:
+        if (threads := dask_worker.state.nthreads) != 1:
             found.append(f"runs {threads} threads, and the simulator needs a process for itself")
         return found
 
