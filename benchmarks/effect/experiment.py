@@ -109,7 +109,11 @@ class Experiment(Frozen):
 
     def dataset_name(self, arm: str) -> str:
         """Says what a dataset is made from, so that another configuration makes another."""
-        made_from = self.run.model_dump(mode="json", exclude={"compute"}), self.demonstrations, self.arms[arm]
+        made_from = (
+            self.run.model_dump(mode="json", exclude={"compute", "folder"}, by_alias=True),
+            self.demonstrations,
+            self.arms[arm],
+        )
         return f"{arm}_{digest(*made_from, self.frame_px)[:8]}"
 
     def policy_name(self, arm: str, seed: int) -> str:
