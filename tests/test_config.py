@@ -12,7 +12,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
-from pipeline.__main__ import config_schema, schemas
+from pipeline.commands.develop import config_schema, schemas
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.export_config import Where

@@ -97,7 +97,8 @@ def asked(target: AnyFormat, episodes: Episodes) -> str:
 
 def _options(target: AnyFormat) -> dict[str, Any]:
     """By the names that the fields had when they were first written."""
-    return target.options.model_dump(mode="json", by_alias=True)
+    dumped: dict[str, Any] = target.options.model_dump(mode="json", by_alias=True)
+    return dumped
 
 
 def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
