@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -33,7 +34,9 @@ def parser() -> argparse.ArgumentParser:
         description=DESCRIPTION,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    commands = top.add_subparsers(required=True, metavar="COMMAND", help=argparse.SUPPRESS, parser_class=LazyParser)
+    commands = top.add_subparsers(
+        required=True, metavar="COMMAND", help=argparse.SUPPRESS, parser_class=LazyParser, prog=top.prog
+    )
     families = []
     for family in FAMILIES:
         others = set(commands.choices)
@@ -47,7 +50,12 @@ def parser() -> argparse.ArgumentParser:
 def main() -> int:
     def run() -> int:
         arguments = parser().parse_args()
-        return int(arguments.run(arguments))
+        try:
+            return int(arguments.run(arguments))
+        except BrokenPipeError:
+            # Who reads the output, such as `head`, has enough. Nothing must be written to it when Python ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 0
 
     return exit_status(run)
 

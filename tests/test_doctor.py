@@ -117,7 +117,7 @@ def test_the_twins_of_all_demonstrations_take_room() -> None:
     """Also where fewer episodes are wanted than there are demonstrations."""
     config = load(REPOSITORY / "configs" / "starter.yaml")
     many = config.demos.model_copy(update={"tasks": ("libero_goal/*", "libero_10/*")})
-    one = PlanConfig.model_validate({"seed": 1, "axes": {"noise": {}}, "episodes": {"noise": 1}})
+    one = PlanConfig.model_validate({"episodes": {"noise": 1}, "reserve": 0.0})
     rows = plan.make(many.index().entries, one, config.replay, TestSet(()))
     steps = sum(row.demo_steps for row in rows)
     assert (len(rows), steps > 4000) == (21, True)

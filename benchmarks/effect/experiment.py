@@ -95,7 +95,7 @@ class Experiment(Frozen):
         if self.demonstrations is not None and self.run.demos.root is None:
             raise ValueError(f"demonstrations: {self.data} has no demos.root to make them in")
         if self.run.export.lerobot is None or self.run.export.lerobot.frames != "images":
-            raise ValueError(f"{self.data} has no export.lerobot.frames: images; write that there")
+            raise ValueError(f"{self.data} does not export lerobot with images; write frames: images there")
         return self
 
     @cached_property

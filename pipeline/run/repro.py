@@ -17,6 +17,7 @@ from pipeline.exit_status import Terminated
 from pipeline.files import remove, replaced
 from pipeline.formats.registry import formats_of
 
+DVC = (sys.executable, "-m", "dvc")
 PARAMS = Path("params.yaml")
 HEADER = """\
 # The run that `dvc repro` makes: the name of a file in configs/, and its field `folder`. `run CONFIG` writes both.
@@ -83,21 +84,20 @@ def _mend() -> None:
 
     What is finished, a run knows by itself.
     """
-    for lock, read in ((Path("dvc.lock"), yaml.safe_load), (Path(".dvc/tmp/rwlock"), json.loads)):
-        try:
-            if lock.exists() and not isinstance(read(lock.read_text()), dict):
-                remove(lock)
-        except ValueError:
-            remove(lock)
-        except yaml.YAMLError:
-            remove(lock)
+    if subprocess.run([*DVC, "stage", "list"], capture_output=True, check=False).returncode:
+        remove(Path("dvc.lock"))
+    running = Path(".dvc/tmp/rwlock")
+    try:
+        if running.exists():
+            json.loads(running.read_text())
+    except ValueError:
+        remove(running)
 
 
 def _repro() -> int:
     """Its exit status. What ends this process ends DVC, its stage and their workers in order."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"  # The stages call `python`.
-    command = [sys.executable, "-m", "dvc", "repro"]
-    with subprocess.Popen(command, env={**os.environ, "PATH": path}, process_group=0) as process:
+    with subprocess.Popen([*DVC, "repro"], env={**os.environ, "PATH": path}, process_group=0) as process:
         try:
             return process.wait()
         except KeyboardInterrupt as stopped:
