@@ -64,7 +64,7 @@ def choose(config: Config) -> None:
     if not PARAMS.exists() or PARAMS.read_text() != text:
         with replaced(PARAMS) as temporary:
             temporary.write_text(text)
-        print(f"{PARAMS} names {config.name} from now on")
+        print(f"{PARAMS} names {config.name} from now on", flush=True)
 
 
 def _refuse_elsewhere(file: Path, config: Config) -> None:
