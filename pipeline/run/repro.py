@@ -16,9 +16,9 @@ from pipeline.errors import PipelineError
 from pipeline.exit_status import Terminated
 from pipeline.files import remove, replaced
 from pipeline.formats.registry import formats_of
+from pipeline.run.stage import PARAMS
 
 DVC = (sys.executable, "-m", "dvc")
-PARAMS = Path("params.yaml")
 HEADER = """\
 # The run that `dvc repro` makes: the name of a file in configs/, and its field `folder`. `run CONFIG` writes both.
 """
