@@ -1,4 +1,7 @@
-"""Stage inputs: list the user's own files, and look whether stored ones are gone or changed, so that DVC notices."""
+"""Stage inputs: write out the configuration, list the user's own files, and look whether stored ones have changed.
+
+So DVC notices what it cannot see itself.
+"""
 
 from pipeline.config import Config
 from pipeline.files import write_json
@@ -10,6 +13,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:
+    write_json(config.data / "settings.json", inputs.settings(config))
     write_json(config.data / "inputs.json", inputs.listing(config))
     TrajectoryStore(config.data / "trajectories").notice_changes()
     FrameStore(config.data / "frames", config.render).notice_changes()

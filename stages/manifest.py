@@ -22,9 +22,10 @@ def run(config: Config) -> None:
     frames, row_of = FrameStore(data / "frames", config.render), episodes.row_of
     motions = {name: frames.motion(name) for name in {row_of[episode].trajectory_id for episode in episodes.kept}}
     suites = {episode: row.suite for episode, row in row_of.items()}
+    name = (config.export.rlds or config.export).name
     figures = {
         name: motion_statistics.openvla([motions[row_of[episode].trajectory_id] for episode in members])
-        for name, members in by_suite(episodes.kept, suites, config.export.rlds.name).items()
+        for name, members in by_suite(episodes.kept, suites, name).items()
     }
     write_json(data / "dataset_statistics.json", figures)
     write_json(data / "counts.json", counts.by_axis_and_suite(table.to_pylist()))

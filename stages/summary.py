@@ -16,19 +16,7 @@ def run(config: Config) -> None:
         memory.keep()
     from rich.console import Console
 
-    console = Console()
-    console.print(counts.shown(rows))
-    sheets, previews = sorted((config.data / "sheets").iterdir()), sorted((config.data / "previews").iterdir())
-    made = {
-        "RLDS": config.data / "rlds",
-        "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
-        "manifest": config.data / "manifest.parquet",
-        **{f"{file.stem} sheet": file for file in sheets},
-        **{f"{folder.name} previews": folder for folder in previews},
-    }
-    width = max(map(len, made))
-    for name, path in made.items():
-        console.print(f"{name:>{width}}  {path}", soft_wrap=True, highlight=False)
+    Console().print(counts.shown(rows))
 
 
 def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
