@@ -30,8 +30,8 @@ from pipeline.compute.pool import Run, loop, runner
 from pipeline.config import ComputeConfig, load
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.render import render_plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.testset import benchmark
 from pipeline.types import Frame
 
@@ -47,7 +47,7 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         root = Path(temporary)
         trajectories = root / "trajectories"
-        replay_plan(rows, config.demos, config.replay, trajectories, loop)
+        Replays(config.demos, config.replay, trajectories, loop).of(rows)
 
         def rendered(run: Run, name: str) -> float:
             start = time.perf_counter()

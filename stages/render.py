@@ -11,8 +11,8 @@ from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
 from pipeline.run.outcome import rejections
 from pipeline.run.remake import outdated
-from pipeline.run.render import render_plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.run.stage import main
 from pipeline.stores.frame_store import FrameStore, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -31,7 +31,7 @@ def run(config: Config) -> None:
         rejected: dict[str, str] | None = None
         while (refused := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = refused
-            verdicts = replay_plan(rows, config.demos, config.replay, trajectories.root, workers, rejected)
+            verdicts = Replays(config.demos, config.replay, trajectories.root, workers).of(rows, rejected)
             rendered = render_plan(rows, config, trajectories.root, frames.root, workers)
             frames.keep(rendered)
     trajectories.keep(verdicts)

@@ -209,9 +209,14 @@ def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),
-        runner(ComputeConfig(cluster="tcp://127.0.0.1:9"), tmp_path),
+        runner(ComputeConfig(cluster="tcp://127.0.0.1:9"), tmp_path) as run,
     ):
-        pass
+        run(str, [1], "work")
+
+
+def test_without_work_nothing_is_started(tmp_path: Path) -> None:
+    with runner(ComputeConfig(cluster="tcp://127.0.0.1:9"), tmp_path) as run:
+        assert run(str, [], "nothing") == []
 
 
 @pytest.mark.slow

@@ -36,8 +36,8 @@ from pipeline.rendering.render import render
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import export
-from pipeline.run.render import render_plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Extra, Rendered, Task, Trajectory
@@ -157,7 +157,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config, data = Config.model_validate(fields), tmp_path_factory.mktemp("run")
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
     plan.write(rows, data / "plan.parquet")
-    judged = replay_plan(rows, config.demos, config.replay, data / "trajectories", loop)
+    judged = Replays(config.demos, config.replay, data / "trajectories", loop).of(rows)
     render_plan(rows, config, data / "trajectories", data / "frames", loop)
     outcome = plan.select(rows, judged)
     kept = [row for row in rows if outcome[row.episode_id].kept]

@@ -90,6 +90,7 @@ def setup() -> dict[str, str]:
 
     A process keeps the code that it imported first, so this is found out once and not again.
     """
+
     # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import faulthandler
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from math import inf
@@ -89,19 +89,33 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 def runner(
     config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None = None
 ) -> Iterator[Run]:
-    """Open what ``config.cluster`` names and yield the function that runs work on it.
+    """Yield the function that runs work on what ``config.cluster`` names. Nothing is started before there is work.
+
+    With the first work comes a ``PipelineError`` when no scheduler answers, or a worker cannot work for this run.
 
     Args:
         config: where to run.
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
         opengl: for work that renders, ``gl.Shared``: gives what each local worker calls with its number.
-
-    Raises:
-        PipelineError: when no scheduler answers, or a worker cannot work for this run.
     """
     if config.cluster == "loop":
         yield loop
         return
+    with ExitStack() as opened:
+        workers: list[_Workers] = []
+
+        def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
+            if items and not workers:
+                workers.append(opened.enter_context(_started(config, folder, opengl)))
+            return workers[0](fn, items, description) if items else []
+
+        yield run
+
+
+@contextmanager
+def _started(
+    config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None
+) -> Iterator[_Workers]:
     # One thread a worker process: GL contexts and the simulator are not shared, and OpenCV and NumPy would otherwise
     # each start a thread for every core in every worker. The environment is inherited by spawned workers.
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")

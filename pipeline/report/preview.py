@@ -34,7 +34,7 @@ from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import first_look, roll_out
-from pipeline.planning.plan import draws_of
+from pipeline.planning.plan import Draws
 from pipeline.rendering.frames import frames_of
 from pipeline.rendering.last_scene import LastScene, scene_of_process
 from pipeline.report.sheets import Tile, describe, sheet, side_by_side
@@ -130,7 +130,7 @@ def configured(name: str, config: Config) -> AnyAxis:
 
 def variants(name: str, axis: AnyAxis, demo: Demo, seed: int, test: TestSet) -> list[AnyPerturbation]:
     """Draws of the plan's that cover the axis's components, and within each component its levels."""
-    draws = draws_of(name, (axis,), demo.demo_id, demo.task, seed, test)
+    draws = Draws(name, (axis,), seed, test).of(demo.demo_id, demo.task)
     left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
     chosen: list[AnyPerturbation] = []
     count = PHYSICS_VARIANTS if isinstance(left[0], PhysicsPerturbation) else VARIANTS

@@ -25,7 +25,7 @@ from pipeline.identity import refuse_unasked
 from pipeline.libero import hdf5
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.scenes.compiled import CompiledScene, proprioception
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
@@ -77,7 +77,7 @@ def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSe
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     result = Expansion()
     while True:
-        verdicts = replay_plan(rows, demos, REPLAY, store.root, run)
+        verdicts = Replays(demos, REPLAY, store.root, run).of(rows)
         outcome = plan.select(rows, verdicts)
         kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
         faults = _faults(kept, rows, store)

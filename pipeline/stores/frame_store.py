@@ -134,7 +134,7 @@ class FrameStore(Store):
                 where=self.folder(trajectory_id),
                 remedy="run the render stage again",
             )
-        return joined(parts)
+        return merged(parts)
 
     def stored(self, trajectory_id: str, streams: Mapping[str, str], device: str) -> list[Rendered]:
         """What files hold of the named streams of a trajectory, each stream once; a damaged file counts as missing.
@@ -207,7 +207,7 @@ def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
     return shown
 
 
-def joined(parts: Sequence[Rendered]) -> Rendered:
+def merged(parts: Sequence[Rendered]) -> Rendered:
     """Streams of one trajectory that were rendered or stored apart; one part at least.
 
     What all streams share comes from a part that was rendered, where there is one: who stored that a worker was lost
