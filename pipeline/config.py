@@ -139,6 +139,31 @@ def _each_once(extras: tuple[Extra, ...]) -> tuple[Extra, ...]:
     return tuple(sorted(set(extras)))
 
 
+class FilterConfig(Frozen):
+    """Which successful replays are dropped all the same, by the columns of the same names; none by default.
+
+    An episode is dropped, with the column as its reason, where the figure is above the limit, or below it in
+    ``joint_margin_rad``; then reserves take its place. Trajectories stay as they are.
+    """
+
+    non_target_moved_m: float | None = Field(default=None, ge=0.0)
+    non_target_left_m: float | None = Field(default=None, ge=0.0)
+    touched_steps: int | None = Field(default=None, ge=0)
+    path_m: float | None = Field(default=None, gt=0.0)
+    jerk_rms_m_s3: float | None = Field(default=None, gt=0.0)
+    idle_share: float | None = Field(default=None, ge=0.0, le=1.0)
+    joint_margin_rad: float | None = Field(default=None, ge=-1.0, le=3.0)
+    lag_m: float | None = Field(default=None, gt=0.0)
+
+    def fault(self, quality: Mapping[str, Any]) -> str | None:
+        """The first column whose figure is refused."""
+        for name, limit in self.model_dump(exclude_none=True).items():
+            figure = quality[name]
+            if figure < limit if name == "joint_margin_rad" else figure > limit:
+                return name
+        return None
+
+
 class RenderConfig(Frozen):
     """How episodes are rendered; the size is that of ``schemas/episode.json``.
 
@@ -206,6 +231,7 @@ class Config(Frozen):
     demos: DemosConfig = DemosConfig()
     plan: PlanConfig
     replay: ReplayConfig = ReplayConfig()
+    filter: FilterConfig = Field(default=FilterConfig(), exclude_if=lambda limits: limits == FilterConfig())
     render: RenderConfig = RenderConfig()
     export: ExportConfig = Field(default=ExportConfig(), validate_default=True)
     compute: ComputeConfig = ComputeConfig()

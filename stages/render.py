@@ -31,7 +31,9 @@ def run(config: Config) -> None:
         rejected: dict[str, str] | None = None
         while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = known
-            verdicts = Replays(config.demos, config.replay, trajectories.root, workers).of(rows, rejected)
+            verdicts = Replays(config.demos, config.replay, trajectories.root, workers, config.filter).of(
+                rows, rejected
+            )
             rendered = render_plan(rows, config, trajectories.root, frames.root, workers)
             frames.keep(rendered)
     trajectories.keep(verdicts)

@@ -16,7 +16,7 @@ def run(config: Config) -> None:
     refuse_unasked(outdated(rows, config), config.data)
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:
-        verdicts = Replays(config.demos, config.replay, folder, workers).of(rows)
+        verdicts = Replays(config.demos, config.replay, folder, workers, config.filter).of(rows)
     # Of the reserves, those too that the stage render replayed because frames were rejected.
     TrajectoryStore(folder).keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())

@@ -8,7 +8,7 @@ import os
 import resource
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from pipeline.axes import to_json
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.compute.pool import loop
-from pipeline.config import Config
+from pipeline.config import Config, FilterConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
@@ -39,7 +39,7 @@ from pipeline.seeding import rng
 from pipeline.stores.frame_store import FrameStore, shown_of
 from pipeline.stores.sealed_file import sealed
 from pipeline.stores.store import TABLE
-from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
@@ -82,6 +82,30 @@ def test_the_table_spares_opening_the_files(replayed: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(h5py, "File", never)
     assert TrajectoryStore(replayed).rows() == rows
+
+
+def test_quality_is_stored_and_a_filter_drops_by_it(config: Config, rows: list[plan.Row], replayed: Path) -> None:
+    store = TrajectoryStore(replayed)
+    ((name, told),) = store.rows().items()
+    quality = store.load(name).quality
+    assert quality is not None
+    figures = asdict(quality)
+    assert {column: told[column] for column in figures} == figures
+    assert set(FilterConfig.model_fields) == set(figures)
+    assert verdicts_of(store.rows(), FilterConfig()) == {name: Verdict(True, "kept")}
+    for column, figure in figures.items():
+        if column == "joint_margin_rad":
+            refusing, letting = figure + 0.01, figure
+        else:
+            refusing, letting = figure * 0.99, figure
+        if figure > 0:
+            refused = verdicts_of(store.rows(), FilterConfig(**{column: refusing}))
+            assert refused == {name: Verdict(False, column)}
+        assert verdicts_of(store.rows(), FilterConfig(**{column: letting}))[name].kept
+
+    limits = FilterConfig(path_m=figures["path_m"] / 2)
+    judged = Replays(config.demos, config.replay, replayed, nothing_to_do, limits).of(rows)
+    assert set(judged.values()) == {Verdict(False, "path_m")}
 
 
 def test_a_lost_or_damaged_table_is_rebuilt(trajectories: Path) -> None:

@@ -74,7 +74,7 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     for demo in demos:
         by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
     planner = _Planner(plan.seed, replay)
-    rows = [planner.row(demo, (), rank) for group in by_task.values() for rank, demo in enumerate(group)]
+    rows = [row for group in by_task.values() for row in twins(group, plan.seed, replay)]
     for name, episodes in plan.episodes.items():
         draws = Draws(name, plan.drawn_from(name), plan.seed, test)
         groups = [group for group in by_task.values() if all(axis.applies(group[0].task) for axis in draws.axes)]
@@ -87,6 +87,11 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
         for group, wanted in zip(groups, _shares(episodes, len(groups)), strict=True):
             rows += islice(planner.candidates(draws, group, wanted), wanted + ceil(wanted * plan.reserve))
     return rows
+
+
+def twins(demos: Sequence[DemoEntry], seed: int, replay: ReplayConfig) -> list[Row]:
+    """The clean twin of each demonstration of a task."""
+    return [_Planner(seed, replay).row(demo, (), rank) for rank, demo in enumerate(demos)]
 
 
 def demonstrations(rows: Sequence[Row]) -> int:

@@ -92,4 +92,5 @@ def render(
         geometry=geometry,
         object_poses=np.stack(poses) if "object_poses" in config.extras else None,
         instances=instances.names if instances else (),
+        quality=trajectory.quality,
     )

@@ -35,6 +35,7 @@ class EpisodeLoader:
         store = FrameStore(self.data / "frames", self.config)
         rendered = store.load(row.trajectory_id, [s.stream_id for s in shown.values()], set(geometry.values()))
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
+        known |= asdict(rendered.quality) if rendered.quality else {}
         known |= {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
         return Episode(
             episode_id=episode_id,

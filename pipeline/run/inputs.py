@@ -36,7 +36,9 @@ def listing(config: Config) -> dict[str, list[str | int]]:
 
 def settings(config: Config) -> dict[str, Any]:
     """Every section that decides what is made, with all fields; of a path the last name, as for ``listing``."""
-    sections = {name: settings_of(getattr(config, name)) for name in ("demos", "plan", "replay", "render", "export")}
+    sections = {
+        name: settings_of(getattr(config, name)) for name in ("demos", "plan", "replay", "filter", "render", "export")
+    }
     return {**sections, "export": {"where": None, **sections["export"]}}
 
 

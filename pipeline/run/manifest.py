@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,6 +18,7 @@ from pipeline.identity import VERSIONS, versions
 from pipeline.planning import plan
 from pipeline.run.outcome import Outcome
 from pipeline.tables import column, columns_of, read_table, write_table
+from pipeline.types import Quality
 
 OWN_VERSION = "pipeline_version"
 """The column for the version of this project, which is information: what is current, recipe numbers decide."""
@@ -33,7 +34,8 @@ class Result:
     reason: Annotated[
         str,
         "kept, or why not: goal_not_reached, goal_lost, too_short, simulation_unstable, too_dark, blown_out, what a "
-        "physics perturbation was refused for, not_replayed, reserve_not_needed, left_out (export.where names others)",
+        "physics perturbation was refused for, the figure that `filter` "
+        "refuses, not_replayed, reserve_not_needed, left_out (export.where names others)",
     ]
     replay_mode: Annotated[
         str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"
@@ -85,7 +87,8 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
             resolved=replayed.get("resolved"),
             gl_device=rendered.device if rendered else None,
         )
-        table.append({**asdict(row), **asdict(result), **places.get(row.episode_id, {}), **own_versions})
+        quality = {each.name: replayed.get(each.name) for each in fields(Quality)}
+        table.append({**asdict(row), **asdict(result), **quality, **places.get(row.episode_id, {}), **own_versions})
     return pa.Table.from_pylist(table, schema=schema(columns))
 
 
@@ -95,9 +98,9 @@ def version_column(name: str) -> str:
 
 
 def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
-    """The manifest's columns: of the plan, of its result, where an episode lies in each dataset, and the versions."""
+    """The columns: of the plan, its result and quality, where an episode lies in each dataset, and the versions."""
     made_by = [column(version_column(name), pa.string(), meaning) for name, meaning in VERSIONS.items()]
-    return pa.schema([*columns_of(plan.Row), *columns_of(Result), *places, *made_by])
+    return pa.schema([*columns_of(plan.Row), *columns_of(Result), *columns_of(Quality), *places, *made_by])
 
 
 def described() -> dict[str, Any]:

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import Config
+from pipeline.config import Config, FilterConfig
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
@@ -59,7 +59,10 @@ class Outcome:
 
 
 def replayed(
-    rows: Sequence[plan.Row], folder: Path, rejected: Mapping[str, str] | None = None
+    rows: Sequence[plan.Row],
+    folder: Path,
+    rejected: Mapping[str, str] | None = None,
+    limits: FilterConfig = FilterConfig(),  # noqa: B008 - frozen
 ) -> dict[str, dict[str, Any]]:
     """Trajectory id to its row in the table of replays.
 
@@ -67,13 +70,14 @@ def replayed(
         rows: the plan.
         folder: of the trajectory store.
         rejected: episode id to the reason why its frames were rejected.
+        limits: of quality.
 
     Raises:
         PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
     """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
-    needed = plan.pending(rows, verdicts_of(trajectories), rejected)
+    needed = plan.pending(rows, verdicts_of(trajectories, limits), rejected)
     # What takes the place of rejected frames, only the stage render replays.
     _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
@@ -105,8 +109,8 @@ def read(config: Config) -> Outcome:
     store = FrameStore(config.data / "frames", config.render)
     frames = shown_of(store.rows())
     rejected = rejections(rows, frames)
-    trajectories = replayed(rows, config.data / "trajectories", rejected)
-    judged = plan.select(rows, verdicts_of(trajectories), rejected)
+    trajectories = replayed(rows, config.data / "trajectories", rejected, config.filter)
+    judged = plan.select(rows, verdicts_of(trajectories, config.filter), rejected)
     if where := config.export.where:
         for row in rows:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):

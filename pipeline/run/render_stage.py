@@ -60,7 +60,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     """
     device = gl.choose().device
     store = FrameStore(folder, config.render)
-    judged = verdicts_of(TrajectoryStore(trajectories).rows())
+    judged = verdicts_of(TrajectoryStore(trajectories).rows(), config.filter)
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in store.refresh().items() if row["device"] == device}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
 from pipeline.physics.environment import Environment, shared
+from pipeline.physics.quality import measure
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
 from pipeline.planning.plan import Row
@@ -57,6 +58,8 @@ class ReplayJob:
         environment = shared(demo.task)
         reference = partial(self._reference, environment, demo)
         trajectory = replay(environment, demo, self.row.trajectory_id, self.config, physics, reference)
+        if trajectory.verdict.kept:
+            trajectory = replace(trajectory, quality=measure(trajectory, demo.task))
         TrajectoryStore(self.folder).save(trajectory)
         return trajectory.verdict
 

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.compute.pool import Expendable, Workers
-from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
 from pipeline.planning.plan import Row, pending
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
+
+NO_LIMITS = FilterConfig()
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,14 @@ class Replays:
         demos, config: sections of the run's configuration.
         folder: of the trajectory store.
         workers: do the work.
+        limits: the section ``filter``.
     """
 
     demos: DemosConfig
     config: ReplayConfig
     folder: Path
     workers: Workers
+    limits: FilterConfig = NO_LIMITS
 
     def of(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
         """Have what a plan needs in the store; reserves only where a candidate failed.
@@ -41,21 +45,19 @@ class Replays:
             Trajectory id to verdict, for every trajectory that was needed.
         """
         store = TrajectoryStore(self.folder)
-        stored = verdicts_of(store.refresh())
+        stored = verdicts_of(store.refresh(), self.limits)
         twins = [row for row in rows if row.role == "twin"]
         verdicts: dict[str, Verdict] = {}
         for group in (twins, rows):
             while needed := pending(group, verdicts, rejected):
                 missing = [trajectory_id for trajectory_id in needed if trajectory_id not in stored]
-                stored |= self._replayed(missing, rows)
+                if missing:
+                    self._replay(missing, rows)
+                    stored = verdicts_of(store.refresh(), self.limits)
                 verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed}
-        # The table tells of what was just replayed, so that whoever comes next opens no file for it.
-        store.refresh()
         return verdicts
 
-    def _replayed(self, missing: Sequence[str], rows: Sequence[Row]) -> dict[str, Verdict]:
-        if not missing:
-            return {}
+    def _replay(self, missing: Sequence[str], rows: Sequence[Row]) -> None:
         # A stage that has nothing to do loads no simulator.
         from pipeline.run.replay_job import ReplayJob
 
@@ -64,5 +66,4 @@ class Replays:
         # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
         in_turn = sorted(map(row_of.__getitem__, missing), key=lambda row: row.demo_id)
         jobs = [ReplayJob(row, twin_of[row.demo_id], self.demos, self.config, self.folder) for row in in_turn]
-        judged = self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
-        return {job.row.trajectory_id: verdict for job, verdict in zip(jobs, judged, strict=True)}
+        self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")

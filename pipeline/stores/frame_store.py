@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -23,7 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
-from pipeline.types import Geometry, Rendered
+from pipeline.types import Geometry, Quality, Rendered
 
 _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 """The schema's parts that say what files of a store hold."""
@@ -97,6 +97,7 @@ class FrameStore(Store):
             "replay_mode": rendered.replay_mode,
             "instances": list(rendered.instances),
             "rejected": json.dumps(dict(rendered.rejected), sort_keys=True),
+            "quality": asdict(rendered.quality) if rendered.quality else None,
         }
         with self.created(file_name(trajectory_id, {*rendered.streams, *rendered.rejected}), attributes) as file:
             for name in ("state", "joint_state", "action"):
@@ -236,6 +237,7 @@ def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[s
         geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
         object_poses=file.array("object_poses") if "object_poses" in file else None,
         instances=file.attributes["instances"],
+        quality=Quality(**quality) if (quality := file.attributes["quality"]) else None,
     )
 
 

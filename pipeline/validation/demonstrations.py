@@ -11,7 +11,8 @@ from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
 from pipeline.libero.tasks import SUITES, find_task
-from pipeline.run.replay import ReplayJob
+from pipeline.planning.plan import twins
+from pipeline.run.replay_job import ReplayJob
 from pipeline.types import Task
 
 LAYOUT = f"<suite>/<task>_demo.hdf5, with a suite of {', '.join(SUITES)}"
@@ -125,13 +126,10 @@ class _FileJob:
 
     def _replayed(self, entries: list[DemoEntry]) -> dict[DemoEntry, str]:
         """What each came to, as the manifest says it."""
-        demos, reasons = DemosConfig(root=self.root), {}
+        demos, replay = DemosConfig(root=self.root), ReplayConfig()
         with tempfile.TemporaryDirectory() as folder:
-            for entry in entries:
-                name = entry.sha256[:16]
-                job = ReplayJob(name, entry.demo_id, entry.sha256, "[]", name, demos, ReplayConfig(), Path(folder))
-                reasons[entry] = job().reason
-        return reasons
+            jobs = [ReplayJob(row, row.trajectory_id, demos, replay, Path(folder)) for row in twins(entries, 0, replay)]
+            return {entry: job().reason for entry, job in zip(entries, jobs, strict=True)}
 
     def limit_s(self) -> float:
         """So long it may take before it counts as hanging; a replay takes about a minute at most."""

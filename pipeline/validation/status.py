@@ -30,7 +30,7 @@ def told(config: Config) -> Iterator[str | Table]:
         rows = plan.read(config.data / "plan.parquet")
     except PipelineError:
         rows = []
-    verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows())
+    verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), config.filter)
     frames = shown_of(FrameStore(config.data / "frames", config.render).rows())
     rejected = outcome.rejections(rows, frames)
     yield _counts(config, rows, plan.select(rows, verdicts, rejected), frames)
