@@ -121,12 +121,13 @@ def _evaluation_report(arguments: argparse.Namespace) -> int:
     """write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures
 
     Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
-    Two different results of one episode are an error. The last line is JSON.
+    Two different results of one episode are an error, and so are results under different prompts or step limits. The
+    last line is JSON.
     """
     from pipeline.evaluation.results import read
     from pipeline.report import evaluation_report
 
-    print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
+    print(json.dumps(evaluation_report.write(read(arguments.folders, arguments.across), arguments.out)))
     return 0
 
 
@@ -313,6 +314,13 @@ def _add_after(commands: Any) -> None:
     """The commands for a finished run and for evaluations."""
     command = _command(commands, _evaluation_report)
     command.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="folder of results")
+    command.add_argument(
+        "--across",
+        nargs="+",
+        choices=("prompt", "step_limit"),
+        default=(),
+        help="compare results that differ in this, which is refused otherwise",
+    )
     command.add_argument(
         "--out",
         type=Path,

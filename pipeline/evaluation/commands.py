@@ -12,7 +12,7 @@ from pipeline.arguments import positive
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.results import stored
 from pipeline.evaluation.tasks import write_tasks
 from pipeline.files import write_json
 
@@ -103,7 +103,7 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
 
 
 def _add_settings(command: argparse.ArgumentParser) -> None:
-    """Fields of ``Settings``, but the seed, which is the selection's."""
+    """Fields of ``EpisodeSettings``, but the seed, which is the selection's."""
     add = command.add_argument
     add("--plan", type=Path, metavar="FILE", help="draw held-out draws anew that overlap with this training plan")
     add(
@@ -135,11 +135,10 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     # The simulator takes seconds to import, which the other commands can do without.
     from dask.system import CPU_COUNT
 
+    from pipeline.evaluation.environment import EpisodeSettings
     from pipeline.evaluation.evaluate import evaluate
-    from pipeline.evaluation.policies import PolicyConfig
-    from pipeline.evaluation.rollout import Evaluation
+    from pipeline.evaluation.rollout import Evaluation, PolicyConfig
     from pipeline.evaluation.selection import Selection
-    from pipeline.evaluation.settings import Settings
 
     def given(*names: str) -> dict[str, Any]:
         return {name: value for name, value in vars(arguments).items() if name in names}
@@ -147,7 +146,7 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     kind, address = next(iter(given("server", "checkpoint", "replay").items()))
     policy = {"kind": address} if kind == "replay" else {"kind": kind, "address": str(address)}
     config = PolicyConfig.model_validate(policy | given("label", "timeout_s"))
-    settings = Settings.model_validate(given(*Settings.model_fields))
+    settings = EpisodeSettings.model_validate(given(*EpisodeSettings.model_fields))
     evaluation = Evaluation(settings, config, config.identity(), arguments.out, **given("videos", "archive"))
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
@@ -198,7 +197,7 @@ def _add_analyse(commands: Any) -> None:
 def _gap(arguments: argparse.Namespace) -> int:
     from pipeline.evaluation import composition
 
-    measured = composition.pairs(EpisodeFiles(arguments.results).some_rows())
+    measured = composition.pairs(stored([arguments.results]))
     composition.heatmap(measured, arguments.results / "gap.png")
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
     write_json(arguments.results / "gap.json", figures)
@@ -208,13 +207,13 @@ def _gap(arguments: argparse.Namespace) -> int:
 
 def _construct(arguments: argparse.Namespace) -> int:
     # The draws need LIBERO, which takes seconds to import.
-    from pipeline.evaluation import construction, own_draws
+    from pipeline.evaluation import own_draws, selection
 
-    chosen, counts = construction.construct(
-        construction.candidates(arguments.seed),
+    chosen, counts = selection.construct(
+        selection.candidates(arguments.seed),
         arguments.seed,
-        arguments.size or construction.SIZE,
-        [row for folder in arguments.results for row in EpisodeFiles(folder).some_rows()],
+        arguments.size or selection.SIZE,
+        [row for row, _ in stored(arguments.results)],
         own_draws.planned(arguments.plan) if arguments.plan else None,
     )
     write_tasks(chosen, arguments.seed, arguments.out)
@@ -223,13 +222,13 @@ def _construct(arguments: argparse.Namespace) -> int:
 
 
 def _grade(arguments: argparse.Namespace) -> int:
-    from pipeline.evaluation import construction
+    from pipeline.evaluation.statistics import grade
 
-    results = [list(EpisodeFiles(folder).some_rows()) for folder in arguments.results]
-    seed, *others = sorted({row["seed"] for rows in results for row in rows})
+    results = [stored([folder]) for folder in arguments.results]
+    seed, *others = sorted({row.seed for of_model in results for row, _ in of_model})
     if others:
         raise PipelineError(f"results of seeds {[seed, *others]}", expected="one seed, and so the same draws")
-    graded = construction.grade(results)
+    graded = grade(results)
     write_tasks(graded, seed, arguments.out)
     by_level = {level: sum(task["difficulty"] == level for task in graded) for level in range(1, 6)}
     print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
@@ -242,10 +241,10 @@ def _leakage(arguments: argparse.Namespace) -> int:
     from pipeline.libero.tasks import find_task
 
     drawn = [
-        (row["name"], one, find_task(row["suite"], row["base"]))
-        for row in EpisodeFiles(arguments.results).some_rows()
-        if row["source"] == "own"
-        for one in from_json(json.dumps(row["perturbations"]))
+        (row.name, one, find_task(row.suite, row.base))
+        for row, _ in stored([arguments.results])
+        if row.source == "own"
+        for one in from_json(json.dumps(row.perturbations))
     ]
     if not drawn:
         raise PipelineError("there are no held-out draws", where=arguments.results, remedy="evaluate --source own")
