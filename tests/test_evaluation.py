@@ -235,6 +235,8 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
         params = {
             "selection": {"suites": ["libero_goal"], "tasks": ["turn_on*"]},
             "settings": {"initial_states": "demonstration"},
+            "out": str(tmp_path / "rows"),
+            "label": "replay",
         }
         benchmark = {"benchmark": "pipeline.evaluation.harness:PerturbedLibero", "params": params}
         # YAML holds JSON.
@@ -246,6 +248,7 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
         assert done.returncode == 0, done.stdout + done.stderr
         (result,) = (tmp_path / "theirs").rglob("*.json")
         assert json.loads(result.read_text())["tasks"][0]["episodes"][0]["metrics"]["success"]
+        assert rows(tmp_path / "rows") == {episode: row}, "and writes the same of it"
 
 
 @pytest.mark.slow

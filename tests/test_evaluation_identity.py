@@ -136,16 +136,28 @@ def test_one_name_is_not_given_to_two_policies(tmp_path: Path, taken: list[float
     assert str(tmp_path / "two") in str(caught.value)
 
 
+@pytest.fixture
+def next_recipe() -> Iterator[Callable[[], None]]:
+    """Makes this the next version, whose episodes are others."""
+    with pytest.MonkeyPatch.context() as patch:
+
+        def change() -> None:
+            patch.setitem(identity.RECIPES, "evaluation", identity.RECIPES["evaluation"] + 1)
+            identity._parts.cache_clear()
+
+        yield change
+    identity._parts.cache_clear()
+
+
 @pytest.mark.slow
 def test_results_of_other_versions_are_made_again_where_that_is_asked_for(
-    tmp_path: Path, taken: list[float], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, taken: list[float], next_recipe: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
     first = run(out, checkpoint)
     (before,) = EpisodeFiles(out).rows()
     number = identity.RECIPES["evaluation"]
-    monkeypatch.setitem(identity.RECIPES, "evaluation", number + 1)
-    identity._parts.cache_clear()
+    next_recipe()
     monkeypatch.delenv(identity.REMAKE, raising=False)
     told = f"1 episodes, made with recipe of evaluation {number}, here {number + 1}"
     with pytest.raises(PipelineError, match=rf"{told}(?s:.*)REMAKE=1 python -m pipeline evaluate"):
