@@ -48,7 +48,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
             names it. Its model servers set these.
         env_seed: as there, of LIBERO's reset.
-        out, label: folder for the results of the policy of that name, as ``evaluate`` writes them; none by default.
+        out, label: folder for the rows of the policy of that name, as ``evaluate`` writes them; none by default.
         assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
         seed: as there; without an effect, since nothing here uses a global generator.
     """
