@@ -94,7 +94,7 @@ def tasks() -> dict[str, TestTask]:
     listed = [test for test in load().by_name.values() if test.base == STOVE.name]
     chosen = {axis: next(test for test in listed if test.axis == axis) for axis in AXES}
     floors = (test for test in load().by_name.values() if test.suite == "libero_object")
-    chosen["floor"] = next(test for test in floors if test.axis == "background" and not libero_plus.runnable(test))
+    chosen["floor"] = next(test for test in floors if test.axis == "background" and not libero_plus.assets_of(test))
     return chosen
 
 

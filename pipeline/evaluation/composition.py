@@ -59,12 +59,12 @@ class Pair:
     @property
     def joint(self) -> float:
         """p(D_i = 1, D_j = 1 | Y = 1); NaN without successes."""
-        return float(_joint(self._sums)[0])
+        return float(_probabilities(self._sums)[0][0])
 
     @property
     def product(self) -> float:
         """p(D_i = 1 | Y = 1) p(D_j = 1 | Y = 1); NaN without successes."""
-        return float(_product(self._sums)[0])
+        return float(_probabilities(self._sums)[1][0])
 
     @property
     def gap(self) -> float:
@@ -99,20 +99,15 @@ class Pair:
 
 def gap(sums: Floats) -> Floats:
     """The gap, of (n, 4) successes without a perturbation, with the one, the other and both; NaN without successes."""
-    return _joint(sums) - _product(sums)
+    joint, product = _probabilities(sums)
+    return joint - product
 
 
-def _joint(sums: Floats) -> Floats:
-    return np.asarray(sums[:, 3] / _whole(sums), float)
-
-
-def _product(sums: Floats) -> Floats:
+def _probabilities(sums: Floats) -> tuple[Floats, Floats]:
+    """(n,) the joint probabilities, and the products of the marginal ones."""
     _, one, other, both = sums.T
-    return np.asarray((one + both) * (other + both) / _whole(sums) ** 2, float)
-
-
-def _whole(sums: Floats) -> Floats:
-    return np.where(sums.any(axis=1), sums.sum(axis=1), np.nan)
+    whole = np.where(sums.any(axis=1), sums.sum(axis=1), np.nan)
+    return np.asarray(both / whole, float), np.asarray((one + both) * (other + both) / whole**2, float)
 
 
 Start = tuple[str, str, int]

@@ -21,18 +21,14 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Policy, PolicyError
-from pipeline.evaluation.results import one_setting, refuse_shared_names
+from pipeline.evaluation.results import one_setting
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import write_json
-from pipeline.identity import REMAKE, refuse_unasked
 from pipeline.images.mp4 import mp4
 from pipeline.types import Frame
-
-ALLOW = f"`{REMAKE}=1 python -m pipeline evaluate ...`; or evaluate into another folder"
-"""How a person allows that results of other versions are made anew."""
 
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
@@ -68,17 +64,14 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Run, workers: in
         PipelineError: after the summary was written, when an episode has no result; before, when the policy fails in
             one episode after the other.
     """
-    settings, policy, folder = evaluation.settings, evaluation.policy, evaluation.folder
-    acting = {"policy": policy.name(evaluation.identity), "identity": evaluation.identity}
+    settings, policy = evaluation.settings, evaluation.policy
     check_settings(selection, settings)
     if settings.look_every != 1 and policy.kind != "server":
         raise PipelineError(
             f"only a server is shown one observation in {settings.look_every}", where="look_every", expected="--server"
         )
-    known = [(row.policy, row.identity, folder) for row in evaluation.files.rows()]
-    refuse_shared_names([*known, (acting["policy"], evaluation.identity, folder)])
     wanted = select(selection, evaluation.archive)
-    refuse_unasked(evaluation.outdated(wanted), folder, ALLOW)
+    evaluation.check(wanted)
     faults: list[str] = []
     if missing := [task for task in wanted if evaluation.result(task) is None]:
         device = gl.choose().device
@@ -91,11 +84,11 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Run, workers: in
     unsaid = [task for task in left if not any(fault.endswith(task) for fault in faults)]
     faults += [f"the plan or the archive changed while it ran {task}" for task in unsaid]
     found = summary(rows) | {
-        "policy": {"name": acting["policy"], "identity": evaluation.identity},
+        "policy": {"name": policy.name(evaluation.identity), "identity": evaluation.identity},
         "selection": selection.model_dump(mode="json"),
         "settings": one_setting((row, evaluation.files) for row in rows) or settings.model_dump(),
     }
-    write_json(folder / "summary.json", found)
+    write_json(evaluation.folder / "summary.json", found)
     if faults:
         raise without_result(faults)
     return found

@@ -96,7 +96,10 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
-        return [task.for_harness() for task in select(self._selection, self._archive)]
+        tasks = select(self._selection, self._archive)
+        if self._evaluation is not None:
+            self._evaluation.check(tasks)
+        return [task.for_harness() for task in tasks]
 
     def reset(self, task: dict[str, Any]) -> Any:
         progress = self._environment.reset(EvaluationTask.of_harness(task))

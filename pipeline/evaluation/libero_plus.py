@@ -85,15 +85,6 @@ def _rounded(part: Floats) -> Floats:
     return np.array([round(float(number), DECIMALS) for number in part])
 
 
-def runnable(test: TestTask, archive: Path | None = None) -> bool:
-    """Whether a test task can be rebuilt.
-
-    Args:
-        archive: folder of the benchmark's asset archive, where there is one.
-    """
-    return test.axis in RUNNABLE or assets_of(test, archive) is not None
-
-
 def camera(test: TestTask) -> TestCamera:
     """The agent view of a test task, whatever its axis."""
     if test.axis != "camera":
@@ -169,8 +160,9 @@ def instruction(test: TestTask, prompt: Prompt) -> str:
     return re.sub(r"^[A-Z].*?SCENE\d+_", "", test.name).replace("_", " ")
 
 
-def assets_of(test: TestTask, archive: Path | None) -> Path | None:
-    """LIBERO's assets or the archive, whichever has the files of a light, background or layout task; None if neither.
+def assets_of(test: TestTask, archive: Path | None = None) -> Path | None:
+    """LIBERO's assets or the archive, whichever has the files that a test task names; None if neither, where it cannot
+    be rebuilt.
 
     Args:
         archive: folder of the unpacked archive, where there is one.
@@ -220,12 +212,10 @@ def register_objects(test: TestTask, assets: Path) -> None:
 
 
 def contents(test: TestTask, archive: Path | None) -> list[str]:
-    """SHA-256 of each file of LIBERO's assets or the archive that a light, background or layout task is made from:
-    those that it names, then those that they refer to. Empty for tasks of other axes."""
-    assets = assets_of(test, archive) if test.axis in ("light", "background", "layout") else None
-    if assets is None:
-        return []
-    files = [assets / path for path in _named(test)]
+    """SHA-256 of each file of LIBERO's assets or the archive that a test task is made from: those that it names, then
+    those that they refer to."""
+    assets = assets_of(test, archive)
+    files = [] if assets is None else [assets / path for path in _named(test)]
     for file in files:
         if file.suffix == ".xml":
             read = (file.parent / path for path in _referred(edition(file)))
@@ -234,8 +224,10 @@ def contents(test: TestTask, archive: Path | None) -> list[str]:
 
 
 def _named(test: TestTask) -> Iterable[str]:
-    """The files that a light, background or layout task names."""
-    return object_models(test).values() if test.axis == "layout" else scene_files(test)
+    """The files that a light, background or layout task names; others name none."""
+    if test.axis == "layout":
+        return object_models(test).values()
+    return scene_files(test) if test.axis in ("light", "background") else ()
 
 
 @cache
@@ -253,17 +245,13 @@ def scene_files(test: TestTask) -> SceneFiles:
 
 def object_models(test: TestTask) -> dict[str, str]:
     """Category to MJCF, by its path in the archive, of the objects that a layout task adds."""
-    return {category: _models()[category] for category in str(test.parameters["category"]).split(",")}
+    models = _reader().object_models
+    return {category: models[category] for category in str(test.parameters["category"]).split(",")}
 
 
 @cache
 def _reader() -> Reader:
     return Reader(zipfile.ZipFile(benchmark.fetch_testset()))
-
-
-@cache
-def _models() -> dict[str, str]:
-    return _reader().object_models()
 
 
 def _object_class(category: str, file: Path) -> Any:

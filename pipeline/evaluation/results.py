@@ -106,18 +106,6 @@ class EpisodeFiles:
         """
         return [_read(path) for path in sorted((self.folder / "episodes").glob("*.json"))]
 
-    def some_rows(self) -> list[EpisodeResult]:
-        """All episodes, of which there must be one.
-
-        Raises:
-            PipelineError: when there is none.
-        """
-        rows = self.rows()
-        if not rows:
-            expected = "a folder that `python -m pipeline evaluate` wrote results into"
-            raise PipelineError("no results", where=self.folder, expected=expected)
-        return rows
-
 
 def _read(path: Path) -> EpisodeResult:
     content = read_json(path, "run the evaluation again")
@@ -138,8 +126,19 @@ Stored = tuple[EpisodeResult, EpisodeFiles]
 
 
 def stored(folders: Iterable[Path]) -> list[Stored]:
-    """The results of all folders, each of which must have some."""
-    return [(row, files) for files in map(EpisodeFiles, folders) for row in files.some_rows()]
+    """The results of all folders.
+
+    Raises:
+        PipelineError: when one has none.
+    """
+    found: list[Stored] = []
+    for files in map(EpisodeFiles, folders):
+        rows = files.rows()
+        if not rows:
+            expected = "a folder that `python -m pipeline evaluate` wrote results into"
+            raise PipelineError("no results", where=files.folder, expected=expected)
+        found += [(row, files) for row in rows]
+    return found
 
 
 def one_setting(found: Iterable[Stored]) -> dict[str, Any]:

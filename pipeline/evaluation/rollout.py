@@ -20,7 +20,7 @@ from pipeline.evaluation import libero_plus
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, checked_actions, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.results import EpisodeFiles, EpisodeResult
+from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, refuse_shared_names
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
@@ -34,6 +34,9 @@ PACKAGES = ("robouse", "opencv-python-headless")
 
 CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
 """What computes a checkpoint's actions."""
+
+REMAKE = f"`{identity.REMAKE}=1` before the command; or evaluate into another folder"
+"""How a person allows that results are made anew."""
 
 RECORDED = ("pipeline", "vla-eval", "OpenGL")
 """The versions of a result that do not decide whether it counts."""
@@ -126,11 +129,22 @@ class Evaluation:
         row = self.files.row(self.episode(task))
         return row if row is not None and _deciding(row) == self.versions(task) else None
 
-    def outdated(self, tasks: Iterable[EvaluationTask]) -> Counter[str]:
-        """What is stored of some episodes that this version would make anew, and why, to how many there are."""
+    def check(self, tasks: Iterable[EvaluationTask]) -> None:
+        """Refuse a folder that has another policy of this name, or results of other versions that nobody allowed to
+        make anew.
+
+        Args:
+            tasks: that are to be run.
+
+        Raises:
+            PipelineError: when it has. Nothing was changed.
+        """
+        known = [(row.policy, row.identity, self.folder) for row in self.files.rows()]
+        refuse_shared_names([*known, (self.policy.name(self.identity), self.identity, self.folder)])
         rows = ((task, self.files.row(self.episode(task))) for task in tasks)
         differing = (identity.differences(_deciding(row), self.versions(task)) for task, row in rows if row is not None)
-        return Counter(f"episodes, made with {reason}" for reason in differing if reason)
+        outdated = Counter(f"episodes, made with {reason}" for reason in differing if reason)
+        identity.refuse_unasked(outdated, self.folder, REMAKE)
 
     def versions(self, task: EvaluationTask) -> dict[str, str]:
         """What makes a result beside the task, the settings and the policy, by name."""

@@ -82,6 +82,8 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
     """
     _check_names(selection)
     listed = list(_listed(selection))
+    if selection.source == "pairs":  # which are listed by axis and level, and with LIBERO's tasks, which have neither
+        selection = selection.model_copy(update={"axes": (), "levels": ()})
     _check_listed(selection, listed)
     wanted = [task for task in listed if _matches(task, selection)]
     if selection.source == "libero_plus" and selection.file is None:
@@ -171,26 +173,19 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
     yield from filter(None, (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs)))
 
 
-def _restricting(selection: Selection) -> list[str]:
-    """The fields that choose among the listed tasks."""
-    # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
-    fields = ("suites",) if selection.source == "pairs" else COLUMNS
-    return [field for field in fields if getattr(selection, field)]
-
-
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
-    if any(getattr(task, COLUMNS[field]) not in getattr(selection, field) for field in _restricting(selection)):
-        return False
+    for field, column in COLUMNS.items():
+        if getattr(selection, field) and getattr(task, column) not in getattr(selection, field):
+            return False
     names = (task.name, task.base)
     return not selection.tasks or any(fnmatch.filter(names, pattern) for pattern in selection.tasks)
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
     """Refuse a name that none of the listed tasks has."""
-    for field in _restricting(selection):
-        if field != "suites":
-            known = {getattr(task, COLUMNS[field]) for task in listed}
-            _check_known(field, getattr(selection, field), known, selection)
+    for field in ("axes", "components", "levels"):
+        known = {getattr(task, COLUMNS[field]) for task in listed}
+        _check_known(field, getattr(selection, field), known, selection)
     names = {name for task in listed for name in (task.name, task.base)}
     names |= {task.name for suite in TESTED_SUITES for task in tasks(suite)}
     for pattern in selection.tasks:
@@ -216,7 +211,7 @@ def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> Pip
 
 def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
     """Those that can be rebuilt; says how many cannot. Refuses an axis of which nothing can be, if it is named."""
-    left = [task for task in wanted if libero_plus.runnable(load().find(task.suite, task.name), archive)]
+    left = [task for task in wanted if libero_plus.assets_of(load().find(task.suite, task.name), archive)]
     missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
     if missing and (not left or {*selection.axes} - {task.axis for task in left}):
