@@ -103,7 +103,7 @@ def test_folders_of_several_machines_are_one_result(subset: list[EvaluationTask]
     names = [policy.name for policy in read([one, polluted], across=["prompt"])]
     assert names == ["mine, prompt clean", "mine, prompt benchmark"]
     different = write(tmp_path / "different", [result(subset[0], False, "mine")])
-    with pytest.raises(PipelineError, match=r"two results of libero_plus.*'success': True.*'success': False"):
+    with pytest.raises(PipelineError, match=r"two results of libero_plus/.*: success True and False, reason"):
         read([one, different])
     with pytest.raises(PipelineError, match="no results"):
         read([one, tmp_path / "absent"])
@@ -126,7 +126,8 @@ def test_results_under_different_prompts_or_limits_are_not_compared(
         with pytest.raises(PipelineError) as caught:
             arguments.run(arguments)
         told = str(caught.value)
-        assert f"different values of {field}: {getattr(one, field)} and {getattr(other, field)}" in told
+        assert f"cannot be compared, on {subset[0].source}/{subset[0].suite}: {field} " in told
+        assert f"{getattr(one, field)} and {getattr(other, field)}" in told
         for folder, row in zip(folders, (one, other), strict=True):
             assert str(EpisodeFiles(folder).path(row.episode)) in told
         assert f"--across {field}" in told

@@ -86,7 +86,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Run, workers: in
     found = summary(rows) | {
         "policy": {"name": policy.name(evaluation.identity), "identity": evaluation.identity},
         "selection": selection.model_dump(mode="json"),
-        "settings": one_setting((row, evaluation.files) for row in rows) or settings.model_dump(),
+        "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
     }
     write_json(evaluation.folder / "summary.json", found)
     if faults:

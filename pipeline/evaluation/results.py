@@ -141,27 +141,19 @@ def stored(folders: Iterable[Path]) -> list[Stored]:
     return found
 
 
-def one_setting(found: Iterable[Stored]) -> dict[str, Any]:
+def one_setting(found: Sequence[Stored]) -> dict[str, Any]:
     """What held for all of some results, which are of one policy; empty where there is none.
 
     Raises:
         PipelineError: when two are of several policies or settings, with their files and what differs.
     """
-    first: Stored | None = None
-    for row, files in found:
-        first = first or (row, files)
-        earlier, where = first
-        one, other = ({"identity": each.identity, **each.settings} for each in (earlier, row))
-        differing = [name for name in {**one, **other} if one.get(name) != other.get(name)]
-        if differing:
-            raise PipelineError(
-                "results of several policies or settings: "
-                + ", ".join(f"{name} {one.get(name)} and {other.get(name)}" for name in differing),
-                where=f"{where.path(earlier.episode)} and {files.path(row.episode)}",
-                expected="one policy under one setting",
-                remedy="give each a folder of its own; evaluate a server that has changed under another --label",
-            )
-    return first[0].settings if first else {}
+    _agree(
+        (("", {"identity": row.identity, **row.settings}, files.path(row.episode)) for row, files in found),
+        "results of several policies or settings",
+        expected="one policy under one setting",
+        remedy="give each a folder of its own; evaluate a server that has changed under another --label",
+    )
+    return found[0][0].settings if found else {}
 
 
 def refuse_different(found: Iterable[Stored], across: Collection[str] = ()) -> None:
@@ -171,42 +163,57 @@ def refuse_different(found: Iterable[Stored], across: Collection[str] = ()) -> N
         across: fields of ``ALIKE`` that are what is compared.
 
     Raises:
-        PipelineError: when two were not, with their files.
+        PipelineError: when two were not, with their files and what differs.
     """
-    known: dict[tuple[str, str, str], Stored] = {}
-    for row, files in found:
-        for field in (field for field in ALIKE if field not in across):
-            earlier, where = known.setdefault((field, row.source, row.suite), (row, files))
-            one, other = getattr(earlier, field), getattr(row, field)
-            if one != other:
-                raise PipelineError(
-                    f"results on {row.source}/{row.suite} have different values of {field}: {one} and {other}",
-                    where=f"{where.path(earlier.episode)} and {files.path(row.episode)}",
-                    expected="one prompt and one step limit for all that is compared",
-                    remedy=f"evaluate both alike, or leave one of the folders out; where {field} is what you compare, "
-                    f"`evaluation-report --across {field}`",
-                )
+    fields = [field for field in ALIKE if field not in across]
+    _agree(
+        (
+            (f"{row.source}/{row.suite}", {field: getattr(row, field) for field in fields}, files.path(row.episode))
+            for row, files in found
+        ),
+        "these results cannot be compared, on ",
+        expected="one prompt and one step limit for all that is compared",
+        remedy="evaluate both alike, or leave one of the folders out; where the difference is what you compare, "
+        "`evaluation-report --across prompt`, or --across step_limit",
+    )
 
 
 def refuse_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
     """Have each name mean one policy.
 
     Args:
-        policies: name, identity, and the folder that results are in or go to.
+        policies: name, identity, and the file or folder that results are in or go to.
 
     Raises:
         PipelineError: when one name has two identities.
     """
-    known: dict[str, tuple[str, Path]] = {}
-    for name, identity, folder in policies:
-        earlier, where = known.setdefault(name, (identity, folder))
-        if earlier != identity:
+    _agree(
+        ((repr(name), {"identity": identity}, where) for name, identity, where in policies),
+        "two policies have the name ",
+        expected="one policy under one name",
+        remedy="evaluate one of them under another --label into another folder, or leave out the folder of the one "
+        "that is no longer wanted",
+    )
+
+
+def _agree(found: Iterable[tuple[str, Mapping[str, object], Path]], what: str, expected: str, remedy: str) -> None:
+    """Have facts that go by one name be the same.
+
+    Args:
+        found: name, facts, and the file that has them.
+        what: is said of two that differ, before their name.
+    """
+    known: dict[str, tuple[Mapping[str, object], Path]] = {}
+    for name, facts, file in found:
+        earlier, where = known.setdefault(name, (facts, file))
+        differing = [
+            f"{fact} {earlier.get(fact)} and {facts.get(fact)}"
+            for fact in {**earlier, **facts}
+            if earlier.get(fact) != facts.get(fact)
+        ]
+        if differing:
             raise PipelineError(
-                f"two policies have the name {name!r}: {earlier} and {identity}",
-                where=" and ".join(dict.fromkeys([str(where), str(folder)])),
-                expected="one policy under one name",
-                remedy="evaluate one of them under another --label into another folder, or leave out the folder of the "
-                "one that is no longer wanted",
+                f"{what}{name}: {', '.join(differing)}", where=f"{where} and {file}", expected=expected, remedy=remedy
             )
 
 
@@ -246,18 +253,20 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     found = stored(folders)
     refuse_shared_names((row.policy, row.identity, files.folder) for row, files in found)
     refuse_different(found, across)
+    outcomes = [{name: getattr(row, name) for name in OUTCOME} for row, _ in found]
+    _agree(
+        (
+            (f"{row} by {row.policy}, episode {row.episode}", outcome, files.path(row.episode))
+            for (row, files), outcome in zip(found, outcomes, strict=True)
+        ),
+        "two results of ",
+        expected="one result of each episode, the same wherever it was run",
+        remedy="leave one of the folders out; run the one again that other versions of the packages made, or give each "
+        "of two policies behind a server a --label of its own",
+    )
     results: dict[str, Stored] = {}
     for row, files in found:
-        earlier, where = results.setdefault(row.episode, (row, files))
-        outcomes = [{name: getattr(one, name) for name in OUTCOME} for one in (earlier, row)]
-        if outcomes[0] != outcomes[1]:
-            raise PipelineError(
-                f"two results of {row} by {row.policy} differ: {outcomes[0]} and {outcomes[1]}",
-                where=f"{where.path(row.episode)} and {files.path(row.episode)}",
-                expected="one result of each episode, the same wherever it was run",
-                remedy="leave one of the folders out; run the one again that other versions of the packages made, or "
-                "give each of two policies behind a server a --label of its own",
-            )
+        results.setdefault(row.episode, (row, files))
     groups: dict[str, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
     for row, files in results.values():
         groups[row.identity][digest(row.settings)].append((row, files))
