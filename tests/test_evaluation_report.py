@@ -16,13 +16,13 @@ from scipy.stats import binomtest
 
 from pipeline.__main__ import parser
 from pipeline.errors import PipelineError
-from pipeline.evaluation.findings import FAILURES, paper_table
 from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import compare, mcnemar, paired
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.report import evaluation_report
+from pipeline.report.evaluation_findings import FAILURES, paper_table
 
 
 @pytest.fixture(scope="module")

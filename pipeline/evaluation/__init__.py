@@ -8,8 +8,7 @@ those above them:
 * ``selection``: the tasks that a user names, or a benchmark of one's own.
 * ``environment``: starts an episode, shows it, takes actions. ``simulator``: LIBERO's environment below it.
 * ``policies``: what acts. ``reference_policies``: the demonstrations, as a check.
-* ``findings``: what a report says, the paper's table in it. ``composition``: the compositional gap of two axes.
-  ``statistics``: rates, intervals, comparisons, difficulty.
+* ``statistics``: rates, intervals, comparisons, difficulty. ``composition``: the compositional gap of two axes.
 * ``results``: an episode's row, the files of all, and which can be compared.
 * ``libero_plus``, ``own_draws``: where test tasks and held-out draws come from. ``tasks``: what a task is, and other
   goals for LIBERO's.

@@ -198,12 +198,12 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
 def find_replacement(task: Task, name: str) -> Replacement:
     """The replacement that the name of an evaluation task says; refused when the task has none of that name."""
     named = {one.name(task, 0).rpartition("_")[0]: one for one in replacements(task)}
-    replaced = name.rpartition("_")[0]
-    if replaced not in named:
+    asked = name.rpartition("_")[0]
+    if asked not in named:
         raise PipelineError(
-            f"{task.suite} has no goal {replaced!r}", expected=" or ".join(named) or "a task with other objects"
+            f"{task.suite} has no goal {asked!r}", expected=" or ".join(named) or "a task with other objects"
         )
-    return named[replaced]
+    return named[asked]
 
 
 def _fits(category: str, relation: str, place: str, known: Bddl) -> bool:
