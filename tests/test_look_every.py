@@ -21,6 +21,7 @@ from model_server import running  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
+from pipeline.errors import PipelineError  # noqa: E402
 from pipeline.evaluation import environment  # noqa: E402
 from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.harness import PerturbedLibero  # noqa: E402
@@ -83,6 +84,13 @@ def short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(environment.STEP_LIMITS, STOVE.suite, STEPS)
         yield
+
+
+def test_rows_of_the_harness_need_a_folder_and_a_label(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="out: DIR"):
+        PerturbedLibero(label="act")
+    with pytest.raises(PipelineError, match="--label NAME"):
+        PerturbedLibero(out=str(tmp_path))
 
 
 @pytest.fixture(scope="module")

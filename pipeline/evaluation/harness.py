@@ -91,6 +91,8 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             policy = PolicyConfig(kind="server", address="of the harness", label=label)
             self._evaluation = Evaluation(episodes, policy, policy.identity(), Path(out), archive=self._archive)
             self._device = gl.choose().device
+        elif label:
+            raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR beside it")
         self._next_look = NextLook(self._environment.settings.look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
