@@ -134,12 +134,17 @@ def differences(then: Mapping[str, str], now: Mapping[str, str]) -> str:
     )
 
 
-def refuse_unasked(found: Counter[str], where: Path) -> None:
+ALLOW = f"`{REMAKE}=1 dvc repro`, or --remake behind one stage's command"
+"""How a person allows it for what a stage makes."""
+
+
+def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
     """Say what is made anew, and stop unless that was asked for.
 
     Args:
         found: what and why, to the number of files.
         where: they lie.
+        allow: how to allow it, in words.
 
     Raises:
         PipelineError: when there is any, and the environment does not allow it. Nothing was changed.
@@ -154,8 +159,7 @@ def refuse_unasked(found: Counter[str], where: Path) -> None:
         f"finished work would be made anew: {told}",
         where=where,
         expected="the recipes, packages, machine code and OpenGL device that it was made with",
-        remedy="go on with the version and the machine that made it, or allow it: `REMAKE=1 dvc repro`, or --remake "
-        "behind one stage's command",
+        remedy=f"go on with the version and the machine that made it, or allow it: {allow}",
     )
 
 
