@@ -67,16 +67,24 @@ def _fetch(arguments: argparse.Namespace) -> int:
 
 
 def _preview(arguments: argparse.Namespace) -> int:
-    """draw what an axis does to a task: its first frame, and eleven draws over the components and levels"""
+    """render what an axis does to a task: its first frame, and eleven draws over the components and levels
+
+    Without AXIS, one draw of each axis beside the clean twin. A name that ends in .jpg gives a JPEG file, else PNG.
+    """
     from pipeline.report import preview
 
     config = load(arguments.config)
     tasks = select_tasks([arguments.task])
     stage = preview.staged(tasks, config)
+    test, shown = benchmark.load(), arguments.axis or "every axis"
     with replaced(arguments.out) as temporary:
-        preview.draw(stage, arguments.axis, config, benchmark.load()).save(temporary, format="PNG")
+        if arguments.axis:
+            picture = preview.draw(stage, arguments.axis, config, test)
+        else:
+            picture = preview.overview(stage, config, test)
+        picture.save(temporary, format="JPEG" if arguments.out.suffix == ".jpg" else "PNG", quality=90)
         of = f", the first of {len(tasks)} tasks" if len(tasks) > 1 else ""
-        print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")
+        print(f"{arguments.out} shows {shown} on {stage.demo.demo_id}{of}")
     return 0
 
 
@@ -259,7 +267,11 @@ def _add_before(commands: Any) -> None:
     command = _command(commands, _preview)
     command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
     command.add_argument(
-        "axis", choices=Axes.model_fields, metavar="AXIS", help=f"any of {', '.join(Axes.model_fields)}"
+        "axis",
+        nargs="?",
+        choices=Axes.model_fields,
+        metavar="AXIS",
+        help=f"any of {', '.join(Axes.model_fields)} (default: one draw of each)",
     )
     command.add_argument(
         "--config",
