@@ -235,7 +235,8 @@ def test_the_command_without_an_axis_shows_every_axis_beside_the_twin(
     monkeypatch.chdir(REPOSITORY)
     monkeypatch.setattr("sys.argv", ["pipeline", "preview", f"{BOWL.suite}/{BOWL.name}", "--out", str(out)])
     assert command_line.main() == 0
-    side, pitch = SCHEMA.frame.width, SCHEMA.frame.width + sheets.GAP_PX
+    side = SCHEMA.frame.shape[1]
+    pitch = side + sheets.GAP_PX
     with Image.open(out) as sheet:
         assert sheet.format == "JPEG"
         assert sheet.width == 3 * pitch + sheets.GAP_PX
