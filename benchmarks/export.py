@@ -78,7 +78,7 @@ def dataset(writer: str, out: Path, parts: int) -> Format[Any]:
     if writer == "rlds":
         return Rlds(out, RldsConfig(name="benchmark", shards=parts))
     frames: Literal["video", "images"] = "video" if writer == "lerobot_video" else "images"
-    return LeRobot(out, LeRobotConfig(name="benchmark", parts=parts, frames=frames))
+    return LeRobot(out, LeRobotConfig(name="benchmark", shards=parts, frames=frames))
 
 
 def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, float]:

@@ -1,4 +1,7 @@
-"""Stage inputs: list the user's own files, and look whether stored ones are gone or changed, so that DVC notices."""
+"""Stage inputs: write out the configuration, list the user's own files, and look whether stored ones have changed.
+
+So DVC notices what it cannot see itself.
+"""
 
 from pipeline.config import Config
 from pipeline.formats.registry import formats_of
@@ -9,6 +12,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:
+    inputs.write(inputs.settings(config), config.data / "settings.json")
     inputs.write(inputs.listing(config), config.data / "inputs.json")
     TrajectoryStore(config.data / "trajectories").settle()
     FrameStore(config.data / "frames", config.render).settle()

@@ -24,7 +24,8 @@ def run(config: Config) -> None:
     motions = {
         name: frames.motion(name) for name in dict.fromkeys(rows[episode].trajectory_id for episode in episodes.kept)
     }
-    sets = by_suite(episodes.kept, {episode: row.suite for episode, row in rows.items()}, config.export.rlds.name)
+    name = (config.export.rlds or config.export).name
+    sets = by_suite(episodes.kept, {episode: row.suite for episode, row in rows.items()}, name)
     figures = {
         name: motion_statistics.openvla([motions[rows[episode].trajectory_id] for episode in members])
         for name, members in sets.items()

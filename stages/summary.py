@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.config import Config
+from pipeline.formats.registry import formats_of
 from pipeline.run import finished, manifest
 from pipeline.run.stage import main
 
@@ -20,8 +21,7 @@ def run(config: Config) -> None:
     console.print(manifest.counts_table(rows))
     sheets, previews = sorted((config.data / "sheets").iterdir()), sorted((config.data / "previews").iterdir())
     made = {
-        "RLDS": config.data / "rlds",
-        "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
+        **{one.title: one.root for one in formats_of(config.data, config.export, config.render.extras)},
         "manifest": config.data / "manifest.parquet",
         **{f"{file.stem} sheet": file for file in sheets},
         **{f"{folder.name} previews": folder for folder in previews},

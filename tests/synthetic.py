@@ -124,7 +124,7 @@ def write_lerobot(
     name: str = NAME,
     extras: Sequence[Extra] = (),
 ) -> LeRobot:
-    target = LeRobot(out, LeRobotConfig(name=name, parts=3, frames=frames), extras)
+    target = LeRobot(out, LeRobotConfig(name=name, shards=3, frames=frames), extras)
     export(target, episodes(load), run)
     return target
 

@@ -228,12 +228,10 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 @pytest.mark.slow
-def test_the_command_without_an_axis_shows_every_axis_beside_the_twin(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_shows_all_axes_beside_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "axes.jpg"
     monkeypatch.chdir(REPOSITORY)
-    monkeypatch.setattr("sys.argv", ["pipeline", "preview", f"{BOWL.suite}/{BOWL.name}", "--out", str(out)])
+    monkeypatch.setattr("sys.argv", ["pipeline", "preview", f"{BOWL.suite}/{BOWL.name}", "all", "--out", str(out)])
     assert command_line.main() == 0
     side = SCHEMA.frame.shape[1]
     pitch = side + sheets.GAP_PX

@@ -16,7 +16,7 @@ READ = """
 import json
 from pathlib import Path
 import pipeline
-from pipeline.__main__ import config_schema
+from pipeline.commands.develop import config_schema
 from pipeline.axes.language import load_bank
 from pipeline.catalogue.objects import models
 from pipeline.episode_schema import SCHEMA, SCHEMA_FILE

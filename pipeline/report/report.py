@@ -234,5 +234,5 @@ _Settings.add_multi_representer(
 
 def _settings(config: Config) -> str:
     # Where it is computed changes nothing, and would make the page differ.
-    chosen = config.model_dump(exclude_defaults=True, exclude={"compute"})
+    chosen = config.model_dump(exclude_defaults=True, exclude={"compute", "folder"})
     return yaml.dump(chosen, Dumper=_Settings, sort_keys=False)

@@ -18,7 +18,17 @@ from pipeline.compute.pool import Run, runner
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
+from pipeline.files import (
+    checksum,
+    keep_below,
+    keep_only,
+    put_in_place,
+    remove,
+    remove_if_empty,
+    replaced,
+    sync,
+    write_json,
+)
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
@@ -29,8 +39,19 @@ from pipeline.seeding import digest
 AnyFormat = Format[Any]
 
 
-def export_run(target: Format[Any], config: Config) -> None:
-    """Bring a run's dataset up to date, and say what was done."""
+def export_run(kind: type[AnyFormat], config: Config) -> None:
+    """Bring a run's dataset of one format up to date, and say what was done.
+
+    One that is not asked for is left as it is: where there is none, its record is an empty one.
+    """
+    options = config.export.formats.get(kind.name)
+    if options is None:
+        record = config.data / f"{kind.name}.json"
+        if not record.exists():
+            write_json(record, {})
+        print(f"{kind.title} is not asked for: export.{kind.name} is null")
+        return
+    target = kind(config.data, options, config.render.extras)
     episodes = kept_episodes(config)
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
@@ -61,7 +82,7 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
         RECIPES[target.name],
         {package: version(package) for package in PACKAGES[target.name]},
         SCHEMA.model_dump(mode="json"),
-        target.options.model_dump(mode="json"),
+        _options(target),
         target.extras,
         [[piece.path, piece.ids] for piece in target.pieces(episodes)],
         [known.content for known in episodes.known.values()],
@@ -71,7 +92,13 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
 def asked(target: AnyFormat, episodes: Episodes) -> str:
     """A short digest of what of it was asked for: the episodes with all that they are, and the options."""
     content = [known.content for known in episodes.known.values()]
-    return digest(target.options.model_dump(mode="json"), target.extras, content)[:16]
+    return digest(_options(target), target.extras, content)[:16]
+
+
+def _options(target: AnyFormat) -> dict[str, Any]:
+    """By the names that the fields had when they were first written."""
+    dumped: dict[str, Any] = target.options.model_dump(mode="json", by_alias=True)
+    return dumped
 
 
 def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:

@@ -35,7 +35,7 @@ class Result:
     reason: Annotated[
         str,
         "kept, or why not: goal_not_reached, goal_lost, too_short, simulation_unstable, too_dark, blown_out, what a "
-        "physics perturbation was refused for, not_replayed, reserve_not_needed",
+        "physics perturbation was refused for, not_replayed, reserve_not_needed, left_out (export.where names others)",
     ]
     replay_mode: Annotated[
         str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"

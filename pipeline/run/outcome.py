@@ -17,6 +17,9 @@ from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
 
+LEFT_OUT = "left_out"
+"""The reason why an episode that reached its goal is in no dataset: ``export.where`` does not name it."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -91,7 +94,7 @@ def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[st
 
 
 def read(config: Config) -> Outcome:
-    """What became of every row of a run, after the render stage.
+    """What became of every row of a run, after the render stage, and what of it ``export.where`` leaves out.
 
     Raises:
         PipelineError: when a trajectory or a frame that the plan needs is not there, or can no longer be read.
@@ -102,6 +105,10 @@ def read(config: Config) -> Outcome:
     rejected = rejections(rows, frames)
     trajectories = replayed(rows, config.data / "trajectories", rejected)
     judged = plan.select(rows, verdicts_of(trajectories), rejected)
+    if where := config.export.where:
+        for row in rows:
+            if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
+                judged[row.episode_id] = Verdict(False, LEFT_OUT)
     missing = dict.fromkeys(
         store.folder(row.trajectory_id)
         for row in rows

@@ -1,6 +1,6 @@
 """Rebuild one episode from its row of the manifest and the demonstration, and say where it differs from the dataset's.
 
-`python -m pipeline regenerate EPISODE_ID --manifest data/<run>/manifest.parquet --out FOLDER`
+`python -m pipeline regenerate EPISODE_ID CONFIG --out FOLDER`
 """
 
 from __future__ import annotations

@@ -93,7 +93,8 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
                 total.add(results)
         finally:
             scene_of_process().close()
-    if not any(fault.dataset == "rlds" for check in ("readable", "checksums") for fault in total.findings[check]):
+    damaged = {fault.dataset for check in ("readable", "checksums") for fault in total.findings[check]}
+    if config.export.rlds and "rlds" not in damaged:
         # OFT's reader stops at what is damaged.
         sets = oft.datasets(data / "rlds")
         statistics = read_json(data / "dataset_statistics.json")
