@@ -76,7 +76,7 @@ def _preview_arguments(command: argparse.ArgumentParser) -> None:
 def preview(arguments: argparse.Namespace) -> int:
     """render what an axis does to a task: its first frame, and eleven draws over the components and levels
 
-    With `all`, one strong draw of each axis beside the clean twin. A name that ends in .jpg gives a JPEG file, else PNG.
+    With `all`, one strong draw of each axis beside the clean twin. A name that ends in .jpg gives JPEG, else PNG.
     Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default ranges.
     """
     from pipeline.files import replaced
