@@ -237,7 +237,7 @@ def test_the_command_shows_all_axes_beside_the_twin(tmp_path: Path, monkeypatch:
     pitch = side + sheets.GAP_PX
     with Image.open(out) as sheet:
         assert sheet.format == "JPEG"
-        assert sheet.width == 3 * pitch + sheets.GAP_PX
+        assert sheet.width == 5 * pitch + sheets.GAP_PX
         row = np.asarray(sheet).astype(int)[2 * sheets.LINE_PX :][:side, sheets.GAP_PX :]
     twin, layout, pose = (row[:, left : left + side] for left in (0, pitch, 2 * pitch))
     assert [np.abs(tile - twin).mean() > 2 for tile in (layout, pose)] == [True, True]

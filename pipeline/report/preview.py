@@ -196,7 +196,7 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
         axis = configured(name, config)
         if axis.applies(demo.task):
             tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test), view))
-    return sheet(f"{demo.task.suite}/{demo.task.name}: first frame of the agent view, one draw of each axis", tiles, 3)
+    return sheet(f"{demo.task.suite}/{demo.task.name}: first frame of the agent view, one draw of each axis", tiles, 5)
 
 
 def _strongest(stage: Stage, drawn: Sequence[AnyPerturbation], view: str) -> Tile:
