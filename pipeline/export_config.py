@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import count
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -78,6 +79,13 @@ class LeRobotConfig(_Frozen):
     shards: Count | None = Field(default=None, serialization_alias="parts")
     frames: Literal["video", "images"] = "video"
     validation: Share = 0.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _first_name(cls, raw: Any) -> Any:
+        if isinstance(raw, Mapping) and "parts" in raw:
+            raise ValueError("parts is called shards now, as in rlds")
+        return raw
 
 
 CLEAN = "clean"

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.config import Config
-from pipeline.formats.registry import formats_of
 from pipeline.run import finished, manifest
 from pipeline.run.stage import main
 
@@ -17,18 +16,7 @@ def run(config: Config) -> None:
         memory.keep()
     from rich.console import Console
 
-    console = Console()
-    console.print(manifest.counts_table(rows))
-    sheets, previews = sorted((config.data / "sheets").iterdir()), sorted((config.data / "previews").iterdir())
-    made = {
-        **{one.title: one.root for one in formats_of(config.data, config.export, config.render.extras)},
-        "manifest": config.data / "manifest.parquet",
-        **{f"{file.stem} sheet": file for file in sheets},
-        **{f"{folder.name} previews": folder for folder in previews},
-    }
-    width = max(map(len, made))
-    for name, path in made.items():
-        console.print(f"{name:>{width}}  {path}", soft_wrap=True, highlight=False)
+    Console().print(manifest.counts_table(rows))
 
 
 def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,7 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
         ("carrier pigeon", ("compute",), "compute"),
         ("my_set", ("export", "rlds", "name"), "export.rlds.name"),
         ("libero_aloha", ("export", "rlds", "name"), "a name with libero and without aloha in it"),
+        (4, ("export", "lerobot", "parts"), "export.lerobot: Value error, parts is called shards now"),
         (0.6, ("export", "rlds", "validation"), "export.rlds.validation: Input should be less than or equal to 0.5"),
         (1e-320, ("export", "lerobot", "validation"), "export.lerobot.validation"),
         ({"background": {"colour_scale": [0.2, 0.4, 0.6, 0.8, 2.0]}}, ("plan", "axes"), "colour_scale.4"),
@@ -138,6 +140,19 @@ def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
     assert {name: one.name for name, one in config.export.formats.items()} == dict.fromkeys(
         ("rlds", "lerobot"), "libero_mine"
     )
+
+
+def test_the_examples_of_the_documentation_are_valid() -> None:
+    text = (REPOSITORY / "docs" / "configuration.md").read_text()
+    examples = [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]
+    whole = [example for example in examples if "name" in example]
+    assert len(whole) == 2
+    everything = yaml.safe_load((REPOSITORY / "configs" / "small.yaml").read_text())
+    for example in examples:
+        if "axes" in example:
+            example = {"plan": everything["plan"] | example}
+        if {"plan", "export"}.intersection(example):
+            Config.model_validate(everything | example)
 
 
 def test_a_folder_of_demonstrations_is_of_hdf5_files_and_one_format_is_enough(tmp_path: Path) -> None:

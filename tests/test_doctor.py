@@ -27,14 +27,14 @@ from pipeline.types import Extra
 from pipeline.validation import doctor
 from pipeline.validation.disk import needed_mb
 
-REAL_TRIAL = doctor.trial
+REAL_TRIAL = machine.trial
 
 
 @pytest.fixture(autouse=True)
 def trial(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """A trial that takes no time; the real one is run on its own."""
     result = {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"}
-    monkeypatch.setattr(doctor, "trial", lambda: result)
+    monkeypatch.setattr(machine, "trial", lambda: result)
     return result
 
 

@@ -16,9 +16,9 @@ from pipeline.errors import PipelineError
 from pipeline.exit_status import Terminated
 from pipeline.files import remove, replaced
 from pipeline.formats.registry import formats_of
+from pipeline.run.stage import PARAMS
 
 DVC = (sys.executable, "-m", "dvc")
-PARAMS = Path("params.yaml")
 HEADER = """\
 # The run that `dvc repro` makes: the name of a file in configs/, and its field `folder`. `run CONFIG` writes both.
 """
@@ -64,7 +64,7 @@ def choose(config: Config) -> None:
     if not PARAMS.exists() or PARAMS.read_text() != text:
         with replaced(PARAMS) as temporary:
             temporary.write_text(text)
-        print(f"{PARAMS} names {config.name} from now on")
+        print(f"{PARAMS} names {config.name} from now on", flush=True)
 
 
 def _refuse_elsewhere(file: Path, config: Config) -> None:

@@ -22,6 +22,9 @@ from pipeline.identity import REMAKE
 OWNER = "configuration.json"
 """File of a run's folder that says which configuration file the folder belongs to."""
 
+PARAMS = Path("params.yaml")
+"""Says which run `dvc repro` makes, and in which folder."""
+
 LOCK = ".lock"
 """Empty file of a run's folder that a stage holds while it runs."""
 
@@ -104,14 +107,13 @@ def owned(file: Path) -> Config:
 
 def _refuse_other_folder(config: Config, file: Path) -> None:
     """DVC knows the folder from params.yaml alone, and would look for a stage's files there."""
-    params = Path("params.yaml")
-    chosen = yaml.safe_load(params.read_text()) if params.is_file() else None
+    chosen = yaml.safe_load(PARAMS.read_text()) if PARAMS.is_file() else None
     if isinstance(chosen, dict) and chosen.get("run") == file.stem and chosen.get("data") != config.folder.as_posix():
         raise PipelineError(
             f"says `data: {chosen.get('data')}`, and {file} says `folder: {config.folder}`",
-            where=params,
+            where=PARAMS,
             expected="the same folder in both",
-            remedy=f"python -m pipeline run {file}, which writes it into {params}",
+            remedy=f"python -m pipeline run {file}, which writes it into {PARAMS}",
         )
 
 
