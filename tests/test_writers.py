@@ -23,7 +23,7 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import dataset_to_policy_features
+from lerobot.policies.factory import dataset_to_policy_features
 from numpy.typing import NDArray
 from synthetic import (
     EXTRAS,

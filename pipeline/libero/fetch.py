@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+import httpx
 from huggingface_hub import snapshot_download
 
 from pipeline.errors import PipelineError
@@ -48,7 +49,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
             # The files are public: no reason to show a mirror the user's token.
             token=False,
         )
-    except OSError as error:
+    except (OSError, httpx.HTTPError) as error:  # the second since huggingface-hub 1
         raise PipelineError(
             f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
         ) from error
