@@ -20,8 +20,8 @@ REVISION = "f13aa24a3da8c43c7225569f28c562979fa0e35a"
 def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list[Path]:
     """Download whole suites to ``<out>/<suite>/<task>_demo.hdf5``: 10 files of 0.3 to 1 GB for each suite of 10 tasks.
 
-    A download that was cut short goes on where it stopped, and files that are there are not fetched again. The
-    revision is fixed.
+    A download that was cut short goes on where it stopped (since huggingface-hub 1 at the start of that file), and
+    files that are there are not fetched again. The revision is fixed.
 
     Args:
         out: the folder to use as ``demos.root`` afterwards.
