@@ -122,8 +122,9 @@ def write_lerobot(
     frames: Any = "video",
     name: str = NAME,
     extras: Sequence[Extra] = (),
+    parts: int = 3,
 ) -> LeRobot:
-    target = LeRobot(out, LeRobotConfig(name=name, parts=3, frames=frames), extras)
+    target = LeRobot(out, LeRobotConfig(name=name, parts=parts, frames=frames), extras)
     export(target, episodes(load), run)
     return target
 
