@@ -366,6 +366,30 @@ def test_bytes_do_not_depend_on_the_workers(written: Written, tmp_path: Path) ->
     assert not {"mujoco", "robosuite", "libero", "tensorflow"} & modules
 
 
+WITHOUT_TORCH = """
+import sys, tempfile
+from pathlib import Path
+import pipeline
+from synthetic import IDS, write_lerobot, write_rlds
+
+folder = Path(tempfile.mkdtemp(dir=sys.argv[1]))
+write_lerobot(folder)
+made = write_rlds(folder)
+rows = {name: {**made.record().places[name], "episode_id": name, "suite": "synthetic", "steps": 1} for name in IDS}
+assert all(made.read(row, folder) for row in rows.values())
+list(made.check(rows, folder))
+print(sorted({"torch", "tensorflow", "lerobot"} & sys.modules.keys()))
+"""
+
+
+def test_rlds_is_made_and_checked_and_lerobot_written_without_torch(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, str(tmp_path)], cwd=Path(__file__).parent, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout == "[]\n"
+
+
 @pytest.mark.slow
 def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
     """Both formats hand out the files and numbers that went in; what is not extra stays as it is without them."""
