@@ -34,7 +34,7 @@ CONFIG = {
         "source": "starter",
         "tasks": ["libero_object/pick_up_the_orange_juice_*", "libero_goal/put_the_bowl_on_the_plate"],
     },
-    "plan": {"seed": 20261121, "axes": {name: {} for name in AXES}, "episodes": dict.fromkeys(AXES, 2)},
+    "plan": {"seed": 20261121, "axes": {name: {} for name in AXES}, "episodes": dict.fromkeys(AXES, 1)},
     "replay": {"mode": "auto", "noops": "drop"},
     "render": {"jpeg_quality": 95},
     "export": {"rlds": {"name": "pythons", "shards": 2}, "lerobot": {"name": "pythons", "parts": 2}},
