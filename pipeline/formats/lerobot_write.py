@@ -261,7 +261,8 @@ def _listed(figures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
 
 
 def _provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
-    columns = {"episode_index": pa.int64()} | dict.fromkeys(SCHEMA.provenance, pa.string())
+    columns = {"episode_index": pa.int64()}
+    columns |= {name: pa.type_for_alias(dtype) for name, dtype in SCHEMA.provenance.items()}
     columns |= {name: pa.list_(pa.float32(), spec.shape[0] * spec.shape[1]) for name, spec in matrix_columns().items()}
     return pa.schema(columns | ({INSTANCES: pa.string()} if named(extras) else {}))
 
