@@ -37,7 +37,7 @@ CONFIG = {
     "plan": {"seed": 20261121, "axes": {name: {} for name in AXES}, "episodes": dict.fromkeys(AXES, 1)},
     "replay": {"mode": "auto", "noops": "drop"},
     "render": {"jpeg_quality": 95},
-    "export": {"rlds": {"name": "pythons", "shards": 2}, "lerobot": {"name": "pythons", "parts": 2}},
+    "export": {"rlds": {"name": "libero_pythons", "shards": 2}, "lerobot": {"name": "libero_pythons", "parts": 2}},
 }
 WITHOUT_TORCH = ("doctor", "inputs", "plan", "leakage", "replay", "render", "export_rlds")
 WITH_TORCH = ("export_lerobot", "manifest", "recipe", "validate")
