@@ -46,8 +46,8 @@ benchmark's do. 5: the command and the posture are those of the recording among 
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
 lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
-3 of ``rlds``, 6 of ``lerobot``: the seed is a number, quality is told, features are described. 5 of ``lerobot``: files
-are written directly, and camera matrices stand once for each episode.
+3 of ``rlds``, 6 of ``lerobot``: the seed is a number, quality is told, features and videos are described. 5 of
+``lerobot``: files are written directly, and camera matrices stand once for each episode.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
 2 of it: joint angles are held against the replay's. 3: figures of quality too, against the manifest's.
 ``pictures``: what ``summary`` draws, and the report.
