@@ -77,9 +77,25 @@ class LeRobotConfig(_Frozen):
     validation: Share = 0.0
 
 
+class LeRobotV21Config(_Frozen):
+    """How LeRobot datasets of version 2.1 are written.
+
+    Attributes:
+        name: of the dataset, or what the sets' names begin with.
+        convention: ``ipec`` for GR00T, starVLA and others: a set for each suite, as IPEC-COMMUNITY's of LIBERO, with
+            videos and a gripper of 1 open, 0 closed. ``openpi``: one set, as openpi's configuration of LIBERO reads it.
+        validation: share of each task's demonstrations whose episodes go into sets of their own, named ``..._val``.
+    """
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    convention: Literal["ipec", "openpi"]
+    validation: Share = 0.0
+
+
 class ExportConfig(_Frozen):
     rlds: RldsConfig
     lerobot: LeRobotConfig
+    lerobot_v21: LeRobotV21Config | None = None
 
     def refuse_too_few(self, demonstrations: int) -> None:
         """Refuse a validation split that nothing could be in.
@@ -91,6 +107,6 @@ class ExportConfig(_Frozen):
             PipelineError: when a share holds none of them out.
         """
         for name in ExportConfig.model_fields:
-            share: float = getattr(self, name).validation
+            share: float = getattr(getattr(self, name), "validation", 0.0)
             if share and not held_out(share, demonstrations):
                 raise too_few(share, f"export.{name}.validation")

@@ -26,14 +26,15 @@ from pipeline.errors import PipelineError
 from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
 
-Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "evaluation", "checks", "pictures"]
+Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "lerobot_v21", "evaluation", "checks", "pictures"]
 
 RECIPES: dict[Step, int] = {
     "physics": 5,
     "pixels": 5,
     "encoding": 1,
     "rlds": 2,
-    "lerobot": 5,
+    "lerobot": 6,
+    "lerobot_v21": 1,
     "evaluation": 1,
     "checks": 2,
     "pictures": 2,
@@ -45,7 +46,8 @@ benchmark's do. 5: the command and the posture are those of the recording among 
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
 lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
-5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode.
+5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode. 6: there is a
+``meta/modality.json``.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
 2 of it: joint angles are held against the replay's. ``pictures``: what ``summary`` draws, and the report.
 2 of it: a contact sheet is spread over the run, and shows other starts at the first frame."""
@@ -71,6 +73,7 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
     "encoding": ("opencv-python-headless",),
     "rlds": ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy"),
     "lerobot": ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless"),
+    "lerobot_v21": ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless"),
     "checks": ("tensorflow-datasets", "lerobot", "datasets", "av", "pyarrow"),
     "pictures": ("robouse",),
 }

@@ -63,9 +63,9 @@ class Format(ABC, Generic[Options]):
     """For people, and the hub's tag."""
     columns: ClassVar[tuple[pa.Field, ...]]
     """Of the manifest: where an episode lies; null when it was dropped."""
-    keys: ClassVar[Mapping[str, str]]
+    keys: Mapping[str, str]
     """Each view, ``state``, ``joint_state`` and ``action`` to its name in this format."""
-    clients: ClassVar[tuple[str, ...]]
+    clients: tuple[str, ...]
     """The clients of ``finetune.yaml`` that train on this format."""
 
     def __init__(self, data: Path, options: Options, extras: Sequence[Extra] = ()) -> None:
@@ -83,6 +83,11 @@ class Format(ABC, Generic[Options]):
         return self.data / f"{self.name}.json"
 
     @property
+    def stage_record(self) -> Path:
+        """The record that DVC knows the output of the format's stage by."""
+        return self.record_file
+
+    @property
     def work(self) -> Path:
         """Holds what is being made; on the file system of ``folder``, so that a finished dataset is only renamed."""
         return self.data / ".work" / self.name
@@ -98,7 +103,9 @@ class Format(ABC, Generic[Options]):
             return replace(record, files=dict(record.files))
         except (OSError, ValueError, TypeError) as error:
             raise PipelineError(
-                f"no finished dataset ({error})", where=self.record_file, remedy=f"dvc repro export_{self.name}"
+                f"no finished dataset ({error})",
+                where=self.record_file,
+                remedy=f"dvc repro export_{self.stage_record.stem}",
             ) from error
 
     def written(self) -> list[Written]:

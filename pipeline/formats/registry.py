@@ -11,18 +11,21 @@ import pyarrow as pa
 from pipeline.export_config import ExportConfig
 from pipeline.formats.base import Format
 from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.types import Extra
 
 FORMATS: tuple[type[Format[Any]], ...] = (
     Rlds,
     LeRobot,
+    LeRobotV21,
 )
 
 
 def formats_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
-    """Every format's dataset of a run whose folder is ``data`` and whose episodes have these extras."""
-    return [kind(data, getattr(options, kind.name), extras) for kind in FORMATS]
+    """The datasets that a run asks for, whose folder is ``data`` and whose episodes have these extras."""
+    asked = {kind: getattr(options, kind.name) for kind in FORMATS}
+    return [kind(data, section, extras) for kind, section in asked.items() if section is not None]
 
 
 def columns() -> list[pa.Field]:

@@ -123,6 +123,7 @@ def settle(target: AnyFormat) -> None:
         target.record_file.touch()
     else:
         target.record_file.unlink()
+        target.stage_record.unlink(missing_ok=True)
 
 
 def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
