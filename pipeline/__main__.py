@@ -20,6 +20,7 @@ from pipeline.arguments import positive
 from pipeline.axes import Axes
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
+from pipeline.errors import PipelineError
 from pipeline.evaluation import commands as evaluation_commands
 from pipeline.exit_status import exit_status
 from pipeline.files import replaced
@@ -194,10 +195,12 @@ def _push(arguments: argparse.Namespace) -> int:
     config = owned(arguments.config)
     from pipeline.publish import push
 
-    (target,) = (
-        one for one in formats_of(config.data, config.export, config.render.extras) if one.name == arguments.format
-    )
-    upload = push.prepare(target)
+    asked = {one.name: one for one in formats_of(config.data, config.export, config.render.extras)}
+    if arguments.format not in asked:
+        raise PipelineError(
+            f"{arguments.format} is not asked for", where=arguments.config, remedy=f"set export.{arguments.format}"
+        )
+    upload = push.prepare(asked[arguments.format])
     print(upload.summary())
     if not arguments.really:
         print(f"nothing was sent: with --really this goes to {arguments.repository}")

@@ -1,13 +1,15 @@
-"""Stage export_lerobot: the kept episodes as a LeRobot v3.0 dataset, through lerobot itself."""
+"""Stage export_lerobot: the kept episodes as a LeRobot v3.0 dataset, and as v2.1 where that is asked for."""
 
 from pipeline.config import Config
-from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.registry import formats_of
 from pipeline.run.export import export_run
 from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    export_run(LeRobot(config.data, config.export.lerobot, config.render.extras), config)
+    for target in formats_of(config.data, config.export, config.render.extras):
+        if target.stage_record == config.data / "lerobot.json":
+            export_run(target, config)
 
 
 if __name__ == "__main__":

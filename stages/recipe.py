@@ -7,11 +7,11 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    file, name = config.data / "manifest.parquet", config.export.lerobot.name
-    recipe = build(file, manifest.read(file), name=config.export.rlds.name, lerobot=name)
-    folder = config.data / "finetune"
-    write(recipe, config.data / "lerobot" / name, folder)
-    print(f"{folder / 'finetune.yaml'} has the recipe and a command line for each of {', '.join(recipe['clients'])}")
+    file = config.data / "manifest.parquet"
+    recipe = build(file, manifest.read(file), config.export)
+    write(recipe, config.data, config.export)
+    made = config.data / "finetune" / "finetune.yaml"
+    print(f"{made} has the recipe and a command line for each of {', '.join(recipe['clients'])}")
 
 
 if __name__ == "__main__":

@@ -91,7 +91,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
         super().__init__(data, options, extras)
         self.convention = CONVENTIONS[options.convention]
         self.keys = {name: self.convention.names.get(key, key) for name, key in LeRobot.keys.items()}
-        self.clients = {"ipec": ("starvla", "gr00t"), "openpi": ("openpi", "openpi_serve")}[options.convention]
+        self.clients = {"ipec": ("starvla",), "openpi": ("openpi", "openpi_serve")}[options.convention]
 
     @property
     def stage_record(self) -> Path:
