@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import pyarrow as pa
 from pydantic import BaseModel
 
+from pipeline.episode_schema import SCHEMA, GripperSpec
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
@@ -67,6 +68,8 @@ class Format(ABC, Generic[Options]):
     """Each view, ``state``, ``joint_state`` and ``action`` to its name in this format."""
     clients: tuple[str, ...]
     """The clients of ``finetune.yaml`` that train on this format."""
+    gripper: GripperSpec = SCHEMA.action.gripper
+    """The commands of the gripper in this format."""
 
     def __init__(self, data: Path, options: Options, extras: Sequence[Extra] = ()) -> None:
         self.data = data

@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 
 import pyarrow as pa
 
+from pipeline.episode_schema import GripperSpec
 from pipeline.export_config import LeRobotV21Config
 from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
@@ -91,6 +92,8 @@ class LeRobotV21(Format[LeRobotV21Config]):
         super().__init__(data, options, extras)
         self.convention = CONVENTIONS[options.convention]
         self.keys = {name: self.convention.names.get(key, key) for name, key in LeRobot.keys.items()}
+        if self.convention.open_is_one:
+            self.gripper = GripperSpec(open=1.0, close=0.0)
         self.clients = {"ipec": ("starvla",), "openpi": ("openpi", "openpi_serve")}[options.convention]
 
     @property
