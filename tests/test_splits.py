@@ -131,8 +131,8 @@ def test_what_is_held_out_of_v21_is_a_set_of_its_own(
         rows = pq.read_table(tmp_path / "lerobot_v21" / folder / "data").to_pylist()
         assert list(dict.fromkeys(row["episode_id"] for row in rows)) == ids
         assert [row["index"] for row in rows] == list(range(len(rows)))
-    others = {"rlds": RldsConfig(name=NAME, shards=1), "lerobot": LeRobotConfig(name=NAME, parts=1)}
-    recipe.write({}, tmp_path, ExportConfig(**others, lerobot_v21=options))
+    rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, parts=1)
+    recipe.write({}, tmp_path, ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=options))
     if convention == "openpi":
         found = json.loads((tmp_path / "finetune" / recipe.OPENPI_ASSETS).read_text())["norm_stats"]
         for key, column in (("actions", "action"), ("state", "state")):

@@ -20,15 +20,18 @@ that lies in a cloud store: where that cannot be reached, any SentencePiece mode
 
 from __future__ import annotations
 
+import importlib
+import io
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
 import pyarrow.parquet as pq
+from PIL import Image
 
 Sample = dict[str, Any]
 """``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``."""
@@ -61,10 +64,6 @@ def files(root: Path) -> Iterator[tuple[int, Sample]]:
 
 
 def _opened(packed: bytes) -> Any:
-    import io
-
-    from PIL import Image
-
     return np.array(Image.open(io.BytesIO(packed)))
 
 
@@ -88,14 +87,13 @@ def lerobot(root: Path) -> Iterator[tuple[Sample, Sample]]:
 def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
     """starVLA's mixture of one set, with its own normalisation to [-1, 1] of all but the gripper."""
     from omegaconf import OmegaConf
-    from PIL import Image
-    from starVLA.dataloader.gr00t_lerobot.registry import DATASET_NAMED_MIXTURES
-    from starVLA.dataloader.lerobot_datasets import get_vla_dataset
 
-    (mixture,) = (name for name, sets in DATASET_NAMED_MIXTURES.items() if root.name in [one[0] for one in sets])
+    loader: Any = importlib.import_module("starVLA.dataloader.lerobot_datasets")
+    mixtures = loader.DATASET_NAMED_MIXTURES
+    (mixture,) = (name for name, sets in mixtures.items() if root.name in [one[0] for one in sets])
     settings = OmegaConf.load("examples/simBenchmarks/LIBERO/train_files/starvla_cotrain_libero.yaml").datasets.vla_data
     settings |= {"data_root_dir": str(root.parent), "data_mix": mixture, "include_state": True}
-    mixed = get_vla_dataset(settings)
+    mixed = loader.get_vla_dataset(settings)
     (dataset,) = (one for one in mixed.datasets if one.dataset_name == root.name)
     actions = np.concatenate([np.stack(pq.read_table(file)["action"].to_numpy()) for file in root.glob("data/*/*")])
     low, high = actions.min(axis=0), actions.max(axis=0)
@@ -112,9 +110,9 @@ def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
 
 def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
     """openpi's data loader of its configuration pi05_libero, by the arguments of the recipe, with its normalisation."""
-    from openpi.training import config, data_loader
-    from openpi_client import image_tools
-
+    config: Any = importlib.import_module("openpi.training.config")
+    data_loader: Any = importlib.import_module("openpi.training.data_loader")
+    image_tools: Any = importlib.import_module("openpi_client.image_tools")
     sys.argv = ["train.py", "pi05_libero", "--exp-name=read", f"--data.repo-id={root.name}"]
     sys.argv += [f"--data.assets.assets-dir={assets}", "--data.assets.asset-id=physical-intelligence/libero"]
     chosen = config.cli()
@@ -136,10 +134,11 @@ def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
 
 def main() -> None:
     client, root, *further = sys.argv[1:]
-    reader = {"lerobot": lerobot, "starvla": starvla, "openpi": openpi}[client]
+    readers: dict[str, Callable[..., Iterator[tuple[Sample, Sample]]]]
+    readers = {"lerobot": lerobot, "starvla": starvla, "openpi": openpi}
     furthest = dict.fromkeys(("state", "action", "image", "wrist_image"), 0.0)
     samples = 0
-    for read, expected in reader(Path(root).resolve(), *map(Path, further)):
+    for read, expected in readers[client](Path(root).resolve(), *map(Path, further)):
         assert read["text"] == expected["text"], f"{read['text']!r} for {expected['text']!r}"
         for name in furthest:
             apart = np.abs(np.asarray(read[name], float) - np.asarray(expected[name], float))

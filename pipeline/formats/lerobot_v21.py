@@ -1,20 +1,8 @@
-"""LeRobotDataset v2.1, for clients whose lerobot is of 2025: a file of data and one of each video for each episode.
-
-Two conventions are in use:
-
-* ``ipec``, of IPEC-COMMUNITY's ``libero_*_no_noops_1.0.0_lerobot``, which cannot be had here. They were made by
-  ``openx2lerobot/openx_rlds.py`` and its ``libero_dataset_transform`` (Tavish9/any4lerobot at 6937315): a set for each
-  suite, videos, 20 Hz, gripper 1 open and 0 closed. ``examples/simBenchmarks/LIBERO/train_files`` in starVLA/starVLA at
-  0ed0aad names the columns, and ``eval_files/eval_libero.py`` there turns the gripper back.
-* ``openpi``, of ``examples/libero/convert_libero_data_to_lerobot.py`` (Physical-Intelligence/openpi at 15a9616), as
-  ``LeRobotLiberoDataConfig`` in ``src/openpi/training/config.py`` repacks it: one set, images in the data files,
-  gripper as LIBERO has it. openpi writes a frame rate of 10; here it is LIBERO's 20 Hz, which its loader takes too.
-"""
+"""LeRobotDataset v2.1, for clients whose lerobot is of 2025: a file of data and one of each video for each episode."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,7 +13,7 @@ from pipeline.export_config import LeRobotV21Config
 from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
 from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_columns import Frames, features
+from pipeline.formats.lerobot_columns import CONVENTIONS
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import by_suite
 from pipeline.identity import Step
@@ -33,51 +21,6 @@ from pipeline.types import Extra
 
 EPISODES_OF_A_PIECE = 50
 """So many episodes are written again, at most, where a call is killed; the files do not depend on it."""
-
-
-@dataclass(frozen=True)
-class Convention:
-    """What clients expect of a set.
-
-    Attributes:
-        frames: how the frames are stored.
-        robot_type: in ``meta/info.json``.
-        names: columns that have another name than in v3.0.
-        open_is_one: whether the gripper's command is 1 open, 0 closed, and not as LIBERO has it. GR00T and starVLA,
-            which look for ``meta/modality.json``, take it so.
-    """
-
-    frames: Frames
-    robot_type: str
-    names: Mapping[str, str]
-    open_is_one: bool
-
-    def columns(self, extras: Sequence[Extra]) -> dict[str, dict[str, Any]]:
-        """The columns of every frame, as ``meta/info.json`` describes them."""
-        return {self.names.get(name, name): of for name, of in features(self.frames, tuple(extras)).items()}
-
-
-# Joint angles are in neither convention. Under ``observation`` they would become a policy's input.
-CONVENTIONS = {
-    "ipec": Convention(
-        "video",
-        "franka",
-        {"observation.images.image2": "observation.images.wrist_image", "observation.joint_state": "joint_state"},
-        open_is_one=True,
-    ),
-    "openpi": Convention(
-        "images",
-        "panda",
-        {
-            "observation.images.image": "image",
-            "observation.images.image2": "wrist_image",
-            "observation.state": "state",
-            "observation.joint_state": "joint_state",
-            "action": "actions",
-        },
-        open_is_one=False,
-    ),
-}
 
 
 class LeRobotV21(Format[LeRobotV21Config]):
@@ -91,7 +34,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def __init__(self, data: Path, options: LeRobotV21Config, extras: Sequence[Extra] = ()) -> None:
         super().__init__(data, options, extras)
         self.convention = CONVENTIONS[options.convention]
-        self.keys = {name: self.convention.names.get(key, key) for name, key in LeRobot.keys.items()}
+        self.keys = {name: self.convention.name(key) for name, key in LeRobot.keys.items()}
         if self.convention.open_is_one:
             self.gripper = GripperSpec(open=1.0, close=0.0)
         self.clients = {"ipec": ("starvla",), "openpi": ("openpi", "openpi_serve")}[options.convention]

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,15 +15,12 @@ import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Row
-from pipeline.formats.lerobot_columns import EPISODE_ID
+from pipeline.formats.lerobot_columns import EPISODE_ID, Convention
 from pipeline.formats.lerobot_read import MARKS, episode, frame_at, readable
 from pipeline.formats.lerobot_v21_write import data_path, video_path
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.images.jpeg import decode
 from pipeline.types import Extra, Frame
-
-if TYPE_CHECKING:
-    from pipeline.formats.lerobot_v21 import Convention
 
 NAME, VERSION = "lerobot_v21", "v2.1"
 
@@ -113,7 +110,7 @@ def _decoded(
         if convention.frames == "images":
             yield (view, step), decode(table[key][step]["bytes"].as_py())
         else:
-            path = root / video_path(index, convention.names.get(key, key))
+            path = root / video_path(index, convention.name(key))
             yield (view, step), frame_at(path, table["timestamp"][step].as_py())
 
 

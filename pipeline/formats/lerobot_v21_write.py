@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -21,13 +21,11 @@ from pipeline.episode_schema import SCHEMA, check
 from pipeline.formats import lerobot_episode as of_episode
 from pipeline.formats.episodes import Load, Piece
 from pipeline.formats.image_statistics import Counts, statistics
+from pipeline.formats.lerobot_columns import Convention
 from pipeline.formats.lerobot_episode import link, listed, write_json
 from pipeline.formats.lerobot_video import INFO, Video
 from pipeline.formats.motion_statistics import open_is_one
 from pipeline.types import Episode, Extra
-
-if TYPE_CHECKING:
-    from pipeline.formats.lerobot_v21 import Convention
 
 EPISODES_OF_A_CHUNK = 1000
 DATA_PATH = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
@@ -71,7 +69,7 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, ex
             numbers = of_episode.numbers(episode, index, first_step, piece.tasks[episode.instruction])
             shown = _write_episode(path, index, episode, numbers, convention, extras)
             figures = {
-                convention.names.get(name, name): listed({of: found[of] for of in STATISTICS})
+                convention.name(name): listed({of: found[of] for of in STATISTICS})
                 for name, found in of_episode.figures(numbers, shown).items()
             }
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
@@ -96,13 +94,13 @@ def _write_episode(
     shown = {}
     for view, of in SCHEMA.views.items():
         if convention.frames == "video":
-            file = path / video_path(index, convention.names.get(of.lerobot_key, of.lerobot_key))
+            file = path / video_path(index, convention.name(of.lerobot_key))
             file.parent.mkdir(parents=True, exist_ok=True)
             with Video(file) as video:
                 shown[view] = of_episode.show(episode, view, video)
         else:
             shown[view] = of_episode.show(episode, view, None)
-    columns = {convention.names.get(name, name): of for name, of in of_episode.columns(episode, numbers).items()}
+    columns = {convention.name(name): of for name, of in of_episode.columns(episode, numbers).items()}
     schema = _schema(convention, extras)
     file = path / data_path(index)
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -132,7 +130,7 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
     (root / "meta" / "tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     columns = convention.columns(extras)
     levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
-    keys = {view: convention.names.get(of.lerobot_key, of.lerobot_key) for view, of in SCHEMA.views.items()}
+    keys = {view: convention.name(of.lerobot_key) for view, of in SCHEMA.views.items()}
     figures = {keys[view]: statistics(np.sum([one[view] for one in levels], axis=0)) for view in SCHEMA.views}
     figures |= {
         name: of_episode.exact(root, name, of["shape"][0]) for name, of in columns.items() if of_episode.is_number(of)
