@@ -5,7 +5,7 @@ from pathlib import Path
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-SCHEMAS = [str(file) for file in sorted(Path("schemas").glob("*.json"))]
+SCHEMAS = [str(file) for file in sorted(Path("schemas").iterdir())]
 
 
 class BuildWithSchemas(build_py):

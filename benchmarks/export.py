@@ -57,7 +57,7 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
         joint_state=rng.normal(size=(steps, *SCHEMA.joint_state.shape)).astype(np.float32),
         action=rng.uniform(-1, 1, (steps, *SCHEMA.action.shape)).astype(np.float32),
         instruction="put the black bowl on the plate",
-        provenance={column: episode_id if column == "episode_id" else column for column in SCHEMA.provenance},
+        provenance=dict.fromkeys(SCHEMA.provenance, "text") | {"episode_id": episode_id, "seed": 0},
         geometry=dict.fromkeys(SCHEMA.views, Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))),
     )
 

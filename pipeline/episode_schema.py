@@ -83,6 +83,7 @@ class VectorSpec(_Model):
     dtype: str
     lerobot_key: str
     names: tuple[str, ...]
+    meaning: str
 
     @model_validator(mode="after")
     def _one_name_per_entry(self) -> Self:
@@ -115,7 +116,11 @@ class ActionSpec(VectorSpec):
 
 
 class EpisodeSchema(_Model):
-    """Names, shapes, units and signs that both writers read."""
+    """Names, shapes, units and signs that all writers read.
+
+    Attributes:
+        provenance: what each episode says of itself, as the manifest's column of that name does, to its type.
+    """
 
     fps_hz: int
     robot_type: str
@@ -131,7 +136,7 @@ class EpisodeSchema(_Model):
     state: StateSpec
     joint_state: VectorSpec
     action: ActionSpec
-    provenance: tuple[str, ...]
+    provenance: dict[str, Literal["string", "int64"]]
 
 
 SCHEMA = EpisodeSchema.model_validate_json(SCHEMA_FILE.read_text())
@@ -182,9 +187,10 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     if set(episode.provenance) != set(SCHEMA.provenance):
         wrong = sorted(set(episode.provenance) ^ set(SCHEMA.provenance))
         raise _fault(episode, "provenance", f"lacks or adds {wrong}", f"exactly {list(SCHEMA.provenance)}")
-    if not all(isinstance(value, str) for value in episode.provenance.values()):
-        wrong = sorted(key for key, value in episode.provenance.items() if not isinstance(value, str))
-        raise _fault(episode, "provenance", f"holds something other than text in {wrong}", "text only")
+    types = {"string": str, "int64": int}
+    if wrong := sorted(k for k, v in episode.provenance.items() if not isinstance(v, types[SCHEMA.provenance[k]])):
+        expected = ", ".join(f"{SCHEMA.provenance[key]} in {key}" for key in wrong)
+        raise _fault(episode, "provenance", f"holds something else in {wrong}", expected)
     if episode.provenance["episode_id"] != episode.episode_id:
         raise _fault(episode, "provenance", f"names episode {episode.provenance['episode_id']!r}", "its own episode_id")
 

@@ -32,8 +32,8 @@ RECIPES: dict[Step, int] = {
     "physics": 5,
     "pixels": 5,
     "encoding": 1,
-    "rlds": 2,
-    "lerobot": 6,
+    "rlds": 3,
+    "lerobot": 7,
     "lerobot_v21": 1,
     "evaluation": 1,
     "checks": 2,
@@ -46,8 +46,8 @@ benchmark's do. 5: the command and the posture are those of the recording among 
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
 lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
-5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode. 6: there is a
-``meta/modality.json``.
+3 of ``rlds``, 6 of ``lerobot``: the seed is a number; features are described. 5 of ``lerobot``: files are written
+directly, and camera matrices stand once for each episode. 7: there is a ``meta/modality.json``.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
 2 of it: joint angles are held against the replay's. ``pictures``: what ``summary`` draws, and the report.
 2 of it: a contact sheet is spread over the run, and shows other starts at the first frame."""

@@ -215,7 +215,7 @@ class Episode:
         joint_state: (T, 7) float32.
         action: (T, 7) float32.
         instruction: the text the policy is prompted with.
-        provenance: flat, JSON-serialisable, the columns named in ``schemas/episode.json``.
+        provenance: the columns named in ``schemas/episode.json``.
         geometry: view name to where it is seen from.
         object_poses: (T, 24, 7) float32, None where they were not asked for.
         instances: names of the things that segmentation and poses number; none without those.
@@ -227,7 +227,7 @@ class Episode:
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]
     instruction: str
-    provenance: Mapping[str, str]
+    provenance: Mapping[str, str | int]
     geometry: Mapping[str, Geometry]
     object_poses: NDArray[np.float32] | None = None
     instances: Sequence[str] = ()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -85,7 +85,7 @@ def checks() -> dict[str, Any]:
     view, other = SCHEMA.views
     shown = {(name, t): decode(made.frames[name][t]) for name in SCHEMA.views for t in sampled(steps)}
     marks = {"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz}
-    stored = replace(made, instruction="task_1", provenance={name: str(row[name]) for name in SCHEMA.provenance})
+    stored = replace(made, instruction="task_1", provenance={name: row[name] for name in SCHEMA.provenance})
     whole = Copy("whole", stored, ["task_1"] * steps, shown, marks, {"place": 1})
     wrong = Copy(
         dataset="wrong",
@@ -113,7 +113,9 @@ def pictures() -> dict[str, str]:
     frames = [decode(episode(IDS[0]).frames[view][0]) for view in SCHEMA.views]
     drawn = sheet("title", [Tile(side_by_side(frames, 64), f"caption {number}") for number in range(5)])
     plot = figures.histogram("title", {"camera": np.linspace(-1, 1, 50)}, np.linspace(-1, 1, 11), "action", log=True)
-    rows = [{"component": n % 2, "suite": n // 10, "level": n % 5, "task": n // 4} for n in range(40)]
+    rows: list[Mapping[str, Any]] = [
+        {"component": n % 2, "suite": n // 10, "level": n % 5, "task": n // 4} for n in range(40)
+    ]
     folder = Path(figures.__file__).parent / "templates"
     return {
         "sheet": hashlib.sha256(np.asarray(drawn).tobytes()).hexdigest()[:16],

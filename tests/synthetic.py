@@ -66,7 +66,8 @@ def episode(episode_id: str) -> Episode:
         joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
         action=action,
         instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
-        provenance={column: f"{column} of {episode_id}" for column in SCHEMA.provenance} | {"episode_id": episode_id},
+        provenance={column: f"{column} of {episode_id}" for column in SCHEMA.provenance}
+        | {"episode_id": episode_id, "seed": 7},
         geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
     )
 

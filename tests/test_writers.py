@@ -139,7 +139,8 @@ def assert_episodes(read: Sequence[dict[str, NDArray[Any]]]) -> None:
             np.testing.assert_array_equal(metadata.pop(f"{view}_intrinsics"), seen.intrinsics)
             np.testing.assert_array_equal(metadata.pop(f"{view}_extrinsics"), seen.extrinsics)
         texts = {name: str(text) for name, text in metadata.items() if name != "instances"}
-        assert texts == {"file_path": source.provenance["demo_source"], **source.provenance}
+        said = {name: str(value) for name, value in source.provenance.items()}
+        assert texts == {"file_path": said["demo_source"], **said}
 
 
 @pytest.mark.slow
@@ -173,7 +174,14 @@ def test_rlds_features_are_openvlas(written: Written) -> None:
     matrices = {f"{view}_{name}": shape for view in SCHEMA.views for name, shape in MATRICES.items()}
     assert set(features["episode_metadata"]) == {"file_path", *matrices, *SCHEMA.provenance}
     assert {name: features["episode_metadata"][name].shape for name in matrices} == matrices
+    assert {name for name, of in features["episode_metadata"].items() if of.np_dtype == np.int64} == {"seed"}
+    leaves = [*features["steps"].feature.items(), *observation.items(), *features["episode_metadata"].items()]
+    assert [name for name, of in leaves if name != "observation" and not of.doc.desc] == []
+    assert all(word in observation["state"].doc.desc for word in ("world", "metres", "radians", "eef_x_m"))
     assert (builder.info.name, str(builder.info.version)) == (SET, "1.0.0")
+    assert "LIBERO-Plus" in builder.info.citation
+    assert builder.info.homepage
+    assert "CC BY 4.0" in (builder.info.redistribution_info.license or "")
     assert builder.info.splits["train"].shard_lengths == [2, 2, 2]
 
 
@@ -431,7 +439,7 @@ BAD: dict[str, tuple[str, Callable[[Episode], Episode]]] = {
     "cut image": ("image", lambda e: replace(e, frames={**e.frames, "image": [f[:-99] for f in e.frames["image"]]})),
     "lost column": ("provenance", lambda e: replace(e, provenance={"episode_id": e.episode_id})),
     "wrong id": ("provenance", lambda e: replace(e, provenance={**e.provenance, "episode_id": "other"})),
-    "no text": ("provenance", lambda e: replace(e, provenance={**e.provenance, "seed": 7})),  # type: ignore[dict-item]
+    "no number": ("provenance", lambda e: replace(e, provenance={**e.provenance, "seed": "7"})),
 }
 
 

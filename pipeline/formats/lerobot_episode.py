@@ -110,7 +110,8 @@ def figures(found: Numbers, shown: Mapping[str, Counts]) -> dict[str, dict[str, 
 
 def provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
     """Of ``meta/provenance.parquet``, which has a row for each episode, and which lerobot passes by."""
-    stored = {"episode_index": pa.int64()} | dict.fromkeys(SCHEMA.provenance, pa.string())
+    stored = {"episode_index": pa.int64()}
+    stored |= {name: pa.type_for_alias(dtype) for name, dtype in SCHEMA.provenance.items()}
     stored |= {name: pa.list_(pa.float32(), spec.shape[0] * spec.shape[1]) for name, spec in matrix_columns().items()}
     return pa.schema(stored | ({INSTANCES: pa.string()} if named(extras) else {}))
 

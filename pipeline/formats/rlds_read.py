@@ -120,6 +120,10 @@ def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) ->
     return Geometry(**matrices, maps=maps)
 
 
+def _said(value: Any) -> str | int:
+    return value.decode() if isinstance(value, bytes) else int(value)
+
+
 def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> Copy:
     shard, index = place
     instructions = [text.decode() for text in steps["language_instruction"]]
@@ -131,7 +135,7 @@ def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> 
         joint_state=steps["observation/joint_state"],
         action=steps["action"],
         instruction=instructions[0],
-        provenance={name: steps[METADATA + name][0].decode() for name in SCHEMA.provenance},
+        provenance={name: _said(steps[METADATA + name][0]) for name in SCHEMA.provenance},
         geometry={view: _geometry(steps, view, extras) for view in SCHEMA.views},
         object_poses=steps["observation/object_poses"] if "object_poses" in extras else None,
         instances=json.loads(steps[f"{METADATA}instances"][0]) if named(extras) else (),

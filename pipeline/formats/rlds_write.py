@@ -18,6 +18,7 @@ import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MapSpec, MatrixSpec, VectorSpec, check, named
+from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
 from pipeline.formats.tfrecord import OVERHEAD_BYTES, framed
@@ -64,7 +65,11 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
         version=VERSION,
         filename_template=template,
         check_data=False,  # the check needs TensorFlow
-        description="LIBERO demonstrations, perturbed, replayed in simulation and kept when they solve the task.",
+        description="LIBERO demonstrations, perturbed, replayed in simulation and kept when they solve the task. "
+        "Robot: Franka Panda. Every episode ends in success; episode_metadata says what was changed.",
+        homepage="https://libero-project.github.io",
+        citation=schema_file("citation.bib").read_text(),
+        license="LIBERO's demonstrations: CC BY 4.0. README.md of the dataset names what its textures and objects owe.",
     )
 
 
@@ -77,8 +82,8 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
         dtype=np.dtype(SCHEMA.frame.dtype),
         encoding_format=SCHEMA.frame.encoding,
     )
-    rotated = f"rotated by {SCHEMA.image_rotation_deg} degrees"
-    observation = {view: frame(doc=f"{spec.camera}, {rotated}") for view, spec in SCHEMA.views.items()}
+    turned = f"RGB, before the action, turned by {SCHEMA.image_rotation_deg} degrees from how MuJoCo renders it"
+    observation = {view: frame(doc=f"camera {spec.camera}: {turned}") for view, spec in SCHEMA.views.items()}
     observation |= {"state": _vector(SCHEMA.state), "joint_state": _vector(SCHEMA.joint_state)}
     for name in (name for name in MAPS if name in extras):
         observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
@@ -95,8 +100,11 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
         "is_terminal": scalar(np.bool_, doc="last step: every episode ends in success"),
         "language_instruction": tfds.features.Text(doc="what the policy is asked to do"),
     }
-    metadata = {"file_path": tfds.features.Text(doc="the demonstration's source")}
-    metadata |= {column: tfds.features.Text() for column in SCHEMA.provenance}
+    metadata = {"file_path": tfds.features.Text(doc="where the demonstration was published, as demo_source")}
+    meanings = {column["name"]: column["meaning"] for column in read_json(schema_file("manifest.json"))["columns"]}
+    for key, dtype in SCHEMA.provenance.items():
+        doc = meanings[key]
+        metadata[key] = tfds.features.Text(doc=doc) if dtype == "string" else scalar(np.dtype(dtype), doc=doc)
     metadata |= {f"{view}_{name}": _matrix(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
     if named(extras):
         metadata["instances"] = tfds.features.Text(doc="JSON list of names; segmentation and poses have places in it")
@@ -104,7 +112,9 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
 
 
 def _vector(spec: VectorSpec) -> Any:
-    return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=", ".join(spec.names))
+    return tfds.features.Tensor(
+        shape=spec.shape, dtype=np.dtype(spec.dtype), doc=f"{spec.meaning}: {', '.join(spec.names)}"
+    )
 
 
 def _matrix(spec: MatrixSpec) -> Any:

@@ -18,7 +18,7 @@ from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import checksum, read_json, replaced
+from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.base import Format
 from pipeline.publish.attribution import attributions
 from pipeline.report.yields import LEVELS
@@ -143,6 +143,7 @@ def render(
         versions=manifest.made_with(kept[0]),
         devices=sorted({row["gl_device"] for row in kept}),
         free=free,
+        citation=schema_file("citation.bib").read_text(),
         owed=table(["name", "kind", "licence", "attribution", "episodes"], owed),
     )
 

@@ -45,7 +45,7 @@ class EpisodeLoader:
             joint_state=rendered.joint_state,
             action=rendered.action,
             instruction=row.instruction,
-            provenance={name: str(known[name]) for name in SCHEMA.provenance},
+            provenance={name: known[name] for name in SCHEMA.provenance},
             geometry={view: rendered.geometry[name] for view, name in geometry.items()},
             object_poses=rendered.object_poses,
             instances=rendered.instances,

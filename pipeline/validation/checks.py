@@ -140,7 +140,7 @@ def provenance(case: Case) -> Iterator[Fault]:
     """The manifest's provenance, but for this project's version: a manifest is made anew where a dataset stays."""
     for copy in case.copies:
         for column in SCHEMA.provenance:
-            found, expected = copy.episode.provenance.get(column), str(case.row[column])
+            found, expected = copy.episode.provenance.get(column), case.row[column]
             if found != expected and column != OWN_VERSION:
                 yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
 
