@@ -240,7 +240,7 @@ def test_lerobot_v21_is_made_checked_and_described_where_it_is_asked_for(
     assert "lerobot has these" in printed, "v3.0 stays"
     assert (data / "manifest.parquet").read_bytes() == manifest_before
     sets = {folder.name for folder in (data / "lerobot_v21").iterdir()}
-    assert sets == {"libero_tiny_goal", "libero_tiny_spatial", "libero_tiny_object"}
+    assert sets == {"libero_tiny_goal", "libero_tiny_object"}
     assert "libero_tiny_goal" in (data / "finetune" / "starvla_data_config.py").read_text()
     assert "`observation.images.wrist_image`" in (data / "card" / "lerobot_v21" / "README.md").read_text()
     # What DVC knows the stage's output by goes with a lost file, so that the stage is run.
