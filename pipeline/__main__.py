@@ -17,7 +17,7 @@ import yaml
 from rich.console import Console
 
 from pipeline.arguments import positive
-from pipeline.axes import Axes
+from pipeline.axes import AXES
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, Config, DemosConfig, load
 from pipeline.evaluation import commands as evaluation_commands
@@ -258,9 +258,7 @@ def _add_before(commands: Any) -> None:
 
     command = _command(commands, _preview)
     command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
-    command.add_argument(
-        "axis", choices=Axes.model_fields, metavar="AXIS", help=f"any of {', '.join(Axes.model_fields)}"
-    )
+    command.add_argument("axis", choices=AXES, metavar="AXIS", help=f"any of {', '.join(AXES)}")
     command.add_argument(
         "--config",
         type=Path,

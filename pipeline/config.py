@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import yaml
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
-from pipeline.axes import AnyAxis, Axes, axes_of
+from pipeline.axes import Axes, Axis, axes_of
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.export_config import Count, ExportConfig, known_to_oft
@@ -76,7 +76,7 @@ class PlanConfig(Frozen):
 
     @model_validator(mode="after")
     def _axes_match_episodes(self) -> PlanConfig:
-        configured = {name for name in Axes.model_fields if getattr(self.axes, name) is not None}
+        configured = {*self.axes.drawn()}
         drawn = {axis for name in self.episodes for axis in axes_of(name)}
         if configured != drawn:
             raise ValueError(f"axes and episodes must name the same axes, got {sorted(configured)} and {sorted(drawn)}")
@@ -84,16 +84,14 @@ class PlanConfig(Frozen):
             self.drawn_from(name)
         return self
 
-    def drawn_from(self, name: str) -> tuple[AnyAxis, ...]:
+    def drawn_from(self, name: str) -> tuple[Axis, ...]:
         """What the episodes called ``name`` draw from, one axis after the other.
 
         Raises:
-            ValueError: when objects are added and no class of rewrites is left that stays unambiguous among them.
+            ValueError: when one of them has nothing left to draw beside the others.
         """
-        axes = {axis: getattr(self.axes, axis) for axis in axes_of(name)}
-        if "layout" in axes and "language" in axes:
-            axes["language"] = axes["language"].among_more_objects()
-        return tuple(axes.values())
+        names, axes = axes_of(name), self.axes.drawn()
+        return tuple(axes[one].beside(names) for one in names)
 
 
 class ReplayConfig(Frozen):

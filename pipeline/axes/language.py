@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import bisect
 import re
+from collections.abc import Collection
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
@@ -81,7 +82,8 @@ class LanguagePerturbation(TextPerturbation):
     text: str
 
     clearance: ClassVar[float] = 0.2
-    measure: ClassVar[str] = "share of characters to edit, to the task's test instructions without case and punctuation"
+    unit: ClassVar[str | None] = "share of characters to edit"
+    measure: ClassVar[str] = "to the task's test instructions without case and punctuation"
 
     def apply(self, instruction: str) -> str:
         """The wording that takes the place of ``instruction``."""
@@ -102,17 +104,22 @@ class LanguageAxis(Axis):
         bank: a further bank, such as the command ``rewrite`` makes; its rewrites join those that are shipped.
     """
 
+    draws: ClassVar = (LanguagePerturbation,)
+    not_held_out: ClassVar[str] = "its rewrites are a list, and plans train on all of it"
+
     classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
     bank: Path | None = None
 
-    def among_more_objects(self) -> LanguageAxis:
-        """The axis for scenes with objects that the task does not have, such as the layout axis adds: ``NAMED`` only.
+    def beside(self, axes: Collection[str]) -> LanguageAxis:
+        """Among objects that the layout axis adds: of the classes ``NAMED`` only.
 
         Names stay unambiguous there as far as the added objects are of categories that the scene does not have.
 
         Raises:
             ValueError: when none of ``classes`` is left.
         """
+        if "layout" not in axes:
+            return self
         classes = tuple(component for component in self.classes if component in NAMED)
         if not classes:
             raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, PhysicsPerturbation, on_task
+from pipeline.axes.base import Axis, Credit, Frozen, PhysicsPerturbation, on_task
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, taken
@@ -55,9 +57,8 @@ class LayoutPerturbation(PhysicsPerturbation):
     objects: Annotated[tuple[AddedObject, ...], Field(min_length=1)]
     seed: int
 
-    clearance: ClassVar[float] = 1.0
     measure: ClassVar[str] = "1 where no category is shared with a test task of the same LIBERO task, else 0"
-    graded: ClassVar[bool] = False
+    clearance: ClassVar[float] = 1.0
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         # Drawing a plan must not load the simulator.
@@ -70,12 +71,22 @@ class LayoutPerturbation(PhysicsPerturbation):
 
         The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
         """
-        own = {added.category for added in self.objects}
         distances = np.full(len(test.of("layout")), np.nan)
         distances[on_task(test, task, "layout")] = [
-            0.0 if own & set(_plain(other.parameters["category"])) else math.inf for other in test.on(task, "layout")
+            self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")
         ]
         return distances
+
+    def apart(self, others: Sequence[LayoutPerturbation], same_task: NDArray[np.bool_]) -> Floats:
+        """By category too, among the draws on the same task."""
+        categories = ([added.category for added in other.objects] for other in others)
+        return np.where(same_task, [self._apart_from(of_other) for of_other in categories], np.nan)
+
+    def _apart_from(self, categories: Iterable[str]) -> float:
+        return math.inf if {added.category for added in self.objects}.isdisjoint(categories) else 0.0
+
+    def credits(self) -> frozenset[Credit]:
+        return frozenset(Credit("object", o.name, o.licence, o.attribution) for o in self.objects)
 
 
 class LayoutAxis(Axis):
@@ -92,6 +103,8 @@ class LayoutAxis(Axis):
         area_m2: the most that the objects take up together, each of them at most its share: the more objects, the
             smaller (0.12 m2 is what the broadest object of all takes up).
     """
+
+    draws: ClassVar = (LayoutPerturbation,)
 
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
     area_m2: float = Field(default=0.12, gt=0.0, le=10.0)
@@ -112,6 +125,13 @@ class LayoutAxis(Axis):
         choice = list(shelf.values())
         objects = tuple(AddedObject.of(choice[index]) for index in rng.integers(len(choice), size=level))
         return LayoutPerturbation(level=level, objects=objects, seed=int(rng.integers(2**31)))
+
+    def offered(self) -> dict[str, int]:
+        found = models(self.sources).values()
+        return {
+            "models": len({model.sha256 for model in found}),
+            "categories": len({model.category for model in found}),
+        }
 
 
 @cache

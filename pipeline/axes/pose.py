@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.axes.base import Axis, PhysicsPerturbation, on_task, pick, point
@@ -44,7 +46,8 @@ class PosePerturbation(PhysicsPerturbation):
 
     # A quarter of the 2 cm square that LIBERO's own reset scatters an object in.
     clearance: ClassVar[float] = 0.005
-    measure: ClassVar[str] = "m: the norm of the difference between the displacements of the same object"
+    unit: ClassVar[str | None] = "m"
+    measure: ClassVar[str] = "the norm of the difference between the displacements of the same object"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the object moved; its height and velocity and everything else stay as they are.
@@ -63,6 +66,12 @@ class PosePerturbation(PhysicsPerturbation):
         """
         distances_m: Floats = np.linalg.norm(_test_moves_m(test, task, self.moved) - (self.dx_m, self.dy_m), axis=1)
         return distances_m
+
+    def apart(self, others: Sequence[PosePerturbation], same_task: NDArray[np.bool_]) -> Floats:
+        """Compared with the draws that move the same object of the same task."""
+        shifts_m = np.array([(other.dx_m, other.dy_m) for other in others])
+        comparable = same_task & [other.moved == self.moved for other in others]
+        return np.where(comparable, np.linalg.norm(shifts_m - (self.dx_m, self.dy_m), axis=1), np.nan)
 
 
 @cache
@@ -91,6 +100,8 @@ class PoseAxis(Axis):
         step_m: at level k one object is moved by k - 1 to k times this, uniform over the ring.
         turn_deg: one object is turned by up to so much to either side, uniform, whatever the level.
     """
+
+    draws: ClassVar = (PosePerturbation, ScenePerturbation)
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("scene",)
     step_m: float = Field(default=0.016, ge=0.0001, le=0.2)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.axes.base import Frozen, Level, PhysicsPerturbation, on_task
@@ -81,7 +82,8 @@ class ScenePerturbation(PhysicsPerturbation):
     # 1 cm on, at least one thing is outside of the 2 cm around its place there: the reset's own scatter of all things
     # does not make the two scenes one. 5 cm cannot be asked for: at level 1 of the long suite the disks are smaller.
     clearance: ClassVar[float] = 0.01
-    measure: ClassVar[str] = "m: the largest difference along an axis between the displacements of the same thing"
+    unit: ClassVar[str | None] = "m"
+    measure: ClassVar[str] = "the largest difference along an axis between the displacements of the same thing"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with everything moved; heights, rotations, velocities and joints stay as they are.
@@ -91,17 +93,28 @@ class ScenePerturbation(PhysicsPerturbation):
         """
         from pipeline.scenes.moving import move
 
-        return move(scene, demo.task, {one.name: (one.dx_m, one.dy_m) for one in self.moves})
+        return move(scene, demo.task, self.shifts)
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """Compared with the test scenes of the same task, in all things that both move."""
-        own = {one.name: (one.dx_m, one.dy_m) for one in self.moves}
         distances_m = np.full(len(test.of("pose")), np.nan)
         for place, tested in _test_scenes(test, task):
-            both = own.keys() & tested.keys()
-            if both:
-                distances_m[place] = max(float(np.abs(np.subtract(own[name], tested[name])).max()) for name in both)
+            distances_m[place] = self._apart_m(tested)
         return distances_m
+
+    def apart(self, others: Sequence[ScenePerturbation], same_task: NDArray[np.bool_]) -> Floats:
+        """Compared with the scenes of the same task, in all things that both move."""
+        compared = zip(others, same_task, strict=True)
+        return np.array([self._apart_m(other.shifts) if same else np.nan for other, same in compared])
+
+    @property
+    def shifts(self) -> Shifts:
+        return {one.name: (one.dx_m, one.dy_m) for one in self.moves}
+
+    def _apart_m(self, shifts: Shifts) -> float:
+        own = self.shifts
+        both = own.keys() & shifts.keys()
+        return max((float(np.abs(np.subtract(own[name], shifts[name])).max()) for name in both), default=math.nan)
 
 
 @cache

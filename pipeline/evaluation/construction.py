@@ -11,8 +11,9 @@ from collections.abc import Iterable, Sequence
 from itertools import count, islice, product
 from typing import Any
 
+from pipeline.axes.base import LEVELS
 from pipeline.errors import PipelineError
-from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, PlannedDraws, draw, drawn_task
+from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_task
 from pipeline.evaluation.results import REFUSED, Row
 from pipeline.evaluation.tasks import EvaluationTask, balanced
 from pipeline.libero.tasks import find_task, tasks

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.axes import AnyPerturbation
+from pipeline.axes import Perturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import asset_archive, goals, libero_plus, own_draws
@@ -76,7 +76,7 @@ class EpisodeEnvironment:
         self.task, self._base = task, find_task(task.suite, task.base)
         self.limit = STEP_LIMITS[task.suite]
         self.resolved: Mapping[str, Any] = {}
-        self.perturbations: tuple[AnyPerturbation, ...] = ()
+        self.perturbations: tuple[Perturbation, ...] = ()
         self._seen: dict[str, Frame] = {}
         starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
         try:

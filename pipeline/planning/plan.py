@@ -14,8 +14,8 @@ from typing import Annotated
 import pyarrow as pa
 
 from pipeline.axes import (
-    AnyAxis,
-    AnyPerturbation,
+    Axis,
+    Perturbation,
     PhysicsPerturbation,
     TextPerturbation,
     in_order,
@@ -112,7 +112,7 @@ def _shares(total: int, parts: int) -> list[int]:
 
 def _candidates(
     name: str,
-    axes: Sequence[AnyAxis],
+    axes: Sequence[Axis],
     group: Sequence[DemoEntry],
     wanted: int,
     plan: PlanConfig,
@@ -141,8 +141,8 @@ def _candidates(
 
 
 def draws_of(
-    name: str, axes: Sequence[AnyAxis], demo_id: str, task: Task, seed: int, test: TestSet
-) -> Iterator[tuple[AnyPerturbation, ...]]:
+    name: str, axes: Sequence[Axis], demo_id: str, task: Task, seed: int, test: TestSet
+) -> Iterator[tuple[Perturbation, ...]]:
     """What a plan draws for one demonstration, variant after variant: all different, and clear of the test set.
 
     Args:
@@ -170,7 +170,7 @@ def draws_of(
 
 def _row(
     demo: DemoEntry,
-    perturbations: Sequence[AnyPerturbation],
+    perturbations: Sequence[Perturbation],
     seed: int,
     variant: int,
     rank: int,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, from_json, to_json
+from pipeline.axes import Perturbation, PixelPerturbation, RenderPerturbation, from_json, to_json
 from pipeline.episode_schema import SCHEMA
 from pipeline.seeding import digest
 
@@ -19,7 +19,7 @@ class Stream:
     """
 
     view: str
-    perturbations: tuple[AnyPerturbation, ...]
+    perturbations: tuple[Perturbation, ...]
 
     @property
     def stream_id(self) -> str:

@@ -1,16 +1,13 @@
-"""What the sources of a run's textures and objects hold, and who made the ones that its episodes show."""
+"""What the sources of a run's axes hold, and who made what its episodes show."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from itertools import chain
 from typing import NamedTuple
 
-from pipeline.axes import Axes, from_json
-from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
-from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
-from pipeline.catalogue.objects import models
-from pipeline.catalogue.textures import catalogue
+from pipeline.axes import AXES, Axes, from_json
 
 
 class Attribution(NamedTuple):
@@ -32,23 +29,15 @@ class Attribution(NamedTuple):
 
 
 def attributions(perturbations: Iterable[str]) -> list[Attribution]:
-    """Every texture and object that episodes show, by kind and name.
+    """Everything of others' that episodes show, by kind and name.
 
     Args:
         perturbations: for each episode, the column of that name in the plan or the manifest. Nothing else is read.
     """
-    shown: Counter[tuple[str, str, str, str]] = Counter()
-    for text in perturbations:
-        of_episode = set()
-        for change in from_json(text):
-            if isinstance(change, BackgroundPerturbation):
-                of_episode |= {("texture", c.texture, c.licence, "") for c in change.coverings}
-            elif isinstance(change, LayoutPerturbation):
-                of_episode |= {("object", o.name, o.licence, o.attribution) for o in change.objects}
-        shown.update(of_episode)
+    shown = Counter(credit for text in perturbations for credit in {*chain(*(p.credits() for p in from_json(text)))})
     return [
-        Attribution(name, kind, licence, attribution, episodes)
-        for (kind, name, licence, attribution), episodes in sorted(shown.items())
+        Attribution(credit.name, credit.kind, credit.licence, credit.attribution, episodes)
+        for credit, episodes in sorted(shown.items())
     ]
 
 
@@ -60,11 +49,6 @@ def counts(axes: Axes) -> dict[str, int]:
     Raises:
         PipelineError: when a source cannot be had.
     """
-    textures = catalogue((axes.background or BackgroundAxis()).sources).values()
-    objects = models((axes.layout or LayoutAxis()).sources).values()
-    return {
-        "surfaces": len({texture.sha256 for texture in textures}),
-        "procedural": sum(texture.source == "procedural" for texture in textures),
-        "models": len({model.sha256 for model in objects}),
-        "categories": len({model.category for model in objects}),
-    }
+    drawn = axes.drawn()
+    offered = [(drawn.get(name) or axis()).offered() for name, axis in AXES.items()]
+    return {kind: number for of_axis in offered for kind, number in of_axis.items()}
