@@ -14,7 +14,6 @@ from itertools import product
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Credit, Frozen, RenderPerturbation, Share, pick
@@ -23,12 +22,11 @@ from pipeline.catalogue.data_maps import DATA_MAPS
 from pipeline.catalogue.procedural import COLOUR_MAPS
 from pipeline.catalogue.texture_sources import Source, Texture, keep
 from pipeline.errors import PipelineError
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Frame, Task
 
 if TYPE_CHECKING:
     import mujoco
-
-    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["theme", "surface"]
 Part = Literal["wall", "floor", "cupboard", "surface"]
@@ -119,7 +117,7 @@ class BackgroundPerturbation(RenderPerturbation):
         )
         return np.full(len(test.of("background")), 0.0 if overlaps else 1.0)
 
-    def apart(self, others: Sequence[BackgroundPerturbation], same_task: NDArray[np.bool_]) -> Floats:
+    def apart(self, others: Sequence[BackgroundPerturbation]) -> Floats:
         """0 where both show one of the images, else 1."""
         own = {covering.sha256 for covering in self.coverings}
         return np.array([float(own.isdisjoint(c.sha256 for c in other.coverings)) for other in others])

@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from pipeline.errors import PipelineError
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
 
 if TYPE_CHECKING:
     import mujoco
-
-    from pipeline.testset.benchmark import TestSet
 
 
 class Layer(IntEnum):
@@ -90,6 +89,7 @@ class Perturbation(Frozen):
         measure: what the distance to a test task is.
         unit: of that distance; None where it tells only same from other, not near from far.
         clearance: the least distance to any test task; a draw that comes closer is drawn anew.
+        per_task: whether only what is on the same LIBERO task can be compared.
     """
 
     axis: str
@@ -101,13 +101,21 @@ class Perturbation(Frozen):
     measure: ClassVar[str]
     unit: ClassVar[str | None] = None
     clearance: ClassVar[float] = 0.0
+    per_task: ClassVar[bool] = False
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """The distance to each of the axis's test tasks (N,), in their order, for an episode of ``task``.
 
-        NaN where there is nothing to compare, such as the wordings of another task, or an axis without test tasks.
+        NaN where there is nothing to compare, such as the wordings of another task.
         """
-        return np.full(len(test.of(self.axis)), np.nan)
+        distances = np.full(len(test.of(self.axis)), np.nan)
+        if self.per_task:
+            distances[on_task(test, task, self.axis)] = self.distances_on_task(test, task)
+        return distances
+
+    def distances_on_task(self, test: TestSet, task: Task) -> Sequence[float] | Floats:
+        """Those of ``distances`` to the test tasks that perturb ``task``, where an axis compares ``per_task``."""
+        raise NotImplementedError
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
         """The distance to the nearest of the test tasks that this could coincide with, for an episode of ``task``."""
@@ -115,13 +123,12 @@ class Perturbation(Frozen):
         compared = distances[~np.isnan(distances)]
         return Nearest(float(compared.min(initial=np.inf)), len(compared))
 
-    def apart(self, others: Sequence[Self], same_task: NDArray[np.bool_]) -> Floats:
+    def apart(self, others: Sequence[Self]) -> Floats:
         """The distance to each of N draws of this class (N,), as ``distances`` measures it; NaN where there is nothing
         to compare. By default 0 to a draw that is equal, else 1.
 
         Args:
-            others: the draws.
-            same_task: (N,) whether they are on the LIBERO task of this one.
+            others: at least one, on the same LIBERO task where the axis compares ``per_task``.
         """
         return np.array([float(self != other) for other in others])
 

@@ -12,12 +12,11 @@ from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.axes.base import Axis, ByLevel, Degrees, Frozen, Intervals, RenderPerturbation, draw, pick, point
 from pipeline.rotations import about, product, rotate
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
     import mujoco
-
-    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["distance", "spherical", "orientation"]
 
@@ -95,7 +94,7 @@ class CameraPerturbation(RenderPerturbation):
         cameras, which = _test_cameras(test)
         return self._angles_deg(cameras)[which]
 
-    def apart(self, others: Sequence[CameraPerturbation], same_task: NDArray[np.bool_]) -> Floats:
+    def apart(self, others: Sequence[CameraPerturbation]) -> Floats:
         """To all cameras, whichever task they are for."""
         return self._angles_deg(_embed(np.array([other._parameters() for other in others])))
 

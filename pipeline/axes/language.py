@@ -16,7 +16,7 @@ from collections.abc import Collection
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import yaml
@@ -24,14 +24,12 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, Level, TextPerturbation, on_task
+from pipeline.axes.base import Axis, Level, TextPerturbation
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
 from pipeline.jit import compiled
-from pipeline.types import Floats, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Task
 
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
 CLASSES: tuple[Component, ...] = get_args(Component)
@@ -89,11 +87,11 @@ class LanguagePerturbation(TextPerturbation):
         """The wording that takes the place of ``instruction``."""
         return self.text
 
-    def distances(self, test: TestSet, task: Task) -> Floats:
+    per_task: ClassVar[bool] = True
+
+    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
         """To the task's test instructions; a clearance of about one word in five."""
-        distances = np.full(len(test.of("language")), np.nan)
-        distances[on_task(test, task, "language")] = _distances(self.text, test, task)
-        return distances
+        return _distances(self.text, test, task)
 
 
 class LanguageAxis(Axis):

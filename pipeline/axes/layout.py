@@ -5,22 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Credit, Frozen, PhysicsPerturbation, on_task
+from pipeline.axes.base import Axis, Credit, Frozen, PhysicsPerturbation
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, taken
 from pipeline.errors import PipelineError
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
-
 
 SHELF = 13
 """How many models the objects of one scene are drawn from: as many as LIBERO-Plus draws from."""
@@ -66,21 +62,17 @@ class LayoutPerturbation(PhysicsPerturbation):
 
         return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed, roll_out)
 
-    def distances(self, test: TestSet, task: Task) -> Floats:
+    per_task: ClassVar[bool] = True
+
+    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
         """By category: infinite where a test task on this LIBERO task adds nothing of the same category.
 
         The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
         """
-        distances = np.full(len(test.of("layout")), np.nan)
-        distances[on_task(test, task, "layout")] = [
-            self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")
-        ]
-        return distances
+        return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")]
 
-    def apart(self, others: Sequence[LayoutPerturbation], same_task: NDArray[np.bool_]) -> Floats:
-        """By category too, among the draws on the same task."""
-        categories = ([added.category for added in other.objects] for other in others)
-        return np.where(same_task, [self._apart_from(of_other) for of_other in categories], np.nan)
+    def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:
+        return np.array([self._apart_from(added.category for added in other.objects) for other in others])
 
     def _apart_from(self, categories: Iterable[str]) -> float:
         return math.inf if {added.category for added in self.objects}.isdisjoint(categories) else 0.0

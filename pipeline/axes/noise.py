@@ -9,7 +9,6 @@ from functools import cache
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import model_validator
 
 from pipeline import seeding
@@ -69,7 +68,7 @@ class NoisePerturbation(PixelPerturbation):
         tested, severities = _tested(test, self.component, self.effect.strength[0])
         return np.abs(severities - self.severity(test)) if tested else severities
 
-    def apart(self, others: Sequence[NoisePerturbation], same_task: NDArray[np.bool_]) -> Floats:
+    def apart(self, others: Sequence[NoisePerturbation]) -> Floats:
         """To the strengths of the same component, on the scale of the benchmark's severities."""
         test = benchmark.load()
         severities = [other.severity(test) if other.component == self.component else np.nan for other in others]

@@ -5,19 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import HOME_RAD
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
 
 Joints = tuple[float, float, float, float, float, float, float]
 Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
@@ -97,7 +94,7 @@ class RobotPerturbation(PhysicsPerturbation):
         distances_rad: Floats = np.linalg.norm(benchmark_offsets_rad()[ids] - self.joint_offsets_rad, axis=1)
         return distances_rad
 
-    def apart(self, others: Sequence[RobotPerturbation], same_task: NDArray[np.bool_]) -> Floats:
+    def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
         """To the offsets of all, as the arm is the same in all tasks."""
         offsets_rad = np.array([other.joint_offsets_rad for other in others])
         apart_rad: Floats = np.linalg.norm(offsets_rad - self.joint_offsets_rad, axis=1)

@@ -6,20 +6,17 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.axes.base import Frozen, Level, PhysicsPerturbation, on_task
+from pipeline.axes.base import Frozen, Level, PhysicsPerturbation
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.libero.relations import relation_holds
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
 
 STEP_M = {"libero_spatial": 0.01, "libero_object": 0.03, "libero_goal": 0.02, "libero_10": 0.01, "libero_90": 0.01}
 WIDER_M = {"LIVING_ROOM_SCENE1": 0.02}
@@ -95,17 +92,14 @@ class ScenePerturbation(PhysicsPerturbation):
 
         return move(scene, demo.task, self.shifts)
 
-    def distances(self, test: TestSet, task: Task) -> Floats:
-        """Compared with the test scenes of the same task, in all things that both move."""
-        distances_m = np.full(len(test.of("pose")), np.nan)
-        for place, tested in _test_scenes(test, task):
-            distances_m[place] = self._apart_m(tested)
-        return distances_m
+    per_task: ClassVar[bool] = True
 
-    def apart(self, others: Sequence[ScenePerturbation], same_task: NDArray[np.bool_]) -> Floats:
-        """Compared with the scenes of the same task, in all things that both move."""
-        compared = zip(others, same_task, strict=True)
-        return np.array([self._apart_m(other.shifts) if same else np.nan for other, same in compared])
+    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
+        """Compared in all things that both move."""
+        return [self._apart_m(shifts) for shifts in _test_scenes(test, task)]
+
+    def apart(self, others: Sequence[ScenePerturbation]) -> Floats:
+        return np.array([self._apart_m(other.shifts) for other in others])
 
     @property
     def shifts(self) -> Shifts:
@@ -118,10 +112,9 @@ class ScenePerturbation(PhysicsPerturbation):
 
 
 @cache
-def _test_scenes(test: TestSet, task: Task) -> list[tuple[int, Shifts]]:
-    """Place of each test scene of ``task`` among the axis's test tasks, and how far it moves each thing."""
-    tested = zip(on_task(test, task, "pose").tolist(), test.on(task, "pose"), strict=True)
-    return [(place, displacements(scene.parameters)) for place, scene in tested]
+def _test_scenes(test: TestSet, task: Task) -> list[Shifts]:
+    """How far each test scene of ``task`` moves each thing."""
+    return [displacements(scene.parameters) for scene in test.on(task, "pose")]
 
 
 def displacements(parameters: Mapping[str, object]) -> Shifts:

@@ -131,10 +131,11 @@ class PlannedDraws:
         """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
         episode, where there is none to compare with."""
         others = self._draws[type(drawn)]
+        if drawn.per_task:
+            others = [(one, row) for one, row in others if (row.suite, row.task) == (task.suite, task.name)]
         if not others:
             return math.inf, ""
-        same_task = np.array([(row.suite, row.task) == (task.suite, task.name) for _, row in others])
-        distances = drawn.apart([other for other, _ in others], same_task)
+        distances = drawn.apart([other for other, _ in others])
         distances = np.where(np.isnan(distances), np.inf, distances)
         if not np.isfinite(distances).any():
             return math.inf, ""
