@@ -123,7 +123,7 @@ class BackgroundPerturbation(RenderPerturbation):
         return np.array([float(own.isdisjoint(c.sha256 for c in other.coverings)) for other in others])
 
     def credits(self) -> frozenset[Credit]:
-        return frozenset(Credit("texture", c.texture, c.licence, "") for c in self.coverings)
+        return frozenset(Credit(c.texture, "texture", c.licence, "") for c in self.coverings)
 
 
 class BackgroundAxis(Axis):

@@ -65,14 +65,14 @@ class Credit(NamedTuple):
     """Something of others' that a perturbation shows.
 
     Attributes:
-        kind: ``texture`` or ``object``.
         name: such as ``robosuite:clay.png`` or ``sweethome3d/scopia_teapot``.
+        kind: ``texture`` or ``object``.
         licence: as its source states it.
         attribution: who made it and what was changed, where that is more than the licence says.
     """
 
-    kind: str
     name: str
+    kind: str
     licence: str
     attribution: str
 
@@ -98,7 +98,7 @@ class Perturbation(Frozen):
 
     layer: ClassVar[Layer]
     views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
-    measure: ClassVar[str]
+    measure: ClassVar[str] = "nothing to compare with: the benchmark has no such test"
     unit: ClassVar[str | None] = None
     clearance: ClassVar[float] = 0.0
     per_task: ClassVar[bool] = False
@@ -110,7 +110,7 @@ class Perturbation(Frozen):
         """
         distances = np.full(len(test.of(self.axis)), np.nan)
         if self.per_task:
-            distances[on_task(test, task, self.axis)] = self.distances_on_task(test, task)
+            distances[_on_task(test, task, self.axis)] = self.distances_on_task(test, task)
         return distances
 
     def distances_on_task(self, test: TestSet, task: Task) -> Sequence[float] | Floats:
@@ -190,7 +190,7 @@ class Axis(Frozen):
 
 
 @cache
-def on_task(test: TestSet, task: Task, axis: str) -> NDArray[np.intp]:
+def _on_task(test: TestSet, task: Task, axis: str) -> NDArray[np.intp]:
     """Which of an axis's test tasks perturb ``task``: their places in ``test.of(axis)``."""
     bases = [(tested.suite, tested.base) for tested in test.of(axis)]
     return np.flatnonzero([base == (task.suite, task.name) for base in bases])
@@ -225,7 +225,7 @@ LIGHT_FIELDS = (
     *("mat_emission", "mat_reflectance", "mat_shininess", "mat_specular"),
 )
 FIELDS = (*CAMERA_FIELDS, *OPACITY_FIELDS, *LIGHT_FIELDS, "tex_data")
-"""Arrays of MuJoCo's model that the render layer can change: each is compared with MuJoCo's own drawing by the tests.
+"""Arrays of MuJoCo's model that the render layer can change: each is compared with MuJoCo's own rendering by the tests.
 
 What a scene is made of, such as ``geom_size`` or ``mesh_vert``, is kept from one picture to the next."""
 

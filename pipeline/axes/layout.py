@@ -78,7 +78,7 @@ class LayoutPerturbation(PhysicsPerturbation):
         return math.inf if {added.category for added in self.objects}.isdisjoint(categories) else 0.0
 
     def credits(self) -> frozenset[Credit]:
-        return frozenset(Credit("object", o.name, o.licence, o.attribution) for o in self.objects)
+        return frozenset(Credit(o.name, "object", o.licence, o.attribution) for o in self.objects)
 
 
 class LayoutAxis(Axis):

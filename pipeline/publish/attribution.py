@@ -5,40 +5,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 from itertools import chain
-from typing import NamedTuple
 
 from pipeline.axes import AXES, Axes, from_json
+from pipeline.axes.base import Credit
 
 
-class Attribution(NamedTuple):
-    """One texture or object that episodes show.
-
-    Attributes:
-        name: such as ``robosuite:clay.png`` or ``sweethome3d/scopia_teapot``.
-        kind: ``texture`` or ``object``.
-        licence: as its source states it.
-        attribution: who made it and what was changed, where that is more than the licence says.
-        episodes: how many show it.
-    """
-
-    name: str
-    kind: str
-    licence: str
-    attribution: str
-    episodes: int
-
-
-def attributions(perturbations: Iterable[str]) -> list[Attribution]:
-    """Everything of others' that episodes show, by kind and name.
+def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
+    """Everything of others' that episodes show, by kind and name, to how many of them show it.
 
     Args:
         perturbations: for each episode, the column of that name in the plan or the manifest. Nothing else is read.
     """
     shown = Counter(credit for text in perturbations for credit in {*chain(*(p.credits() for p in from_json(text)))})
-    return [
-        Attribution(credit.name, credit.kind, credit.licence, credit.attribution, episodes)
-        for credit, episodes in sorted(shown.items())
-    ]
+    return dict(sorted(shown.items(), key=lambda one: (one[0].kind, *one[0])))
 
 
 def counts(axes: Axes) -> dict[str, int]:
