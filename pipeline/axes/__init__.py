@@ -82,6 +82,11 @@ def axes_of(name: str) -> tuple[str, ...]:
     return tuple(sorted(axes, key=_PLACE.__getitem__))
 
 
+def components_of(axis: str) -> tuple[str, ...]:
+    """What can stand in the column ``component`` for an axis."""
+    return tuple(one for kind in AXES[axis].draws for one in get_args(kind.model_fields["component"].annotation))
+
+
 def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:
     """Perturbations in the order in which they apply, whatever order they were listed in."""
     return tuple(sorted(perturbations, key=lambda p: _PLACE[p.axis]))
@@ -124,6 +129,7 @@ __all__ = [
     "RenderPerturbation",
     "TextPerturbation",
     "axes_of",
+    "components_of",
     "from_json",
     "in_order",
     "of_layer",

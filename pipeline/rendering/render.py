@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import RenderPerturbation, of_layer, to_json
+from pipeline.axes import RenderPerturbation, of_layer
 from pipeline.axes.light import exposure
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA, named
@@ -43,7 +43,7 @@ def render(
     apart = not isinstance(renderer.drawing, SideBySide)
     scenes: dict[str, dict[str, list[Stream]]] = {}
     for stream in streams:
-        scenes.setdefault(scene_of(stream, textures=apart), {}).setdefault(scene_of(stream), []).append(stream)
+        scenes.setdefault(stream.scene(textures=apart), {}).setdefault(stream.scene(), []).append(stream)
     instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
     for step in range(steps):
         renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
@@ -92,10 +92,5 @@ def render(
         geometry=geometry,
         object_poses=np.stack(poses) if "object_poses" in config.extras else None,
         instances=instances.names if instances else (),
+        quality=trajectory.quality,
     )
-
-
-def scene_of(stream: Stream, textures: bool = True) -> str:
-    """What streams have in common that are made from the same scene, or from the same one but for its textures."""
-    changes = of_layer(stream.perturbations, RenderPerturbation)
-    return to_json([change for change in changes if textures or not change.paints])
