@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pipeline.axes import Perturbation, RenderPerturbation, of_layer
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.evaluation.settings import VIEWS
 from pipeline.images.jpeg import to_policy
 from pipeline.physics.control_env import control_env, seeded
 from pipeline.physics.environment import Environment
@@ -230,7 +229,7 @@ class Picture:
         """(256, 256, 3) uint8 RGB, turned by 180 degrees.
 
         Args:
-            view: one of ``VIEWS``.
+            view: its name in ``schemas/episode.json``.
             step: how many steps were taken, for noise that is random.
         """
         if self._scene is None:
@@ -241,8 +240,8 @@ class Picture:
             self._changes.enter_context(renderer.perturbed(of_layer(self._perturbations, RenderPerturbation)))
         state = np.concatenate([[0.0], observed.qpos, np.zeros(renderer.model.nv)])
         renderer.restore(state, observed.site_alpha)
-        frame = renderer.frame(SCHEMA.views[VIEWS[view]].camera)
-        return to_policy(noisy(frame, VIEWS[view], self._perturbations, step))
+        frame = renderer.frame(SCHEMA.views[view].camera)
+        return to_policy(noisy(frame, view, self._perturbations, step))
 
     def restore(self) -> None:
         """Undo an episode's looks."""
