@@ -1,6 +1,6 @@
 """An axis of your own, tried on a scene of a run: python examples/add_axis.py data/starter
 
-Both classes in a file of ``pipeline/axes``, and their names in its ``__init__.py``, make it an axis that
+Both classes in a file of ``pipeline/axes``, and a line for it in its ``__init__.py``, make it an axis that
 configurations can name. CONTRIBUTING.md has the steps.
 """
 
@@ -20,8 +20,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.testset.benchmark import TestSet
-from pipeline.types import Floats, Task
+from pipeline.types import Task
 
 
 class LensPerturbation(RenderPerturbation):
@@ -33,18 +32,15 @@ class LensPerturbation(RenderPerturbation):
 
     views: ClassVar[frozenset[str]] = frozenset({"image"})
     fields: ClassVar[tuple[str, ...]] = ("cam_fovy",)
-    clearance: ClassVar[float] = 0.0
-    measure: ClassVar[str] = "nothing to compare with: no test task changes the field of view"
 
     def apply(self, model: mujoco.MjModel) -> None:
         model.cam_fovy[model.camera("agentview").id] *= self.fovy_scale
 
-    def distances(self, test: TestSet, task: Task) -> Floats:
-        return np.empty(0)
-
 
 class LensAxis(Axis):
     """Narrows the view by up to 6 % at level 1 and up to 30 % at level 5."""
+
+    draws: ClassVar = (LensPerturbation,)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LensPerturbation:
         level = self.draw_level(rng)

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from pipeline.axes import AnyAxis, Axes, axes_of, components_of
+from pipeline.axes import AXES, Axes, Axis, axes_of, components_of
 from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank
 from pipeline.errors import PipelineError
@@ -79,7 +79,7 @@ class PlanConfig(Frozen):
         axes = raw.get("axes", {}) if isinstance(raw, Mapping) else None
         if not isinstance(axes, Mapping) or not isinstance(raw.get("episodes"), Mapping):
             return raw
-        drawn = {axis for name in raw["episodes"] for axis in str(name).split("+") if axis in Axes.model_fields}
+        drawn = {axis for name in raw["episodes"] for axis in str(name).split("+") if axis in AXES}
         return {**raw, "axes": {axis: {} for axis in drawn} | dict(axes)}
 
     @field_validator("episodes")
@@ -95,7 +95,7 @@ class PlanConfig(Frozen):
 
     @model_validator(mode="after")
     def _axes_match_episodes(self) -> PlanConfig:
-        configured = {name for name in Axes.model_fields if getattr(self.axes, name) is not None}
+        configured = {*self.axes.drawn()}
         drawn = {axis for name in self.episodes for axis in axes_of(name)}
         if configured != drawn:
             raise ValueError(f"axes and episodes must name the same axes, got {sorted(configured)} and {sorted(drawn)}")
@@ -103,16 +103,14 @@ class PlanConfig(Frozen):
             self.drawn_from(name)
         return self
 
-    def drawn_from(self, name: str) -> tuple[AnyAxis, ...]:
+    def drawn_from(self, name: str) -> tuple[Axis, ...]:
         """What the episodes called ``name`` draw from, one axis after the other.
 
         Raises:
-            ValueError: when objects are added and no class of rewrites is left that stays unambiguous among them.
+            ValueError: when one of them has nothing left to draw beside the others.
         """
-        axes = {axis: getattr(self.axes, axis) for axis in axes_of(name)}
-        if "layout" in axes and "language" in axes:
-            axes["language"] = axes["language"].among_more_objects()
-        return tuple(axes.values())
+        names, axes = axes_of(name), self.axes.drawn()
+        return tuple(axes[one].beside(names) for one in names)
 
 
 class ReplayConfig(Frozen):

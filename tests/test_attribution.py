@@ -6,10 +6,11 @@ from conftest import MILK
 
 from pipeline.axes import Axes, to_json
 from pipeline.axes.background import BackgroundAxis
+from pipeline.axes.base import Credit
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.publish import attribution
-from pipeline.publish.attribution import Attribution, attributions
+from pipeline.publish.attribution import attributions
 from pipeline.seeding import rng
 
 
@@ -23,10 +24,11 @@ def test_everything_that_is_shown_is_attributed_and_nothing_else() -> None:
     for added in layout.objects:
         assert added.licence
         assert added.attribution
-        assert objects[added.name] == Attribution(added.name, "object", added.licence, added.attribution, 2)
+        assert objects[added.name] == Credit(added.name, "object", added.licence, added.attribution)
+        assert found[objects[added.name]] == 2
     textures = {made.name: made for made in found if made.kind == "texture"}
     assert {covering.texture for covering in background.coverings} == set(textures)
-    assert {made.episodes for made in textures.values()} == {1}
+    assert {found[made] for made in textures.values()} == {1}
     assert all(made.licence for made in found)
     assert len(found) == len(objects) + len(textures)
 
@@ -34,7 +36,7 @@ def test_everything_that_is_shown_is_attributed_and_nothing_else() -> None:
 def test_a_texture_on_two_parts_of_a_scene_is_one_episode() -> None:
     drawn = BackgroundAxis(components=("theme",)).sample(rng("inventory"), MILK, 0)
     same = drawn.model_copy(update={"coverings": (drawn.coverings[0],) * 2})
-    assert [made.episodes for made in attributions([to_json([same])])] == [1]
+    assert list(attributions([to_json([same])]).values()) == [1]
 
 
 def test_what_is_installed_holds_what_the_documentation_says() -> None:

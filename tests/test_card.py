@@ -93,9 +93,9 @@ def data(tmp_path: Path) -> Path:
         },
     }.items():
         (tmp_path / name).write_text(json.dumps(report))
-    for kind in ("rlds", "lerobot", "lerobot_v21"):
+    for kind in FORMATS:
         record = {"identity": "", "files": {f"{NAME}/data.bin": DATA_SHA256}, "places": {}}
-        (tmp_path / f"{kind}.json").write_text(json.dumps(record))
+        (tmp_path / f"{kind.name}.json").write_text(json.dumps(record))
     (tmp_path / "sheets").mkdir()
     for axis in ("camera", "camera+background"):
         (tmp_path / "sheets" / f"{axis}.png").write_bytes(axis.encode())

@@ -15,7 +15,7 @@ from conftest import STOVE
 from episode_results import result
 
 from pipeline.__main__ import parser
-from pipeline.axes import AnyPerturbation, to_json
+from pipeline.axes import Perturbation, to_json
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.errors import PipelineError
 from pipeline.evaluation import composition, own_draws, tasks
@@ -154,7 +154,7 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
         select(Selection(file=file))
 
 
-def planned_row(task: EvaluationTask, *perturbations: AnyPerturbation) -> plan.Row:
+def planned_row(task: EvaluationTask, *perturbations: Perturbation) -> plan.Row:
     """A row of a plan that a training run would make."""
     fields: dict[str, Any] = dict.fromkeys(plan.Row.__dataclass_fields__, "")
     fields |= {"suite": task.suite, "task": task.base, "episode_id": "planted", "perturbations": to_json(perturbations)}

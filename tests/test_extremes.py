@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from pipeline.axes import AnyAxis, AnyPerturbation, Axes, PixelPerturbation, RenderPerturbation, from_json, to_json
+from pipeline.axes import AXES, Axes, Axis, Perturbation, PixelPerturbation, RenderPerturbation, from_json, to_json
 from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.pose import PoseAxis
 from pipeline.errors import PipelineError
@@ -113,13 +113,13 @@ def applied(json: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("name", [name for name in Axes.model_fields if name != "language"])
+@pytest.mark.parametrize("name", [name for name in AXES if name != "language"])
 def test_what_is_accepted_is_drawn_recorded_and_applied(name: str) -> None:
     """Language has no numbers but its levels."""
     config = getattr(Axes.model_validate({name: {}}), name).model_dump(mode="json")
     for path, value in fields(config):
         for extreme in ends(name, config, path, value):
-            axis: AnyAxis = getattr(Axes.model_validate({name: extreme}), name)
+            axis: Axis = getattr(Axes.model_validate({name: extreme}), name)
             # So many that a change of one of five components at one of five levels is among them.
             for key in range(20 if name == "layout" else 120):
                 task = TASKS[key % len(TASKS)]
@@ -129,7 +129,7 @@ def test_what_is_accepted_is_drawn_recorded_and_applied(name: str) -> None:
                         applied(recorded(axis.sample(rng("extreme", key), task, key), task))
 
 
-def recorded(drawn: AnyPerturbation, task: Task) -> str:
+def recorded(drawn: Perturbation, task: Task) -> str:
     """As a plan has it, but all under one seed, so that the same change is applied once."""
     assert drawn.nearest(TestSet(()), task).compared == 0
     one_seed = drawn.model_copy(update={"seed": 0}) if "seed" in type(drawn).model_fields else drawn

@@ -185,11 +185,11 @@ def test_no_classes_is_refused() -> None:
 
 
 def test_among_more_objects_things_are_called_by_their_names() -> None:
-    axis = LanguageAxis(levels=(1, 2)).among_more_objects()
+    axis = LanguageAxis(levels=(1, 2)).beside(["layout", "language"])
     assert axis == LanguageAxis(levels=(1, 2), classes=NAMED)
-    assert LanguageAxis(classes=("paraphrase", "common_sense")).among_more_objects().classes == ("paraphrase",)
+    assert LanguageAxis(classes=("paraphrase", "common_sense")).beside(["layout"]).classes == ("paraphrase",)
     with pytest.raises(ValueError, match="distraction or paraphrase"):
-        LanguageAxis(classes=("common_sense", "reasoning_chain")).among_more_objects()
+        LanguageAxis(classes=("common_sense", "reasoning_chain")).beside(["layout"])
 
 
 def test_levels_follow_the_distance_to_the_original(task: Task) -> None:

@@ -114,7 +114,7 @@ def test_what_stands_still_is_drawn_once(pair: Pair) -> None:
         if step == 10:
             pair.drawn.clear()
         pair.opened.frame("fixed")
-    assert len(pair.ours._layers) == 1
+    assert len(pair.ours._underlays) == 1
     assert sum(pair.drawn) < 20 * BODIES
 
 
@@ -125,7 +125,7 @@ def test_what_trembles_is_left_out_of_the_layer(pair: Pair) -> None:
         if step == 40:
             pair.drawn.clear()
         pair.opened.frame("fixed")
-    assert max(pair.drawn) < BODIES, "the layer of those that stand still is as it was"
+    assert max(pair.drawn) < BODIES, "the underlay of those that stand still is as it was"
 
 
 @pytest.mark.parametrize(

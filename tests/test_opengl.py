@@ -122,7 +122,7 @@ def textures(scene):
     Renderer(model)
 
 
-def layer():
+def underlay():
     renderer, gl = Renderer({scene()!r}), calls()
     gl.glBindTexture(gl.GL_TEXTURE_2D_MULTISAMPLE, gl.glGenTextures(1))
     gl.glTexImage2DMultisample(gl.GL_TEXTURE_2D_MULTISAMPLE, 4, gl.GL_RGBA8, 16384, 16384, True)
@@ -135,7 +135,7 @@ def window():
 
 
 cases = {{
-    "glTexImage2DMultisample": layer,
+    "glTexImage2DMultisample": underlay,
     "mjr_uploadTexture": lambda: textures({scene(asset=CUBE)!r}),
     # Not what other scenes have too, so that the context is made for this one.
     "mjr_makeContext": lambda: textures({scene(BALL + '<geom type="hfield" hfield="hills"/>', asset=CUBE + HILLS)!r}),

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipeline.axes import Axes, from_json, to_json
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.camera import CameraAxis
-from pipeline.axes.language import LanguageAxis, deal
+from pipeline.axes.language import LanguageAxis, LanguagePerturbation, deal
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.config import PlanConfig, ReplayConfig
@@ -216,7 +216,7 @@ def test_a_combination_is_the_same_in_whatever_order_it_was_written() -> None:
         assert row.axis == "camera+noise+language" == "+".join(p.axis for p in drawn)
         assert row.component == "+".join(p.component for p in drawn)
         assert row.level == "+".join(str(p.level) for p in drawn)
-        assert row.instruction in {p.text for p in drawn if p.axis == "language"}
+        assert row.instruction in {p.text for p in drawn if isinstance(p, LanguagePerturbation)}
     levels = {tuple(p.level for p in from_json(row.perturbations)) for row in rows}
     assert any(len(set(of_parts)) > 1 for of_parts in levels), "each part has a level of its own"
 
@@ -238,7 +238,7 @@ def test_a_combination_fills_a_quota_of_its_own() -> None:
 def test_every_part_of_a_combination_keeps_clear_of_the_test_set() -> None:
     axes: dict[str, object] = {"noise": {}, "language": {}}
     first = combined("noise+language", **axes)
-    planted = next(p for p in from_json(first[0].perturbations) if p.axis == "language")
+    planted = next(p for p in from_json(first[0].perturbations) if isinstance(p, LanguagePerturbation))
     test = TestSet((TestTask("libero_goal", TASKS[0].name, "planted", "language", "rewrite", {"text": planted.text}),))
     again = plan.make(entries(), config(axes=Axes.model_validate(axes), episodes={"noise+language": 6}), REPLAY, test)
     rows = [row for row in again if row.role == "perturbed"]

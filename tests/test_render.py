@@ -241,7 +241,7 @@ def test_a_lens_that_loses_sight_of_the_task_is_rejected_too(
     monkeypatch.setitem(axes._PLACE, "lens", 0)
     trajectory = replace(whole[MILK], states=whole[MILK].states[:3], actions=whole[MILK].actions[:2])
     lenses = [LensPerturbation(component="zoom", level=5, fovy_scale=scale) for scale in (0.3, 0.97)]
-    lost, seen = (Stream("image", (lens,)) for lens in lenses)  # type: ignore[arg-type]
+    lost, seen = (Stream("image", (lens,)) for lens in lenses)
     rendered = render(trajectory, MILK, [lost, seen], RenderConfig(), opened)
     assert rendered.rejected == {lost.stream_id: "task_object_not_seen"}
     assert set(rendered.streams) == {seen.stream_id}

@@ -4,21 +4,30 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from pipeline.axes import axes_of
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
+from pipeline.evaluation.own_draws import OWN_AXES
 from pipeline.seeding import digest
 
 PLUS_AXES = Literal["camera", "robot", "noise", "pose"]
 """The axes whose test tasks need no asset archive. ACT reads no text, so language is none of them."""
 
-OWN_AXES = Literal["layout", "pose", "robot", "camera", "light", "background", "noise"]
+
+def _drawn(axis: str) -> str:
+    if axis not in OWN_AXES:
+        raise ValueError(f"expected one of {', '.join(OWN_AXES)}")
+    return axis
+
+
+OwnAxis = Annotated[str, AfterValidator(_drawn)]
+"""An axis that has held-out draws."""
 
 
 class TrainingConfig(Frozen):
@@ -55,8 +64,8 @@ class EvaluationConfig(Frozen):
 
     episodes: int = Field(ge=1)
     libero_plus: tuple[PLUS_AXES, ...] = ()
-    held_out: tuple[OWN_AXES, ...] = ()
-    redrawn: tuple[OWN_AXES, ...] = ()
+    held_out: tuple[OwnAxis, ...] = ()
+    redrawn: tuple[OwnAxis, ...] = ()
     initial_states: Literal["libero", "demonstration"] = "libero"
 
 

@@ -1,14 +1,17 @@
-"""The axes of perturbation, one file each, and the union that reads any recorded perturbation back."""
+"""The axes of perturbation: one file each, and the registry, ``Axes``, with one line for each."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Annotated, TypeVar, get_args
+from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import Field, TypeAdapter, ValidationError
 
-from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
+from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.base import (
+    Axis,
     Frozen,
     Perturbation,
     PhysicsPerturbation,
@@ -16,32 +19,14 @@ from pipeline.axes.base import (
     RenderPerturbation,
     TextPerturbation,
 )
-from pipeline.axes.camera import CameraAxis, CameraPerturbation
-from pipeline.axes.language import LanguageAxis, LanguagePerturbation
-from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
-from pipeline.axes.light import LightAxis, LightPerturbation
-from pipeline.axes.noise import NoiseAxis, NoisePerturbation
-from pipeline.axes.pose import PoseAxis, PosePerturbation
-from pipeline.axes.robot import RobotAxis, RobotPerturbation
-from pipeline.axes.scene import ScenePerturbation
-from pipeline.errors import PipelineError, RefusedError
-
-AnyPerturbation = Annotated[
-    CameraPerturbation
-    | LightPerturbation
-    | BackgroundPerturbation
-    | NoisePerturbation
-    | LanguagePerturbation
-    | LayoutPerturbation
-    | Annotated[PosePerturbation | ScenePerturbation, Field(discriminator="component")]
-    | RobotPerturbation,
-    Field(discriminator="axis"),
-]
-AnyAxis = CameraAxis | LightAxis | BackgroundAxis | NoiseAxis | LanguageAxis | LayoutAxis | PoseAxis | RobotAxis
-
-Kind = TypeVar("Kind", bound=Perturbation)
-
-_LIST = TypeAdapter(tuple[AnyPerturbation, ...])
+from pipeline.axes.camera import CameraAxis
+from pipeline.axes.language import LanguageAxis
+from pipeline.axes.layout import LayoutAxis
+from pipeline.axes.light import LightAxis
+from pipeline.axes.noise import NoiseAxis
+from pipeline.axes.pose import PoseAxis
+from pipeline.axes.robot import RobotAxis
+from pipeline.errors import PipelineError
 
 
 class Axes(Frozen):
@@ -60,14 +45,27 @@ class Axes(Frozen):
     noise: NoiseAxis | None = None
     language: LanguageAxis | None = None
 
+    def drawn(self) -> dict[str, Axis]:
+        """Those that are drawn from, by name."""
+        return {name: axis for name, axis in self if axis is not None}
 
-# The union has a union of its own for an axis that has several kinds.
-_KINDS: dict[str, tuple[type[Perturbation], ...]] = {
-    kinds[0].model_fields["axis"].default: kinds
-    for member in get_args(get_args(AnyPerturbation)[0])
-    for kinds in [(member,) if isinstance(member, type) else get_args(get_args(member)[0])]
-}
-_PLACE = {axis: place for place, axis in enumerate(Axes.model_fields)}
+
+AXES: Mapping[str, type[Axis]] = {name: get_args(field.annotation)[0] for name, field in Axes.model_fields.items()}
+"""Every axis by its name, in the order in which they apply."""
+
+_PLACE = {name: place for place, name in enumerate(AXES)}
+
+
+def _read_by(tag: str, kinds: Sequence[Any]) -> Any:
+    """The type of what is one of several kinds, told apart by a field."""
+    return Annotated[reduce(or_, kinds), Field(discriminator=tag)] if len(kinds) > 1 else kinds[0]
+
+
+_LIST: TypeAdapter[tuple[Perturbation, ...]] = TypeAdapter(
+    tuple[_read_by("axis", [_read_by("component", axis.draws) for axis in AXES.values()]), ...]  # type: ignore[misc, arg-type]
+)
+
+Kind = TypeVar("Kind", bound=Perturbation)
 
 
 def axes_of(name: str) -> tuple[str, ...]:
@@ -77,23 +75,16 @@ def axes_of(name: str) -> tuple[str, ...]:
         ValueError: when one of them is no axis, or is named twice.
     """
     axes = name.split("+")
-    if unknown := [axis for axis in axes if axis not in _PLACE]:
-        raise ValueError(
-            f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(_PLACE)}, or some joined by +"
-        )
+    if unknown := [axis for axis in axes if axis not in AXES]:
+        raise ValueError(f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(AXES)}, or some joined by +")
     if len(set(axes)) < len(axes):
         raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
     return tuple(sorted(axes, key=_PLACE.__getitem__))
 
 
-def kind_of(axis: str) -> type[Perturbation]:
-    """The perturbations of an axis, by its name; of several kinds the first."""
-    return _KINDS[axis][0]
-
-
 def components_of(axis: str) -> tuple[str, ...]:
     """What can stand in the column ``component`` for an axis."""
-    return tuple(one for kind in _KINDS[axis] for one in get_args(kind.model_fields["component"].annotation))
+    return tuple(one for kind in AXES[axis].draws for one in get_args(kind.model_fields["component"].annotation))
 
 
 def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:
@@ -106,7 +97,7 @@ def to_json(perturbations: Iterable[Perturbation]) -> str:
     return f"[{','.join(p.model_dump_json() for p in in_order(perturbations))}]"
 
 
-def from_json(text: str) -> tuple[AnyPerturbation, ...]:
+def from_json(text: str) -> tuple[Perturbation, ...]:
     """Read perturbations back, in the order in which they apply.
 
     Raises:
@@ -123,25 +114,24 @@ def from_json(text: str) -> tuple[AnyPerturbation, ...]:
         ) from error
 
 
-def of_layer(perturbations: Sequence[Perturbation], layer: type[Kind]) -> tuple[Kind, ...]:
+def of_layer(perturbations: Iterable[Perturbation], layer: type[Kind]) -> tuple[Kind, ...]:
     """Those that act on one layer, named by its class."""
     return tuple(p for p in perturbations if isinstance(p, layer))
 
 
 __all__ = [
-    "AnyAxis",
-    "AnyPerturbation",
+    "AXES",
     "Axes",
+    "Axis",
+    "Perturbation",
     "PhysicsPerturbation",
     "PixelPerturbation",
-    "RefusedError",
     "RenderPerturbation",
     "TextPerturbation",
     "axes_of",
     "components_of",
     "from_json",
     "in_order",
-    "kind_of",
     "of_layer",
     "to_json",
 ]

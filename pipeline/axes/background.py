@@ -8,6 +8,7 @@ the pattern, 5 shows the new one's own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from itertools import product
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
@@ -15,18 +16,17 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, ByLevel, Frozen, RenderPerturbation, Share, pick
+from pipeline.axes.base import Axis, ByLevel, Credit, Frozen, RenderPerturbation, Share, pick
 from pipeline.catalogue import textures
 from pipeline.catalogue.data_maps import DATA_MAPS
 from pipeline.catalogue.procedural import COLOUR_MAPS
 from pipeline.catalogue.texture_sources import Source, Texture, keep
 from pipeline.errors import PipelineError
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Frame, Task
 
 if TYPE_CHECKING:
     import mujoco
-
-    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["theme", "surface"]
 Part = Literal["wall", "floor", "cupboard", "surface"]
@@ -81,11 +81,9 @@ class BackgroundPerturbation(RenderPerturbation):
     coverings: tuple[Covering, ...]
     colour_scale: Share
 
-    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
     fields: ClassVar[tuple[str, ...]] = ("tex_data",)
-    clearance: ClassVar[float] = 1.0
     measure: ClassVar[str] = "0 where an image's name or bytes are those of a test task's, else 1"
-    graded: ClassVar[bool] = False
+    clearance: ClassVar[float] = 1.0
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Write the coverings into the model's textures.
@@ -119,6 +117,14 @@ class BackgroundPerturbation(RenderPerturbation):
         )
         return np.full(len(test.of("background")), 0.0 if overlaps else 1.0)
 
+    def apart(self, others: Sequence[BackgroundPerturbation]) -> Floats:
+        """0 where both show one of the images, else 1."""
+        own = {covering.sha256 for covering in self.coverings}
+        return np.array([float(own.isdisjoint(c.sha256 for c in other.coverings)) for other in others])
+
+    def credits(self) -> frozenset[Credit]:
+        return frozenset(Credit(c.texture, "texture", c.licence, "") for c in self.coverings)
+
 
 class BackgroundAxis(Axis):
     """What to draw from.
@@ -133,6 +139,8 @@ class BackgroundAxis(Axis):
         image_share: how often an image is drawn rather than a procedural colour map, of which there are many more.
         colour_scale: for each level, how much of the new texture's own average colour shows in the other draws.
     """
+
+    draws: ClassVar = (BackgroundPerturbation,)
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("theme", "surface")
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite", "procedural")
@@ -151,6 +159,13 @@ class BackgroundAxis(Axis):
             coverings=tuple(self._draw_covering(rng, part, own_colours) for part in PARTS[component]),
             colour_scale=1.0 if own_colours else self.colour_scale[level - 1],
         )
+
+    def offered(self) -> dict[str, int]:
+        found = textures.catalogue(self.sources).values()
+        return {
+            "surfaces": len({texture.sha256 for texture in found}),
+            "procedural": sum(texture.source == "procedural" for texture in found),
+        }
 
     def _draw_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
         kinds = _offered(self.sources)

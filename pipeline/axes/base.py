@@ -1,32 +1,32 @@
 """What every axis of perturbation has in common.
 
-An axis comes as a pair of small frozen models in one file:
+An axis is a pair of small frozen models in one file. What is constant about it are their class attributes:
 
 * ``XAxis`` is the axis as configured, its ranges, and draws: ``sample(rng, task, place) -> XPerturbation``.
-  Each demonstration numbers its draws from a start of its own, for axes that take the entries of a list in turn.
-* ``XPerturbation`` is one drawn change with every parameter, and acts: ``apply(...)`` on what its layer
-  touches (text: the instruction; pixels: a clean frame; render and physics: the MuJoCo model).
+* ``XPerturbation`` is one draw with every parameter, and acts: ``apply(...)`` on what its layer touches (text: the
+  instruction; pixels: a clean frame; render: the MuJoCo model; physics: the scene, and what it holds for the rollout).
+
+``pipeline.axes.Axes`` is the registry, with one line for each axis.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from enum import IntEnum
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from pipeline.errors import PipelineError
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
 
 if TYPE_CHECKING:
     import mujoco
-
-    from pipeline.testset.benchmark import TestSet
 
 
 class Layer(IntEnum):
@@ -46,26 +46,7 @@ class Frozen(BaseModel):
 
 Level = Literal[1, 2, 3, 4, 5]
 """Strength, weakest first."""
-
-
-class Axis(Frozen):
-    """The ranges that an axis draws from.
-
-    Attributes:
-        levels: the strengths to draw, each as often as the others.
-    """
-
-    levels: Annotated[tuple[Level, ...], Field(min_length=1)] = (1, 2, 3, 4, 5)
-
-    def applies(self, task: Task) -> bool:
-        """Whether the axis can change anything that ``task`` has; its episodes are spread over the tasks that it can.
-
-        What cannot be known before the scene is built is refused when the perturbation is applied.
-        """
-        return True
-
-    def draw_level(self, rng: np.random.Generator) -> Level:
-        return pick(rng, self.levels)
+LEVELS: tuple[Level, ...] = get_args(Level)
 
 
 class Nearest(NamedTuple):
@@ -80,35 +61,60 @@ class Nearest(NamedTuple):
     compared: int
 
 
+class Credit(NamedTuple):
+    """Something of others' that a perturbation shows.
+
+    Attributes:
+        name: such as ``robosuite:clay.png`` or ``sweethome3d/scopia_teapot``.
+        kind: ``texture`` or ``object``.
+        licence: as its source states it.
+        attribution: who made it and what was changed, where that is more than the licence says.
+    """
+
+    name: str
+    kind: str
+    licence: str
+    attribution: str
+
+
 class Perturbation(Frozen):
-    """One change on one axis, with all of its parameters; JSON in and out through pydantic.
+    """One draw: a change on one axis, with all of its parameters; JSON in and out through pydantic.
 
     Attributes:
         axis: name of the axis, the discriminator when a perturbation is read back.
         component: which of the axis's components was drawn.
         level: strength, 1 to 5, by the ranges that the axis states.
+        layer: what has to be made again.
+        views: those of ``schemas/episode.json`` whose frames this can change; empty for text.
+        measure: what the distance to a test task is.
+        unit: of that distance; None where it tells only same from other, not near from far.
         clearance: the least distance to any test task; a draw that comes closer is drawn anew.
-        measure: what the distance is and its unit.
-        graded: whether the distance tells near from far, not only same from other.
+        per_task: whether only what is on the same LIBERO task can be compared.
     """
 
     axis: str
     component: str
     level: Level
 
-    clearance: ClassVar[float]
-    measure: ClassVar[str]
-    graded: ClassVar[bool] = True
-
     layer: ClassVar[Layer]
-    views: ClassVar[frozenset[str]]
-    """The views of ``schemas/episode.json`` whose frames this can change; empty for text."""
+    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
+    measure: ClassVar[str] = "nothing to compare with: the benchmark has no such test"
+    unit: ClassVar[str | None] = None
+    clearance: ClassVar[float] = 0.0
+    per_task: ClassVar[bool] = False
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """The distance to each of the axis's test tasks (N,), in their order, for an episode of ``task``.
 
         NaN where there is nothing to compare, such as the wordings of another task.
         """
+        distances = np.full(len(test.of(self.axis)), np.nan)
+        if self.per_task:
+            distances[_on_task(test, task, self.axis)] = self.distances_on_task(test, task)
+        return distances
+
+    def distances_on_task(self, test: TestSet, task: Task) -> Sequence[float] | Floats:
+        """Those of ``distances`` to the test tasks that perturb ``task``, where an axis compares ``per_task``."""
         raise NotImplementedError
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
@@ -117,9 +123,74 @@ class Perturbation(Frozen):
         compared = distances[~np.isnan(distances)]
         return Nearest(float(compared.min(initial=np.inf)), len(compared))
 
+    def apart(self, others: Sequence[Self]) -> Floats:
+        """The distance to each of N draws of this class (N,), as ``distances`` measures it; NaN where there is nothing
+        to compare. By default 0 to a draw that is equal, else 1.
+
+        Args:
+            others: at least one, on the same LIBERO task where the axis compares ``per_task``.
+        """
+        return np.array([float(self != other) for other in others])
+
+    def credits(self) -> frozenset[Credit]:
+        """What this shows that has a licence of its own."""
+        return frozenset()
+
+
+class Axis(Frozen):
+    """The ranges that an axis draws from.
+
+    Attributes:
+        draws: the perturbations that it draws; several are told apart by their ``component``.
+        not_held_out: why evaluations have no draws of this axis that plans leave alone; empty where they have.
+        levels: the strengths to draw, each as often as the others.
+    """
+
+    draws: ClassVar[tuple[type[Perturbation], ...]]
+    not_held_out: ClassVar[str] = ""
+
+    levels: Annotated[tuple[Level, ...], Field(min_length=1)] = LEVELS
+
+    def applies(self, task: Task) -> bool:
+        """Whether the axis can change anything that ``task`` has; its episodes are spread over the tasks that it can.
+
+        What cannot be known before the scene is built is refused when the perturbation is applied.
+        """
+        return True
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> Perturbation:
+        """One draw for a task that the axis applies to.
+
+        Args:
+            rng: what is random comes from here alone.
+            task: what is perturbed.
+            place: counts a demonstration's draws, for axes that take the entries of a list in turn.
+        """
+        raise NotImplementedError
+
+    def draw_level(self, rng: np.random.Generator) -> Level:
+        return pick(rng, self.levels)
+
+    def beside(self, axes: Collection[str]) -> Axis:
+        """The axis where the episodes are perturbed on these axes together.
+
+        Raises:
+            ValueError: when nothing is left to draw from.
+        """
+        return self
+
+    @classmethod
+    def held_out(cls) -> Axis:
+        """The ranges of held-out draws: the default ones, from which a key of their own keeps draws apart."""
+        return cls()
+
+    def offered(self) -> dict[str, int]:
+        """How many different things of others' there are to draw from, by kind; what is not installed is fetched."""
+        return {}
+
 
 @cache
-def on_task(test: TestSet, task: Task, axis: str) -> NDArray[np.intp]:
+def _on_task(test: TestSet, task: Task, axis: str) -> NDArray[np.intp]:
     """Which of an axis's test tasks perturb ``task``: their places in ``test.of(axis)``."""
     bases = [(tested.suite, tested.base) for tested in test.of(axis)]
     return np.flatnonzero([base == (task.suite, task.name) for base in bases])
@@ -154,7 +225,7 @@ LIGHT_FIELDS = (
     *("mat_emission", "mat_reflectance", "mat_shininess", "mat_specular"),
 )
 FIELDS = (*CAMERA_FIELDS, *OPACITY_FIELDS, *LIGHT_FIELDS, "tex_data")
-"""Arrays of MuJoCo's model that the render layer can change: each is compared with MuJoCo's own drawing by the tests.
+"""Arrays of MuJoCo's model that the render layer can change: each is compared with MuJoCo's own rendering by the tests.
 
 What a scene is made of, such as ``geom_size`` or ``mesh_vert``, is kept from one picture to the next."""
 
@@ -164,17 +235,22 @@ class RenderPerturbation(Perturbation):
 
     Attributes:
         fields: the arrays of the model that ``apply`` may write, of ``FIELDS``; they are put back afterwards.
+        paints: whether it writes textures and nothing else.
+        sees_otherwise: whether it sees other surfaces: from another place, through another lens, or through what was
+            opaque.
 
     Raises:
         PipelineError: when a class is made whose ``fields`` has another one.
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
-    fields: ClassVar[tuple[str, ...]]
+    fields: ClassVar[tuple[str, ...]] = ()
+    paints: ClassVar[bool]
+    sees_otherwise: ClassVar[bool]
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: object) -> None:
-        for field in getattr(cls, "fields", ()):
+        for field in cls.fields:
             if field not in FIELDS:
                 raise PipelineError(
                     f"a render perturbation writes {field}, which pictures would not follow",
@@ -182,27 +258,22 @@ class RenderPerturbation(Perturbation):
                     expected=f"fields of {', '.join(FIELDS)}",
                     remedy="make it a PhysicsPerturbation, which changes the scene before it is replayed",
                 )
+        cls.paints = cls.fields == ("tex_data",)
+        cls.sees_otherwise = not {*CAMERA_FIELDS, *OPACITY_FIELDS}.isdisjoint(cls.fields)
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Write the change into the model's ``fields``."""
         raise NotImplementedError
 
-    @property
-    def paints(self) -> bool:
-        """Whether it writes textures and nothing else."""
-        return self.fields == ("tex_data",)
-
-    @property
-    def sees_otherwise(self) -> bool:
-        """Whether it sees other surfaces: from another place, through another lens, or through what was opaque."""
-        return not {*CAMERA_FIELDS, *OPACITY_FIELDS}.isdisjoint(self.fields)
-
 
 class PhysicsPerturbation(Perturbation):
-    """Changes what happens: the scene before the first step, and so the whole replay."""
+    """Changes what happens: the scene before the first step, and so the whole replay.
+
+    What acts in the course of the episode, such as another posture of the controller, is a field of ``Scene``, which is
+    stored with the trajectory: ``apply`` sets it, and the environment acts by it wherever the scene is run.
+    """
 
     layer: ClassVar[Layer] = Layer.PHYSICS
-    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene that ``demo`` is replayed in.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
@@ -11,12 +12,11 @@ from pydantic import AfterValidator, Field, model_validator
 
 from pipeline.axes.base import Axis, ByLevel, Degrees, Frozen, Intervals, RenderPerturbation, draw, pick, point
 from pipeline.rotations import about, product, rotate
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
     import mujoco
-
-    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["distance", "spherical", "orientation"]
 
@@ -27,6 +27,9 @@ ORBIT_CENTRE_M = np.array([0.0, 0.0, 0.8])
 STEEPEST_DEG = 60.5
 """How far the study's agent view, the steepest of the five arenas, stands above the orbit centre's horizon. There a
 degree of azimuth spans the least of the sphere, so what is clear of the test cameras there is clear in every arena."""
+
+PARAMETERS = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
+"""What places a camera, in draws and in test tasks."""
 
 NEAREST = 0.01
 """The least multiple of the distance that can be asked for; draws are recorded with four decimals."""
@@ -63,8 +66,9 @@ class CameraPerturbation(RenderPerturbation):
     views: ClassVar[frozenset[str]] = frozenset({"image"})
     fields: ClassVar[tuple[str, ...]] = ("cam_pos", "cam_quat")
     clearance: ClassVar[float] = 5.0
+    unit: ClassVar[str | None] = "degrees"
     measure: ClassVar[str] = (
-        "degrees: the largest of the angle on the sphere about the orbit centre, the angle between the turns in place, "
+        "the largest of the angle on the sphere about the orbit centre, the angle between the turns in place, "
         "and the logarithm of the distance ratio (5 degrees: 1.091)"
     )
 
@@ -88,15 +92,22 @@ class CameraPerturbation(RenderPerturbation):
     def distances(self, test: TestSet, task: Task) -> Floats:
         """To all test cameras, whichever task they are for: many tasks share one nominal view."""
         cameras, which = _test_cameras(test)
-        own = _embed(*np.array([self._parameters()]).T)
+        return self._angles_deg(cameras)[which]
+
+    def apart(self, others: Sequence[CameraPerturbation]) -> Floats:
+        """To all cameras, whichever task they are for."""
+        return self._angles_deg(_embed(np.array([other._parameters() for other in others])))
+
+    def _angles_deg(self, cameras: _Cameras) -> Floats:
+        own = _embed(np.array([self._parameters()]))
         sphere = _angle_deg(cameras.rays @ own.rays[0])
         turn = 2 * _angle_deg(np.abs(cameras.turns @ own.turns[0]))
         dolly = np.rad2deg(np.abs(cameras.log_scales - own.log_scales[0]))
-        largest: Floats = np.maximum(np.maximum(sphere, turn), dolly)[which]
+        largest: Floats = np.maximum(np.maximum(sphere, turn), dolly)
         return largest
 
     def _parameters(self) -> tuple[float, ...]:
-        return self.azimuth_deg, self.elevation_deg, self.distance_scale, self.yaw_deg, self.pitch_deg
+        return tuple(getattr(self, name) for name in PARAMETERS)
 
 
 class _Cameras(NamedTuple):
@@ -107,8 +118,9 @@ class _Cameras(NamedTuple):
     log_scales: Floats
 
 
-def _embed(azimuth_deg: Floats, elevation_deg: Floats, scale: Floats, yaw_deg: Floats, pitch_deg: Floats) -> _Cameras:
-    """Parameters (N,) each, in the steepest arena."""
+def _embed(parameters: Floats) -> _Cameras:
+    """``PARAMETERS`` (N, 5) in the steepest arena."""
+    azimuth_deg, elevation_deg, scale, yaw_deg, pitch_deg = parameters.T
     h, v = np.deg2rad(azimuth_deg), np.deg2rad(STEEPEST_DEG + elevation_deg)
     rays = np.stack([np.cos(v) * np.cos(h), np.cos(v) * np.sin(h), np.sin(v)], axis=1)
     y, p = np.deg2rad(yaw_deg) / 2, -np.deg2rad(pitch_deg) / 2
@@ -126,10 +138,9 @@ def _angle_deg(cosine: Floats) -> Floats:
 @lru_cache(maxsize=4)
 def _test_cameras(test: TestSet) -> tuple[_Cameras, NDArray[np.intp]]:
     """The distinct cameras of the test set, and which of them each test task has."""
-    names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
-    listed = [[float(task.parameters[name]) for name in names] for task in test.of("camera")]
-    distinct, which = np.unique(np.array(listed).reshape(-1, len(names)), axis=0, return_inverse=True)
-    return _embed(*distinct.T), which.reshape(-1)
+    listed = [[float(task.parameters[name]) for name in PARAMETERS] for task in test.of("camera")]
+    distinct, which = np.unique(np.array(listed).reshape(-1, len(PARAMETERS)), axis=0, return_inverse=True)
+    return _embed(distinct), which.reshape(-1)
 
 
 def _positive(intervals: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
@@ -233,6 +244,8 @@ class CameraAxis(Axis):
     There every value is taken, so a draw changes something else as well, which keeps it 5 degrees from all of them:
     a distance of 1.6 with 6 degrees of elevation is clear. What the defaults show was looked at in all five arenas.
     """
+
+    draws: ClassVar = (CameraPerturbation,)
 
     distance: DistanceRange | None = DistanceRange()
     spherical: SphericalRange | None = SphericalRange()

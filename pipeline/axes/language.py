@@ -12,10 +12,11 @@ from __future__ import annotations
 
 import bisect
 import re
+from collections.abc import Collection
 from functools import cache
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, get_args
+from typing import ClassVar, Literal, get_args
 
 import numpy as np
 import yaml
@@ -23,14 +24,12 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, Level, TextPerturbation, on_task
+from pipeline.axes.base import Axis, Level, TextPerturbation
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
 from pipeline.jit import compiled
-from pipeline.types import Floats, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Task
 
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
 CLASSES: tuple[Component, ...] = get_args(Component)
@@ -81,17 +80,18 @@ class LanguagePerturbation(TextPerturbation):
     text: str
 
     clearance: ClassVar[float] = 0.2
-    measure: ClassVar[str] = "share of characters to edit, to the task's test instructions without case and punctuation"
+    unit: ClassVar[str | None] = "share of characters to edit"
+    measure: ClassVar[str] = "to the task's test instructions without case and punctuation"
 
     def apply(self, instruction: str) -> str:
         """The wording that takes the place of ``instruction``."""
         return self.text
 
-    def distances(self, test: TestSet, task: Task) -> Floats:
+    per_task: ClassVar[bool] = True
+
+    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
         """To the task's test instructions; a clearance of about one word in five."""
-        distances = np.full(len(test.of("language")), np.nan)
-        distances[on_task(test, task, "language")] = _distances(self.text, test, task)
-        return distances
+        return _distances(self.text, test, task)
 
 
 class LanguageAxis(Axis):
@@ -102,17 +102,22 @@ class LanguageAxis(Axis):
         bank: a further bank, such as the command ``rewrite`` makes; its rewrites join those that are shipped.
     """
 
+    draws: ClassVar = (LanguagePerturbation,)
+    not_held_out: ClassVar[str] = "its rewrites are a list, and plans train on all of it"
+
     classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
     bank: Path | None = None
 
-    def among_more_objects(self) -> LanguageAxis:
-        """The axis for scenes with objects that the task does not have, such as the layout axis adds: ``NAMED`` only.
+    def beside(self, axes: Collection[str]) -> LanguageAxis:
+        """Among objects that the layout axis adds: of the classes ``NAMED`` only.
 
         Names stay unambiguous there as far as the added objects are of categories that the scene does not have.
 
         Raises:
             ValueError: when none of ``classes`` is left.
         """
+        if "layout" not in axes:
+            return self
         classes = tuple(component for component in self.classes if component in NAMED)
         if not classes:
             raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, PhysicsPerturbation, on_task
+from pipeline.axes.base import Axis, Credit, Frozen, PhysicsPerturbation
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, taken
 from pipeline.errors import PipelineError
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
-
 
 SHELF = 13
 """How many models the objects of one scene are drawn from: as many as LIBERO-Plus draws from."""
@@ -55,9 +53,8 @@ class LayoutPerturbation(PhysicsPerturbation):
     objects: Annotated[tuple[AddedObject, ...], Field(min_length=1)]
     seed: int
 
-    clearance: ClassVar[float] = 1.0
     measure: ClassVar[str] = "1 where no category is shared with a test task of the same LIBERO task, else 0"
-    graded: ClassVar[bool] = False
+    clearance: ClassVar[float] = 1.0
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         # Drawing a plan must not load the simulator.
@@ -65,17 +62,23 @@ class LayoutPerturbation(PhysicsPerturbation):
 
         return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed, roll_out)
 
-    def distances(self, test: TestSet, task: Task) -> Floats:
+    per_task: ClassVar[bool] = True
+
+    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
         """By category: infinite where a test task on this LIBERO task adds nothing of the same category.
 
         The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
         """
-        own = {added.category for added in self.objects}
-        distances = np.full(len(test.of("layout")), np.nan)
-        distances[on_task(test, task, "layout")] = [
-            0.0 if own & set(_plain(other.parameters["category"])) else math.inf for other in test.on(task, "layout")
-        ]
-        return distances
+        return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")]
+
+    def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:
+        return np.array([self._apart_from(added.category for added in other.objects) for other in others])
+
+    def _apart_from(self, categories: Iterable[str]) -> float:
+        return math.inf if {added.category for added in self.objects}.isdisjoint(categories) else 0.0
+
+    def credits(self) -> frozenset[Credit]:
+        return frozenset(Credit(o.name, "object", o.licence, o.attribution) for o in self.objects)
 
 
 class LayoutAxis(Axis):
@@ -92,6 +95,8 @@ class LayoutAxis(Axis):
         area_m2: the most that the objects take up together, each of them at most its share: the more objects, the
             smaller (0.12 m2 is what the broadest object of all takes up).
     """
+
+    draws: ClassVar = (LayoutPerturbation,)
 
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
     area_m2: float = Field(default=0.12, gt=0.0, le=10.0)
@@ -112,6 +117,13 @@ class LayoutAxis(Axis):
         choice = list(shelf.values())
         objects = tuple(AddedObject.of(choice[index]) for index in rng.integers(len(choice), size=level))
         return LayoutPerturbation(level=level, objects=objects, seed=int(rng.integers(2**31)))
+
+    def offered(self) -> dict[str, int]:
+        found = models(self.sources).values()
+        return {
+            "models": len({model.sha256 for model in found}),
+            "categories": len({model.category for model in found}),
+        }
 
 
 @cache

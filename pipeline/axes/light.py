@@ -16,12 +16,10 @@ from pydantic import Field, NonNegativeFloat
 
 from pipeline.axes.base import Axis, Degrees, Frozen, Intervals, Level, RenderPerturbation, Share, draw
 from pipeline.libero import bddl
-from pipeline.types import Floats, Frame, Task
+from pipeline.types import Frame, Task
 
 if TYPE_CHECKING:
     import mujoco
-
-    from pipeline.testset.benchmark import TestSet
 
 Property = Literal["diffuse", "direction", "specular", "shadows"]
 Component = Literal["diffuse", "direction", "specular", "shadows", "combined"]
@@ -69,14 +67,11 @@ class LightPerturbation(RenderPerturbation):
     shadows: bool = False
     fill_scale: float = Field(default=0.0, ge=0.0, le=1.0)
 
-    views: ClassVar[frozenset[str]] = frozenset({"image", "wrist_image"})
     fields: ClassVar[tuple[str, ...]] = (
         *("light_diffuse", "light_specular", "light_dir", "light_castshadow"),
         *("mat_emission", "mat_specular", "mat_shininess"),
     )
-    clearance: ClassVar[float] = 0.0
     measure: ClassVar[str] = "unknown offline: the test tasks' light values are only in the benchmark's asset archive"
-    graded: ClassVar[bool] = False
 
     def apply(self, model: mujoco.MjModel) -> None:
         """Change every lamp of the model."""
@@ -103,10 +98,6 @@ class LightPerturbation(RenderPerturbation):
             model.light_diffuse *= scattered
             model.mat_shininess[model.mat_specular == 0] = FLOOR_SHININESS
             model.mat_specular[:] = np.maximum(model.mat_specular, 1 - scattered**2)
-
-    def distances(self, test: TestSet, task: Task) -> Floats:
-        """Nothing to compare with: the test tasks are known by number, not by their lamps."""
-        return np.full(len(test.of("light")), np.nan)
 
 
 class LightRange(Frozen):
@@ -158,6 +149,8 @@ class LightAxis(Axis):
             are drawn as often as one another.
         ranges: one for each level.
     """
+
+    draws: ClassVar = (LightPerturbation,)
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = (
         *("diffuse", "direction", "specular", "shadows", "combined"),

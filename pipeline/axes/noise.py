@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import bisect
 import math
+from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar, Literal, TypeVar
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 from pydantic import model_validator
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, ByLevel, PixelPerturbation, pick
+from pipeline.axes.base import LEVELS, Axis, ByLevel, PixelPerturbation, pick
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet, TestTask
+from pipeline.testset.definitions import Value
 from pipeline.types import Floats, Frame, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
 
 Effect = Motion | Gaussian | Zoom | Fog | Glass
 """Their ``strength`` names the parameter that grows with the severity, and gives its value for a clean frame."""
@@ -39,7 +40,8 @@ class NoisePerturbation(PixelPerturbation):
 
     views: ClassVar[frozenset[str]] = frozenset({"image"})
     clearance: ClassVar[float] = 0.25
-    measure: ClassVar[str] = "steps between the benchmark's severities, by the parameter that sets the strength"
+    unit: ClassVar[str | None] = "steps between the benchmark's severities"
+    measure: ClassVar[str] = "by the parameter that sets the strength"
 
     @model_validator(mode="after")
     def _component_is_that_of_effect(self) -> NoisePerturbation:
@@ -65,6 +67,12 @@ class NoisePerturbation(PixelPerturbation):
         """
         tested, severities = _tested(test, self.component, self.effect.strength[0])
         return np.abs(severities - self.severity(test)) if tested else severities
+
+    def apart(self, others: Sequence[NoisePerturbation]) -> Floats:
+        """To the strengths of the same component, on the scale of the benchmark's severities."""
+        test = benchmark.load()
+        severities = [other.severity(test) if other.component == self.component else np.nan for other in others]
+        return np.abs(np.array(severities) - self.severity(test))
 
     def severity(self, test: TestSet) -> float:
         """The strength on the scale of the component's test severities, 0 where nothing changes; NaN without any."""
@@ -99,6 +107,8 @@ def _grid(effect: type[E], **parameters: ByLevel[float]) -> ByLevel[E]:
 class NoiseAxis(Axis):
     """The training grid: level k lies between the severities 2k - 1 and 2k of LIBERO-Plus's ten and equals none."""
 
+    draws: ClassVar = (NoisePerturbation,)
+
     motion: ByLevel[Motion] = _grid(Motion, radius_px=(7, 11, 17, 23, 33), sigma_px=(2.5, 4.5, 7, 11, 17.5))
     gaussian: ByLevel[Gaussian] = _grid(Gaussian, sigma_px=(1.5, 3.5, 5.5, 7.5, 9.5))
     zoom: ByLevel[Zoom] = _grid(Zoom, max_scale=(1.13, 1.22, 1.33, 1.42, 1.52), copies=(14, 12, 23, 22, 27))
@@ -115,3 +125,22 @@ class NoiseAxis(Axis):
         effect = grid[level - 1]
         seed = int(rng.integers(2**53))  # what every JSON reader keeps exactly
         return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=seed)
+
+    @classmethod
+    def held_out(cls) -> NoiseAxis:
+        """The strengths of the benchmark's even severities.
+
+        Noise has one strength for each component and level. With the default ones, held-out draws would be as strong
+        as those that plans train on; from the benchmark's, plans keep clear.
+        """
+        tests = benchmark.load().of("noise")
+        effects = {(test.component, test.parameters["severity"]): effect_of(test) for test in tests}
+        components = dict.fromkeys(test.component for test in tests)
+        return cls.model_validate(
+            {component: tuple(effects[component, 2 * level] for level in LEVELS) for component in components}
+        )
+
+
+def effect_of(test: TestTask) -> dict[str, Value]:
+    """The parameters of a noise task's corruption."""
+    return {name: value for name, value in test.parameters.items() if name != "severity"}

@@ -7,20 +7,20 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
-from pipeline.axes.base import Axis, PhysicsPerturbation, on_task, pick, point
+from pipeline.axes.base import Axis, PhysicsPerturbation, pick, point
 from pipeline.axes.scene import ScenePerturbation, draw_scene
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
 
 Component = Literal["target", "receptacle", "scene"]
 """What the goal puts somewhere, what it is put on or in, where that is an object that can be moved, or everything."""
@@ -44,7 +44,8 @@ class PosePerturbation(PhysicsPerturbation):
 
     # A quarter of the 2 cm square that LIBERO's own reset scatters an object in.
     clearance: ClassVar[float] = 0.005
-    measure: ClassVar[str] = "m: the norm of the difference between the displacements of the same object"
+    unit: ClassVar[str | None] = "m"
+    measure: ClassVar[str] = "the norm of the difference between the displacements of the same object"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the object moved; its height and velocity and everything else stay as they are.
@@ -56,20 +57,31 @@ class PosePerturbation(PhysicsPerturbation):
 
         return move_one(scene, demo.task, self.moved, (self.dx_m, self.dy_m), self.dyaw_deg)
 
-    def distances(self, test: TestSet, task: Task) -> Floats:
-        """Compared with the test tasks that move the same object of the same task, alone or with others.
+    per_task: ClassVar[bool] = True
+
+    def distances_on_task(self, test: TestSet, task: Task) -> Floats:
+        """Compared with the test tasks that move the same object, alone or with others.
 
         These move every other thing as well, each its own way, so even at distance zero the scenes would differ.
         """
-        distances_m: Floats = np.linalg.norm(_test_moves_m(test, task, self.moved) - (self.dx_m, self.dy_m), axis=1)
+        return self._apart_m(_test_moves_m(test, task, self.moved))
+
+    def apart(self, others: Sequence[PosePerturbation]) -> Floats:
+        """Compared with the draws that move the same object."""
+        nowhere = (math.nan, math.nan)
+        return self._apart_m([(p.dx_m, p.dy_m) if p.moved == self.moved else nowhere for p in others])
+
+    def _apart_m(self, moves_m: ArrayLike) -> Floats:
+        """(N,) from moves (N, 2) of the same object."""
+        distances_m: Floats = np.linalg.norm(np.subtract(moves_m, (self.dx_m, self.dy_m)), axis=1)
         return distances_m
 
 
 @cache
 def _test_moves_m(test: TestSet, task: Task, moved: str) -> Floats:
-    """(N, 2) the displacement of an object of ``task`` in each of the axis's test tasks; NaN where it has none."""
-    moves_m = np.full((len(test.of("pose")), 2), np.nan)
-    for place, tested in zip(on_task(test, task, "pose"), test.on(task, "pose"), strict=True):
+    """(N, 2) the displacement of an object in each of the axis's test tasks of ``task``; NaN where it has none."""
+    moves_m = np.full((len(test.on(task, "pose")), 2), np.nan)
+    for place, tested in enumerate(test.on(task, "pose")):
         known = tested.parameters
         if known.get("target") == moved:
             moves_m[place] = known["dx_m"], known["dy_m"]
@@ -91,6 +103,8 @@ class PoseAxis(Axis):
         step_m: at level k one object is moved by k - 1 to k times this, uniform over the ring.
         turn_deg: one object is turned by up to so much to either side, uniform, whatever the level.
     """
+
+    draws: ClassVar = (PosePerturbation, ScenePerturbation)
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("scene",)
     step_m: float = Field(default=0.016, ge=0.0001, le=0.2)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,10 +13,8 @@ from pydantic import Field
 from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import HOME_RAD
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
-
-if TYPE_CHECKING:
-    from pipeline.testset.benchmark import TestSet
 
 Joints = tuple[float, float, float, float, float, float, float]
 Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
@@ -49,7 +48,8 @@ class RobotPerturbation(PhysicsPerturbation):
 
     # A fifth of the weakest offset, and less than half of the 0.05 rad by which LIBERO's own reset scatters the start.
     clearance: ClassVar[float] = 0.02
-    measure: ClassVar[str] = "rad: the norm of the difference between the joint offsets"
+    unit: ClassVar[str | None] = "rad"
+    measure: ClassVar[str] = "the norm of the difference between the joint offsets"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the arm turned and at rest, or with the controller's posture; all else stays as it is.
@@ -94,6 +94,12 @@ class RobotPerturbation(PhysicsPerturbation):
         distances_rad: Floats = np.linalg.norm(benchmark_offsets_rad()[ids] - self.joint_offsets_rad, axis=1)
         return distances_rad
 
+    def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
+        """To the offsets of all, as the arm is the same in all tasks."""
+        offsets_rad = np.array([other.joint_offsets_rad for other in others])
+        apart_rad: Floats = np.linalg.norm(offsets_rad - self.joint_offsets_rad, axis=1)
+        return apart_rad
+
     def nearest(self, test: TestSet, task: Task) -> Nearest:
         """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450; the arm is the same in all
         tasks, so ``task`` does not matter."""
@@ -123,6 +129,8 @@ class RobotAxis(Axis):
         components: what to draw, each as often as the others.
         norm_rad: the norm of the offset at each level; the defaults are the benchmark's.
     """
+
+    draws: ClassVar = (RobotPerturbation,)
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("controller_posture", "initial_joints")
     norm_rad: ByLevel[Norm] = (0.1, 0.2, 0.3, 0.4, 0.5)

@@ -36,11 +36,11 @@ def axes(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from pipeline.axes import Axes, components_of, kind_of
+    from pipeline.axes import AXES, components_of
 
     table = Table("axis", "components", "made again", "changes", box=None)
-    for axis in Axes.model_fields:
-        kind = kind_of(axis)
+    for axis in AXES:
+        kind = AXES[axis].draws[0]
         views = " and ".join(sorted(kind.views)) or "instruction"
         table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
     Console(highlight=False).print(table)
@@ -64,9 +64,9 @@ def tasks(arguments: argparse.Namespace) -> int:
 
 
 def _preview_arguments(command: argparse.ArgumentParser) -> None:
-    from pipeline.axes import Axes
+    from pipeline.axes import AXES
 
-    axes = (*Axes.model_fields, EVERY)
+    axes = (*AXES, EVERY)
     command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
     command.add_argument("axis", choices=axes, metavar="AXIS", help=f"any of {', '.join(axes)}")
     add_config(command)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, field_serializer
 
-from pipeline.axes import AnyPerturbation
+from pipeline.axes import Perturbation
 from pipeline.axes.base import Frozen
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
@@ -113,7 +113,7 @@ class EpisodeEnvironment:
         self.task, self._base = task, find_task(task.suite, task.base)
         self.step_limit = STEP_LIMITS[task.suite]
         self.resolved: Mapping[str, Any] = {}
-        self.perturbations: tuple[AnyPerturbation, ...] = ()
+        self.perturbations: tuple[Perturbation, ...] = ()
         self._seen: dict[str, Frame] = {}
         starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
         try:

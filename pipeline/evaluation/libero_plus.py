@@ -22,7 +22,7 @@ import numpy as np
 
 from pipeline import seeding
 from pipeline.axes.camera import CameraPerturbation
-from pipeline.axes.noise import NoisePerturbation
+from pipeline.axes.noise import NoisePerturbation, effect_of
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import Prompt
 from pipeline.files import Edition, checksum_of, edition
@@ -99,11 +99,10 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
         seed: of what is drawn anew for every frame: the direction of motion, fog and glass. The benchmark draws it from
             a global generator.
     """
-    parameters = {name: value for name, value in test.parameters.items() if name != "severity"}
     return NoisePerturbation.model_validate(
         {
             "component": test.component,
-            "effect": parameters,
+            "effect": effect_of(test),
             "level": test.level,
             "seed": int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53)),
         }

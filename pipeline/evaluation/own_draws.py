@@ -13,31 +13,17 @@ from typing import Any
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes import AnyAxis, AnyPerturbation, Axes, PhysicsPerturbation, axes_of, from_json
-from pipeline.axes.background import BackgroundPerturbation
-from pipeline.axes.base import Level
-from pipeline.axes.camera import CameraPerturbation
-from pipeline.axes.layout import LayoutPerturbation
-from pipeline.axes.noise import NoiseAxis, NoisePerturbation
-from pipeline.axes.pose import PosePerturbation
-from pipeline.axes.robot import RobotPerturbation
-from pipeline.axes.scene import ScenePerturbation
+from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.evaluation import libero_plus
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
 from pipeline.libero.tasks import find_task
 from pipeline.physics.roll_out import roll_out
 from pipeline.planning import plan
-from pipeline.testset import benchmark
-from pipeline.testset.benchmark import TestSet, TestTask
-from pipeline.testset.definitions import Value
-from pipeline.types import Demo, Floats, Scene, Task
+from pipeline.types import Demo, Scene, Task
 
-LEVELS: tuple[Level, ...] = (1, 2, 3, 4, 5)
-
-OWN_AXES = ("layout", "pose", "robot", "camera", "light", "background", "noise")
-"""The axes with draws of their own to hold out. Language is none: its rewrites are a list, which training uses up."""
+OWN_AXES = tuple(name for name, axis in AXES.items() if not axis.not_held_out)
+"""The axes with draws of their own to hold out."""
 
 ATTEMPTS = 20
 """How often a draw that its scene refuses, or that a plan has, is drawn anew."""
@@ -51,14 +37,14 @@ def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> Eva
         number: counts the draws of a task, axis and level.
     """
     axes = axes_of(axis)
-    if not all(default_axis(one).applies(task) for one in axes):
+    if not all(held_out(one).applies(task) for one in axes):
         return None
     name = f"{task.name}_{axis}_level{level}_draw{number}"
     drawn = EvaluationTask("own", task.suite, task.name, name, axis, "", level, number)
     return replace(drawn, component="+".join(draw(drawn, seed, axis=one).component for one in axes))
 
 
-def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> AnyPerturbation:
+def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> Perturbation:
     """The perturbation of a held-out draw on one axis.
 
     Its key begins with ``evaluation``, which no plan's does, so that no seed makes the two draw alike. What a draw is
@@ -70,32 +56,19 @@ def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> A
     """
     name = axis or task.axis
     key = seeding.rng("evaluation", seed, name, task.suite, task.base, task.level, task.number, attempt)
-    ranges = default_axis(name).model_copy(update={"levels": (task.level,)})
-    drawn: AnyPerturbation = ranges.sample(key, find_task(task.suite, task.base), task.number)
-    return drawn
+    ranges = held_out(name).model_copy(update={"levels": (task.level,)})
+    return ranges.sample(key, find_task(task.suite, task.base), task.number)
 
 
 @cache
-def default_axis(name: str) -> AnyAxis:
-    """An axis with its default ranges; noise has the strengths of the benchmark's even severities.
-
-    Noise has one strength for each component and level. With the default ones, held-out draws would be as strong as
-    those that plans train on; from the benchmark's, plans keep clear.
-    """
-    if name == "noise":
-        tests = benchmark.load().of("noise")
-        effects = {(test.component, test.parameters["severity"]): libero_plus.noise(test, 0).effect for test in tests}
-        components = dict.fromkeys(test.component for test in tests)
-        return NoiseAxis.model_validate(
-            {component: tuple(effects[component, 2 * level] for level in LEVELS) for component in components}
-        )
-    default: AnyAxis = getattr(Axes.model_validate({name: {}}), name)
-    return default
+def held_out(name: str) -> Axis:
+    """The ranges of an axis's held-out draws."""
+    return AXES[name].held_out()
 
 
 def drawn_scene(
     task: EvaluationTask, seed: int, demo: Demo, nominal: Callable[[], Scene], planned: PlannedDraws | None
-) -> tuple[tuple[AnyPerturbation, ...], Scene | None]:
+) -> tuple[tuple[Perturbation, ...], Scene | None]:
     """What a task draws, in the order in which it applies, and the scene with it; None where physics stay LIBERO's.
 
     Each axis has the first draw that the scene takes by itself. That is so too where other axes join it, so that a
@@ -110,7 +83,7 @@ def drawn_scene(
     Raises:
         RefusedError: when the scene takes no draw of an axis, or not the draws of several together.
     """
-    perturbations: list[AnyPerturbation] = []
+    perturbations: list[Perturbation] = []
     scene = None
     for axis in axes_of(task.axis):
         drawn = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
@@ -126,8 +99,8 @@ def drawn_scene(
 
 
 def _first_that_fits(
-    drawn: Iterable[AnyPerturbation], demo: Demo, nominal: Callable[[], Scene]
-) -> tuple[AnyPerturbation, Scene | None] | None:
+    drawn: Iterable[Perturbation], demo: Demo, nominal: Callable[[], Scene]
+) -> tuple[Perturbation, Scene | None] | None:
     """The first draw that the scene takes, and the scene with it, or None where physics stay LIBERO's."""
     for one in drawn:
         if not isinstance(one, PhysicsPerturbation):
@@ -149,60 +122,34 @@ class PlannedDraws:
     """
 
     def __init__(self, rows: Iterable[plan.Row]):
-        self._draws: dict[str, list[AnyPerturbation]] = defaultdict(list)
-        tests: list[TestTask] = []
+        self._draws: dict[type[Perturbation], list[tuple[Perturbation, plan.Row]]] = defaultdict(list)
         for row in rows:
             for one in from_json(row.perturbations):
-                self._draws[one.axis].append(one)
-                tests.append(TestTask(row.suite, row.task, row.episode_id, one.axis, one.component, _as_test(one)))
-        self._tests = TestSet(tuple(tests))
+                self._draws[type(one)].append((one, row))
 
-    def nearest(self, drawn: AnyPerturbation, task: Task) -> tuple[float, str]:
+    def nearest(self, drawn: Perturbation, task: Task) -> tuple[float, str]:
         """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
         episode, where there is none to compare with."""
-        distances = self._distances(drawn, task)
+        others = self._draws[type(drawn)]
+        if drawn.per_task:
+            others = [(one, row) for one, row in others if (row.suite, row.task) == (task.suite, task.name)]
+        if not others:
+            return math.inf, ""
+        distances = drawn.apart([other for other, _ in others])
         distances = np.where(np.isnan(distances), np.inf, distances)
         if not np.isfinite(distances).any():
             return math.inf, ""
         closest = int(distances.argmin())
-        return float(distances[closest]), self._tests.of(drawn.axis)[closest].name
+        return float(distances[closest]), others[closest][1].episode_id
 
     def count(self, name: str) -> int:
         """How many planned draws an axis has."""
-        return len(self._draws[name])
+        return sum(len(self._draws[kind]) for kind in AXES[name].draws)
 
-    def overlap(self, drawn: AnyPerturbation, task: Task) -> bool:
+    def overlap(self, drawn: Perturbation, task: Task) -> bool:
         """Whether a draw is a planned one, or closer to one than the axis keeps from the benchmark's test tasks."""
         distance, _ = self.nearest(drawn, task)
         return distance == 0 or distance < drawn.clearance
-
-    def _distances(self, drawn: AnyPerturbation, task: Task) -> Floats:
-        """(N,) to the planned draws of the axis, not finite where there is nothing to compare."""
-        if drawn.axis in COMPARED_IN_PAIRS:
-            return np.array([_distance(drawn, planned) for planned in self._draws[drawn.axis]])
-        return drawn.distances(self._tests, task)
-
-
-COMPARED_IN_PAIRS = ("robot", "noise", "background", "light")
-"""The axes whose own ``distances`` read what is known of the benchmark alone."""
-
-
-def _distance(one: AnyPerturbation, other: AnyPerturbation) -> float:
-    """Between two draws on the same axis of ``COMPARED_IN_PAIRS``; NaN where they cannot be compared.
-
-    Of light, whose test tasks cannot be compared with, two draws are 0 apart where all their parameters are equal.
-    """
-    match one, other:
-        case RobotPerturbation(), RobotPerturbation():
-            return math.dist(one.joint_offsets_rad, other.joint_offsets_rad)
-        case NoisePerturbation(), NoisePerturbation():
-            test = benchmark.load()
-            return abs(one.severity(test) - other.severity(test)) if one.component == other.component else math.nan
-        case BackgroundPerturbation(), BackgroundPerturbation():
-            shown = {covering.sha256 for covering in one.coverings}
-            return float(shown.isdisjoint(covering.sha256 for covering in other.coverings))
-        case _:
-            return float(one != other)
 
 
 def planned(file: Path) -> PlannedDraws:
@@ -235,22 +182,7 @@ def _edition(file: Path) -> Edition:
         raise PipelineError(f"cannot be read ({error})", where=file, expected="data/<run>/plan.parquet") from error
 
 
-def _as_test(one: AnyPerturbation) -> dict[str, Value]:
-    """The parameters of a planned draw as a test task has them, where its axis reads them to compare."""
-    match one:
-        case CameraPerturbation():
-            return one.model_dump(exclude={"axis", "component", "level"})
-        case LayoutPerturbation():
-            return {"category": ",".join(added.category for added in one.objects)}
-        case PosePerturbation():
-            return {"target": one.moved, "dx_m": one.dx_m, "dy_m": one.dy_m}
-        case ScenePerturbation():
-            return {"moves": ";".join(f"{move.name}:{move.dx_m},{move.dy_m}" for move in one.moves)}
-        case _:
-            return {}
-
-
-def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:
+def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:
     """How close held-out draws come to a plan.
 
     Args:
@@ -261,7 +193,7 @@ def compare(drawn: Iterable[tuple[str, AnyPerturbation, Task]], planned_draws: P
         ``smallest`` distance with the names of its draw and of its planned episode (``closest``), None where nothing
         could be compared. ``clearance`` is the least distance that the leakage report allows.
     """
-    by_axis: dict[str, list[tuple[str, AnyPerturbation, Task]]] = defaultdict(list)
+    by_axis: dict[str, list[tuple[str, Perturbation, Task]]] = defaultdict(list)
     for name, one, task in drawn:
         by_axis[one.axis].append((name, one, task))
     found = {}

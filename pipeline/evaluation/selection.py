@@ -17,11 +17,11 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from pipeline.axes import axes_of
-from pipeline.axes.base import Frozen
+from pipeline.axes import AXES, axes_of
+from pipeline.axes.base import LEVELS, Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
-from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, PlannedDraws, draw, drawn_task
+from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_task
 from pipeline.evaluation.results import REFUSED, EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask, Source, balanced, libero_task, read_tasks, replacements
 from pipeline.libero.tasks import SUITES, find_task, tasks
@@ -113,14 +113,15 @@ def _check_names(selection: Selection) -> None:
             where="subset" if selection.subset else "components",
             remedy="restrict pairs by suite, axis, level, task and episodes",
         )
-    if "language" in selection.axes and selection.source in ("own", "pairs"):
-        raise PipelineError(
-            "language has no held-out draws: its rewrites are a list, and plans train on all of it",
-            where="axes",
-            expected=" or ".join(OWN_AXES),
-            remedy="--source libero_plus --axis language, whose 1,537 instructions every plan keeps clear of",
-        )
     if selection.source in ("own", "pairs"):
+        for axis in selection.axes:
+            if axis in AXES and (reason := AXES[axis].not_held_out):
+                raise PipelineError(
+                    f"{axis} has no held-out draws: {reason}",
+                    where="axes",
+                    expected=" or ".join(OWN_AXES),
+                    remedy=f"--source libero_plus --axis {axis}, the benchmark's test tasks, which plans keep clear of",
+                )
         _check_known("axes", selection.axes, OWN_AXES, selection)
         _check_known("levels", selection.levels, LEVELS, selection)
 

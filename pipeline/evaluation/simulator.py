@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import AnyPerturbation, RenderPerturbation, of_layer
+from pipeline.axes import Perturbation, RenderPerturbation, of_layer
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.images.jpeg import to_policy
@@ -217,10 +217,10 @@ class Picture:
     def __init__(self) -> None:
         self._opened = LastScene()
         self._scene: mujoco.MjModel | str | None = None
-        self._perturbations: Sequence[AnyPerturbation] = ()
+        self._perturbations: Sequence[Perturbation] = ()
         self._changes: ExitStack | None = None
 
-    def show(self, scene: mujoco.MjModel | str, perturbations: Sequence[AnyPerturbation]) -> None:
+    def show(self, scene: mujoco.MjModel | str, perturbations: Sequence[Perturbation]) -> None:
         """Render from here on a model, or a scene's MJCF where the model is without its images, as it is perturbed."""
         self.restore()
         self._scene, self._perturbations = scene, perturbations

@@ -21,7 +21,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from pipeline.axes import AnyPerturbation, from_json
+from pipeline.axes import Perturbation, from_json
 from pipeline.axes.base import Nearest
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
@@ -80,8 +80,8 @@ class AxisDistance:
 
 def check(rows: Sequence[Row], test: TestSet) -> dict[str, AxisDistance]:
     """Axis to finding, in the order of the plan."""
-    found: dict[str, list[tuple[Nearest, str, AnyPerturbation]]] = defaultdict(list)
-    wanted: dict[str, list[tuple[AnyPerturbation, Task]]] = defaultdict(list)
+    found: dict[str, list[tuple[Nearest, str, Perturbation]]] = defaultdict(list)
+    wanted: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
     known = {(row.suite, row.task) for row in rows}
     tasks = {key: find_task(*key) for key in known}
     for row in rows:
@@ -96,12 +96,12 @@ def check(rows: Sequence[Row], test: TestSet) -> dict[str, AxisDistance]:
     }
 
 
-def distances(axis: str, draws: Iterable[tuple[AnyPerturbation, Task]], test: TestSet) -> Floats:
+def distances(axis: str, draws: Iterable[tuple[Perturbation, Task]], test: TestSet) -> Floats:
     """(N,) how far each of an axis's test tasks is from the nearest of some draws on the axis, NaN where it cannot be
     compared with any, or the axis's measure does not tell near from far."""
     least = np.full(len(test.of(axis)), np.nan)
     for perturbation, task in draws:
-        if perturbation.graded:
+        if perturbation.unit is not None:
             np.fmin(least, perturbation.distances(test, task), out=least)
     return least
 
@@ -119,7 +119,7 @@ def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
 
 
 def _finding(
-    found: Sequence[tuple[Nearest, str, AnyPerturbation]], test_tasks: int, coverage: dict[str, Coverage]
+    found: Sequence[tuple[Nearest, str, Perturbation]], test_tasks: int, coverage: dict[str, Coverage]
 ) -> AxisDistance:
     nearest, closest, kind = min(found, key=lambda one: one[0].distance)
     comparisons = sum(one.compared for one, _, _ in found)
@@ -132,11 +132,15 @@ def _finding(
         smallest=nearest.distance if alike else None,
         closest=closest if alike else None,
         clearance=kind.clearance,
-        measure="; ".join(dict.fromkeys(kind.measure for _, _, kind in found)),
+        measure="; ".join(dict.fromkeys(_measure(kind) for _, _, kind in found)),
         overlaps=overlaps,
         verdict="overlap" if overlaps else "unknown" if test_tasks and not comparisons else "disjoint",
         coverage=coverage,
     )
+
+
+def _measure(kind: Perturbation) -> str:
+    return kind.measure if kind.unit is None else f"{kind.unit}: {kind.measure}"
 
 
 def write(findings: dict[str, AxisDistance], path: Path) -> None:

@@ -14,8 +14,8 @@ from typing import Annotated
 import pyarrow as pa
 
 from pipeline.axes import (
-    AnyAxis,
-    AnyPerturbation,
+    Axis,
+    Perturbation,
     PhysicsPerturbation,
     TextPerturbation,
     in_order,
@@ -124,11 +124,11 @@ class Draws:
     """
 
     name: str
-    axes: Sequence[AnyAxis]
+    axes: Sequence[Axis]
     seed: int
     test: TestSet
 
-    def of(self, demo_id: str, task: Task) -> Iterator[tuple[AnyPerturbation, ...]]:
+    def of(self, demo_id: str, task: Task) -> Iterator[tuple[Perturbation, ...]]:
         """Draws for one demonstration, variant after variant: all different, and clear of the test set.
 
         Yields:
@@ -148,7 +148,7 @@ class Draws:
             drawn.add(content)
             yield perturbations
 
-    def _clear(self, perturbations: Sequence[AnyPerturbation], task: Task) -> bool:
+    def _clear(self, perturbations: Sequence[Perturbation], task: Task) -> bool:
         return all(p.nearest(self.test, task).distance >= p.clearance for p in perturbations)
 
 
@@ -181,7 +181,7 @@ class _Planner:
     def row(
         self,
         demo: DemoEntry,
-        perturbations: Sequence[AnyPerturbation],
+        perturbations: Sequence[Perturbation],
         rank: int,
         variant: int = 0,
         wanted: bool = True,

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
-from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
+from pipeline.axes import Perturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
 from pipeline.episode_schema import SCHEMA
 from pipeline.seeding import digest
 
@@ -21,7 +21,7 @@ class Stream:
     """
 
     view: str
-    perturbations: tuple[AnyPerturbation, ...]
+    perturbations: tuple[Perturbation, ...]
 
     @cached_property
     def stream_id(self) -> str:

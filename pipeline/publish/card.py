@@ -15,7 +15,7 @@ import yaml
 from huggingface_hub import DatasetCardData
 
 from pipeline.axes import from_json
-from pipeline.axes.base import Layer, Perturbation
+from pipeline.axes.base import Credit, Layer, Perturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, replaced, schema_file
@@ -145,7 +145,7 @@ def render(
         devices=sorted({row["gl_device"] for row in kept}),
         free=free,
         citation=schema_file("citation.bib").read_text(),
-        owed=table(["name", "kind", "licence", "attribution", "episodes"], owed),
+        owed=table([*Credit._fields, "episodes"], [[*credit, episodes] for credit, episodes in owed.items()]),
     )
 
 

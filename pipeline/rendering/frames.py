@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.axes import Perturbation, PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.renderer import Renderer
 from pipeline.types import Floats, Frame
@@ -17,7 +17,7 @@ def frames_of(
     renderer: Renderer,
     state: Floats,
     site_alpha: NDArray[np.float32],
-    perturbations: Sequence[AnyPerturbation],
+    perturbations: Sequence[Perturbation],
     step: int,
     views: Iterable[str] = tuple(SCHEMA.views),
 ) -> dict[str, Frame]:
@@ -35,7 +35,7 @@ def frames_of(
         return {view: noisy(renderer.frame(SCHEMA.views[view].camera), view, perturbations, step) for view in views}
 
 
-def noisy(frame: Frame, view: str, perturbations: Sequence[AnyPerturbation], step: int) -> Frame:
+def noisy(frame: Frame, view: str, perturbations: Sequence[Perturbation], step: int) -> Frame:
     """A clean frame of a view under the noise that an episode has at a step."""
     for noise in of_layer(perturbations, PixelPerturbation):
         if view in noise.views:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipeline.axes import AnyPerturbation, kind_of
+from pipeline.axes import AXES
 from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraPerturbation
@@ -40,7 +40,7 @@ class Draw(NamedTuple):
     """
 
     task: Task
-    made: AnyPerturbation
+    made: Perturbation
     resolved: Any
 
 
@@ -54,10 +54,9 @@ class AxisPlots(NamedTuple):
 def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     """The coverage of one axis by the draws on it."""
     shown = _plots(axis, draws, test)
-    kind = kind_of(axis)
-    if not kind.graded or not test.of(axis):
+    unit = AXES[axis].draws[0].unit
+    if unit is None or not test.of(axis):
         return shown
-    unit = kind.measure.partition(":")[0].partition(",")[0]
     return AxisPlots(shown.note, [*shown.panels, _distances(axis, draws, test, unit)])
 
 
@@ -96,7 +95,7 @@ def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
 
 def _numbers(axis: str, draws: Sequence[Perturbation], test: TestSet) -> AxisPlots:
     """An axis that has no plots of its own: the level and every parameter that is one number."""
-    names = [name for name, field in kind_of(axis).model_fields.items() if field.annotation in (int, float)]
+    names = [name for name, field in AXES[axis].draws[0].model_fields.items() if field.annotation in (int, float)]
     return AxisPlots(
         f"{len(test.of(axis)):,} test tasks.",
         [

@@ -19,24 +19,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
+from pipeline.axes import AXES
+
 Values = NDArray[Any]
 Groups = Mapping[str, Values]
 """What is drawn in one colour, by name; those of ``REFERENCES`` are drawn behind the others, in grey."""
 
 REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
-COLOURS = {
-    "layout": "#7d9a1f",
-    "pose": "#d463b0",
-    "robot": "#129fc0",
-    "camera": "#4285f4",
-    "light": "#e59a00",
-    "background": "#1f9e82",
-    "noise": "#9467d6",
-    "language": "#e4572e",
-}
+PALETTE = ("#7d9a1f", "#d463b0", "#129fc0", "#4285f4", "#e59a00", "#1f9e82", "#9467d6", "#e4572e", "#6b7d94", "#a3384d")
+COLOURS = dict(zip(AXES, PALETTE, strict=False))
 OTHER = "#b0794a"
-"""For episodes that are perturbed on several axes, and for an axis without a colour of its own."""
+"""For episodes that are perturbed on several axes, and where axes are more than colours."""
 
 INK = "#010203"
 """A colour that nothing else has; it becomes the page's."""

@@ -11,19 +11,11 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 from PIL import Image
 
-from pipeline.axes import (
-    AnyAxis,
-    AnyPerturbation,
-    Axes,
-    PhysicsPerturbation,
-    TextPerturbation,
-    of_layer,
-)
+from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
@@ -69,7 +61,7 @@ class Stage:
     opened: LastScene
     replay: ReplayConfig = field(default_factory=ReplayConfig)
 
-    def frames(self, views: Sequence[str], perturbation: AnyPerturbation | None = None) -> list[Frame]:
+    def frames(self, views: Sequence[str], perturbation: Perturbation | None = None) -> list[Frame]:
         """What the views show, (H, W, 3) each, as a policy sees them.
 
         Raises:
@@ -114,29 +106,25 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
     )
 
 
-def configured(name: str, config: Config) -> AnyAxis:
+def configured(name: str, config: Config) -> Axis:
     """The axis with the ranges of the configuration, or with its default ranges where the configuration has none.
 
     Raises:
         PipelineError: when there is no such axis.
     """
-    if name not in Axes.model_fields:
-        raise PipelineError(f"no axis {name!r}", expected=" or ".join(Axes.model_fields))
-    axis: AnyAxis | None = getattr(config.plan.axes, name)
-    if axis is None:
-        kind = next(kind for kind in get_args(Axes.model_fields[name].annotation) if kind is not type(None))
-        axis = kind()
-    return axis
+    if name not in AXES:
+        raise PipelineError(f"no axis {name!r}", expected=" or ".join(AXES))
+    return config.plan.axes.drawn().get(name) or AXES[name]()
 
 
-def variants(name: str, axis: AnyAxis, demo: Demo, seed: int, test: TestSet) -> list[AnyPerturbation]:
+def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> list[Perturbation]:
     """Draws of the plan's that cover the axis's components, and within each component its levels."""
     draws = Draws(name, (axis,), seed, test).of(demo.demo_id, demo.task)
     left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
-    chosen: list[AnyPerturbation] = []
+    chosen: list[Perturbation] = []
     count = PHYSICS_VARIANTS if isinstance(left[0], PhysicsPerturbation) else VARIANTS
 
-    def wish(candidate: AnyPerturbation) -> tuple[int, int, int]:
+    def wish(candidate: Perturbation) -> tuple[int, int, int]:
         """The smaller, the more a draw adds: a rare component, a level far from those shown of it, a rare level."""
         levels = [p.level for p in chosen if p.component == candidate.component]
         apart = min((abs(level - candidate.level) for level in levels), default=0)
@@ -192,14 +180,14 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     """
     demo, view = stage.demo, "image"
     tiles = [Tile(Image.fromarray(stage.frames([view])[0]), f"clean twin: {demo.task.instruction}")]
-    for name in Axes.model_fields:
+    for name in AXES:
         axis = configured(name, config)
         if axis.applies(demo.task):
             tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test), view))
     return sheet(f"{demo.task.suite}/{demo.task.name}: first frame of the agent view, one draw of each axis", tiles, 5)
 
 
-def _strongest(stage: Stage, drawn: Sequence[AnyPerturbation], view: str) -> Tile:
+def _strongest(stage: Stage, drawn: Sequence[Perturbation], view: str) -> Tile:
     for perturbation in sorted(drawn, key=lambda p: -p.level):
         try:
             (frame,) = stage.frames([view], perturbation)
@@ -237,8 +225,7 @@ def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     # It is there where another worker was lost over these.
     folder.mkdir(parents=True, exist_ok=True)
     stage = staged(tasks, config)
-    # Layout last: each of its draws opens a scene of its own, after which the demonstration's would be opened anew.
-    for name in sorted(Axes.model_fields, key="layout".__eq__):
-        axis: AnyAxis | None = getattr(config.plan.axes, name)
-        if axis is not None and axis.applies(stage.demo.task):
+    # Deepest last: what adds objects opens a scene for each draw, after which the demonstration's would be opened anew.
+    for name, axis in reversed(config.plan.axes.drawn().items()):
+        if axis.applies(stage.demo.task):
             draw(stage, name, config, test).save(folder / f"{name}.png")

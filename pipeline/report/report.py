@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from pipeline.axes import from_json
+from pipeline.axes import TextPerturbation, from_json
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
@@ -181,7 +181,7 @@ def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
     quoted: dict[str, list[tuple[str, str, str]]] = {}
     for row in kept:
         for made in from_json(row["perturbations"]):
-            if made.axis == "language":
+            if isinstance(made, TextPerturbation):
                 original = find_task(row["suite"], row["task"]).instruction
                 label = f"{made.component.replace('_', ' ')}, level {made.level}"
                 quoted.setdefault(made.component, []).append((label, original, row["instruction"]))

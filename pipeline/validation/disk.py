@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.axes import PhysicsPerturbation, RenderPerturbation, axes_of, kind_of
+from pipeline.axes import AXES, PhysicsPerturbation, RenderPerturbation, axes_of
 from pipeline.config import Config, DemosConfig, PlanConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
@@ -80,9 +80,9 @@ class _Own(NamedTuple):
 def _own(plan: PlanConfig) -> _Own:
     trajectories = frames = maps = 0.0
     for name, episodes in plan.episodes.items():
-        kinds = [kind_of(axis) for axis in axes_of(name)]
+        kinds = [AXES[axis].draws[0] for axis in axes_of(name)]
         physics = [kind for kind in kinds if issubclass(kind, PhysicsPerturbation)]
-        cameras = [kind for kind in kinds if issubclass(kind, RenderPerturbation) and "cam_pos" in kind.fields]
+        cameras = [kind for kind in kinds if issubclass(kind, RenderPerturbation) and kind.sees_otherwise]
         trajectories += episodes * (1 + plan.reserve) * bool(physics)
         frames += episodes * len({view for kind in kinds for view in kind.views})
         maps += episodes * len({view for kind in (*physics, *cameras) for view in kind.views})

@@ -49,7 +49,7 @@ class Picture(NamedTuple):
         lamps: those with shadows, in MuJoCo's order.
         sites: (nsite,) which sites.
         projection: by which to choose single faces, or None.
-        layered: whether it can be put together of layers, of what is opaque and does not reflect.
+        underlaid: whether it can be put together of underlays, of what is opaque and does not reflect.
     """
 
     opaque: NDArray[np.bool_]
@@ -60,7 +60,7 @@ class Picture(NamedTuple):
     lamps: tuple[Lamp, ...]
     sites: NDArray[np.bool_]
     projection: Projection | None
-    layered: bool
+    underlaid: bool
 
 
 class Culling:
@@ -103,8 +103,8 @@ class Culling:
             lamps=lamps,
             sites=self._sites(bool(lamps)),
             projection=view.projection(),
-            # What lamps with shadows light is drawn once more for each of them, so that a layer gains little.
-            layered=not lamps and not self._sites_see_through(),
+            # What lamps with shadows light is drawn once more for each of them, so that an underlay gains little.
+            underlaid=not lamps and not self._sites_see_through(),
         )
 
     def everything(self) -> Picture:

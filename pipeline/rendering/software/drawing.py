@@ -21,7 +21,7 @@ from pipeline.axes.base import FIELDS
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.software import mujoco_3_2_7 as private
 from pipeline.rendering.software.culling import Culling, Picture
-from pipeline.rendering.software.mujoco_3_2_7 import Draws, HeldTextures, Layer, Meshes, Pass, Skins
+from pipeline.rendering.software.mujoco_3_2_7 import Draws, HeldTextures, Meshes, Pass, Skins, Underlay
 from pipeline.rendering.software.samples import SAMPLES
 from pipeline.rendering.software.skins import SkinnedMeshes
 from pipeline.rendering.software.still import Still
@@ -57,7 +57,7 @@ class SoftwareDrawing(PlainDrawing):
         self._meshes = Meshes(self._context, bare, [])
         self._skinned = SkinnedMeshes(self._skins, self._samples, bare, np.zeros(bare.ngeom, np.bool_), self._meshes)
         self._still: dict[str, Still] = {}
-        self._layers: dict[tuple[str, str], Layer] = {}
+        self._underlays: dict[tuple[str, str], Underlay] = {}
         self._held: HeldTextures | None = None
         self._show(model)
 
@@ -83,12 +83,12 @@ class SoftwareDrawing(PlainDrawing):
         drawn = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
         self._meshes = Meshes(self._context, model, drawn, self._meshes)
         self._skinned = SkinnedMeshes(self._skins, self._samples, model, shown, self._meshes, self._skinned)
-        self._forget_layers()
+        self._forget_underlays()
 
     def load(self, textures: Collection[int]) -> None:
         super().load(textures)
         if textures:
-            self._forget_layers()
+            self._forget_underlays()
 
     def hold(self, textures: Collection[int]) -> Callable[[], None]:
         self._gl.make_current()
@@ -104,35 +104,35 @@ class SoftwareDrawing(PlainDrawing):
         if self._held is not None:
             self._held.let_go()
         self._held, self._painted = None, np.zeros(self._model.ngeom, np.bool_)
-        self._forget_layers()
+        self._forget_underlays()
 
-    def _forget_layers(self) -> None:
+    def _forget_underlays(self) -> None:
         self._still.clear()
-        for layer in self._layers.values():
-            layer.content = b""
+        for underlay in self._underlays.values():
+            underlay.content = b""
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:
         self._gl.make_current()
         shot = Shot(data, camera, self._culling.picture(data, camera))
-        if shot.picture.layered:
-            self._draw_in_layers(shot)
+        if shot.picture.underlaid:
+            self._draw_in_underlays(shot)
         else:
             self._draw(shot, shot.picture.opaque)
         return self._pixels()
 
-    def _draw_in_layers(self, shot: Shot) -> None:
-        """Draw a picture with a layer of what no held texture is on, or of what stands still."""
+    def _draw_in_underlays(self, shot: Shot) -> None:
+        """Draw a picture with an underlay of what no held texture is on, or of what stands still."""
         opaque = shot.picture.opaque & ~shot.picture.mirror
         painted = opaque & self._painted
         view, places = self._view(shot), np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1)
         places = places.astype(np.float32)
 
-        def layer(name: str, geoms: NDArray[np.bool_], draw: Callable[[], None]) -> Layer:
-            """A layer of the camera's pictures; it is drawn if its content is not what it was."""
-            if (shot.camera, name) not in self._layers:
+        def underlay(name: str, geoms: NDArray[np.bool_], draw: Callable[[], None]) -> Underlay:
+            """An underlay of the camera's pictures; it is drawn if its content is not what it was."""
+            if (shot.camera, name) not in self._underlays:
                 height, width = self._rectangle.height, self._rectangle.width
-                self._layers[shot.camera, name] = Layer(self._context, height, width)
-            found, content = self._layers[shot.camera, name], view + geoms.tobytes() + places[geoms].tobytes()
+                self._underlays[shot.camera, name] = Underlay(self._context, height, width)
+            found, content = self._underlays[shot.camera, name], view + geoms.tobytes() + places[geoms].tobytes()
             if found.content != content:
                 draw()
                 found.keep(content)
@@ -142,26 +142,26 @@ class SoftwareDrawing(PlainDrawing):
             if shot.camera not in self._still:
                 self._still[shot.camera] = Still(self._model)
             still = self._still[shot.camera].geoms(view, places, geoms) & geoms
-            behind = layer("still", still, partial(self._draw, shot, still, last=False)) if still.any() else None
+            behind = underlay("still", still, partial(self._draw, shot, still, last=False)) if still.any() else None
             self._draw(shot, geoms & ~still, behind, last)
 
         if painted.any():
             rest = opaque & ~painted
-            behind = layer("not painted", rest, partial(draw_over_still, rest, last=False))
+            behind = underlay("not painted", rest, partial(draw_over_still, rest, last=False))
             self._draw(shot, painted, behind)
         else:
             draw_over_still(opaque, last=True)
 
-    def _draw(self, shot: Shot, opaque: NDArray[np.bool_], layer: Layer | None = None, last: bool = True) -> None:
-        """Draw opaque geoms (ngeom,) of a picture, over a layer.
+    def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
+        """Draw opaque geoms (ngeom,) of a picture, over an underlay.
 
         Args:
-            last: with what no layer has: the mirror and what shows in it, what can be seen through, the sites, the
+            last: with what no underlay has: the mirror and what shows in it, what can be seen through, the sites, the
                 light of lamps with shadows, and the sky.
         """
         picture = shot.picture
         if not last:
-            self._draw_passes(shot, opaque, [Pass(Draws.CAMERA, picture.seen & opaque)], layer, last)
+            self._draw_passes(shot, opaque, [Pass(Draws.CAMERA, picture.seen & opaque)], underlay, last)
             return
         drawn, passes = opaque | picture.mirror | picture.clear, []
         if picture.mirror.any():
@@ -171,10 +171,10 @@ class SoftwareDrawing(PlainDrawing):
         passes.append(Pass(Draws.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear))
         for lamp in picture.lamps:
             passes += [Pass(Draws.LAMP_MAP, lamp.casts), Pass(Draws.LAMP_LIGHT, lamp.lights)]
-        self._draw_passes(shot, drawn, passes, layer, last)
+        self._draw_passes(shot, drawn, passes, underlay, last)
 
     def _draw_passes(
-        self, shot: Shot, drawn: NDArray[np.bool_], passes: Sequence[Pass], layer: Layer | None, last: bool
+        self, shot: Shot, drawn: NDArray[np.bool_], passes: Sequence[Pass], underlay: Underlay | None, last: bool
     ) -> None:
         """Draw geoms (ngeom,), of meshes in each pass those that it needs."""
         model, picture, flags = self._model, shot.picture, self._scene.flags
@@ -183,14 +183,14 @@ class SoftwareDrawing(PlainDrawing):
             model.geom_group[:] = np.where(drawn, groups, CULLED)
             model.site_group[:] = np.where(last & picture.sites, site_groups, CULLED)
             flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = passes[0].draws is Draws.MIRROR
-            # The sky is behind all layers.
+            # The sky is behind all underlays.
             flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = last
             super()._update(shot.data, shot.camera)
             skinned = None
             if picture.projection is not None:
                 wanted = np.logical_or.reduce([each.geoms for each in passes if each.draws.by_camera])
                 skinned = self._skinned.put(self._scene, shot.data, picture.projection, wanted)
-            self._meshes.show((shot.camera, last), passes, self._scene, skinned, layer)
+            self._meshes.show((shot.camera, last), passes, self._scene, skinned, underlay)
             self._render()
         finally:
             model.geom_group[:] = groups

@@ -97,7 +97,7 @@ def samples(count: int) -> NDArray[np.float32]:
     """
     opengl = calls()
     if opengl.glGetIntegerv(opengl.GL_MAJOR_VERSION) < 4:
-        raise failure("OpenGL has no shaders that run once for each sample, as layers need")
+        raise failure("OpenGL has no shaders that run once for each sample, as underlays need")
     places = [opengl.glGetMultisamplefv(opengl.GL_SAMPLE_POSITION, sample) for sample in range(count)]
     return np.array(places, np.float32)
 
@@ -234,7 +234,7 @@ class Meshes:
 
     The list that MuJoCo calls for a mesh calls another one: the mesh's own in a set of lists that begins at OpenGL's
     list base. So one call of ``mjr_render`` can draw other meshes in each of its passes. The last mesh of every pass is
-    one of ours (:meth:`show`): it puts layers, and sets the list base for the next pass.
+    one of ours (:meth:`show`): it puts underlays, and sets the list base for the next pass.
 
     MuJoCo takes skins to be in the world's frame. So a mesh that has a skin leaves its place on OpenGL's stack of
     matrices, and one more mesh of ours, drawn after the skin, takes it away.
@@ -289,7 +289,7 @@ class Meshes:
         passes: Sequence[Pass],
         scene: mujoco.MjvScene,
         skinned: NDArray[np.bool_] | None = None,
-        layer: Layer | None = None,
+        underlay: Underlay | None = None,
     ) -> None:
         """Have the next drawing of a scene draw of the meshes what its passes have to.
 
@@ -298,7 +298,7 @@ class Meshes:
             passes: those of ``mjr_render``; any after the last draw the same.
             scene: of all that is drawn; it gets one more mesh, the last.
             skinned: (nmesh,) which meshes have a skin in the scene, that draws what the camera sees of them.
-            layer: put behind what the camera sees.
+            underlay: put behind what the camera sees.
         """
         made = self._passes.setdefault(name, [])
         while len(made) < len(passes):
@@ -307,11 +307,11 @@ class Meshes:
         for number, (lists, one) in enumerate(zip(made, passes, strict=False)):
             self._write(lists, one, by_skin)
             then = made[min(number + 1, len(passes) - 1)]
-            ends = then.base, layer.number if layer and one.draws is Draws.CAMERA else 0
+            ends = then.base, underlay.number if underlay and one.draws is Draws.CAMERA else 0
             if lists.ends != ends:
                 with _recorded(lists.end):
-                    if layer and one.draws is Draws.CAMERA:
-                        calls().glCallList(layer.number)
+                    if underlay and one.draws is Draws.CAMERA:
+                        calls().glCallList(underlay.number)
                     calls().glListBase(then.base)
                 lists.ends = ends
         calls().glListBase(made[0].base)
@@ -475,7 +475,7 @@ void main() {
 """
 
 
-class Layer:
+class Underlay:
     """A part of a picture that is drawn once and laid into many: colour and depth of every sample.
 
     The context must be the current one.
@@ -572,7 +572,7 @@ class Layer:
             opengl.glDeleteShader(shader)
         opengl.glLinkProgram(program)
         if not opengl.glGetProgramiv(program, opengl.GL_LINK_STATUS):
-            raise failure(f"OpenGL refuses the shaders of layers: {opengl.glGetProgramInfoLog(program)!r}")
+            raise failure(f"OpenGL refuses the shaders of underlays: {opengl.glGetProgramInfoLog(program)!r}")
         opengl.glUseProgram(program)
         for unit, name in enumerate(("colours", "depths")):
             opengl.glUniform1i(opengl.glGetUniformLocation(program, name), unit)

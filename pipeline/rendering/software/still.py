@@ -11,11 +11,11 @@ LONGEST_WAIT = 16
 
 
 class Still:
-    """Chooses the geoms of one camera's layer of what stands still.
+    """Chooses the geoms of one camera's underlay of what stands still.
 
-    A layer has to be drawn anew when one of its geoms moves, and an object at rest still moves by a millionth now and
-    then. So a geom that left the layer has to stand still for twice as many pictures before it joins again. And geoms
-    join when they were drawn beside the layer so often that it would have paid.
+    An underlay has to be rendered anew when one of its geoms moves, and an object at rest still moves by a millionth
+    now and then. So a geom that left the underlay has to stand still for twice as many pictures before it joins again.
+    And geoms join when they were rendered beside the underlay so often that it would have paid.
     """
 
     def __init__(self, model: mujoco.MjModel):
@@ -25,7 +25,7 @@ class Still:
         self._view = b""
 
     def geoms(self, view: bytes, places: NDArray[np.float32], drawn: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(ngeom,) the geoms of the layer for the next picture.
+        """(ngeom,) the geoms of the underlay for the next picture.
 
         Args:
             view: what a picture depends on beside the geoms: the camera, and where the lamps are.

@@ -13,7 +13,7 @@ from pipeline.rendering.software.drawing import SoftwareDrawing
 from pipeline.types import Frame
 
 STATES = 4
-"""Poses of what moves, without and then with shadows. What stands still in two of them is a layer."""
+"""Poses of what moves, without and then with shadows. What stands still in two of them is an underlay."""
 
 ANGLES, HEIGHTS = 2.4 * np.arange(400), np.linspace(-0.99, 0.99, 400)
 BALL = np.column_stack([np.sqrt(1 - HEIGHTS**2) * wave(ANGLES) for wave in (np.cos, np.sin)] + [HEIGHTS])
