@@ -16,7 +16,8 @@ from pipeline import gl, seeding
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.faces import Faces
-from pipeline.rendering.software.mujoco_3_2_7 import GEOM, SKINS
+from pipeline.rendering.software.mujoco_3_2_7.context import SKINS
+from pipeline.rendering.software.mujoco_3_2_7.skins import GEOM
 from pipeline.rendering.software.samples import BATCH_FACES, Projection, faces_that_show, room
 from pipeline.types import Floats, Frame
 

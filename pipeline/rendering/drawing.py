@@ -32,6 +32,12 @@ class Surfaces(NamedTuple):
     kind: NDArray[np.int32]
 
 
+def texels(model: mujoco.MjModel) -> list[NDArray[np.uint8]]:
+    """The part of a model's ``tex_data`` that belongs to each texture; not copied."""
+    ends = model.tex_adr + model.tex_height * model.tex_width * model.tex_nchannel
+    return [model.tex_data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
+
+
 class Drawing(Protocol):
     """Draws the states of one model at a time; close it before another is made."""
 

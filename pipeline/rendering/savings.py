@@ -19,7 +19,7 @@ PLAIN = "PLAIN_RENDERING"
 """Environment variable: anything but nothing has all scenes drawn by MuJoCo as it is."""
 
 MUJOCO = "3.2.7"
-"""The version of MuJoCo whose private ways ``software/mujoco_3_2_7.py`` knows."""
+"""The version of MuJoCo whose private ways ``software/mujoco_3_2_7/`` knows."""
 
 DEVICE = "llvmpipe"
 """How the names of tested devices begin: Mesa's renderer without a GPU."""

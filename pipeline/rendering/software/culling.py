@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.software.mujoco_3_2_7 import REFLECTING_SQUARE, WIDEST_MAP_DEG
+from pipeline.rendering.software.mujoco_3_2_7.passes import REFLECTING_SQUARE, WIDEST_MAP_DEG
 from pipeline.rendering.software.samples import Projection
 from pipeline.types import Floats
 

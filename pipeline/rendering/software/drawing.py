@@ -19,9 +19,13 @@ from numpy.typing import NDArray
 
 from pipeline.axes.base import FIELDS
 from pipeline.rendering.drawing import PlainDrawing
-from pipeline.rendering.software import mujoco_3_2_7 as private
 from pipeline.rendering.software.culling import Culling, Picture
-from pipeline.rendering.software.mujoco_3_2_7 import Draws, HeldTextures, Layer, Meshes, Pass, Skins
+from pipeline.rendering.software.mujoco_3_2_7 import context as private
+from pipeline.rendering.software.mujoco_3_2_7.context import HeldTextures
+from pipeline.rendering.software.mujoco_3_2_7.layers import Layer
+from pipeline.rendering.software.mujoco_3_2_7.meshes import Meshes
+from pipeline.rendering.software.mujoco_3_2_7.passes import Draws, Pass
+from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.samples import SAMPLES
 from pipeline.rendering.software.skins import SkinnedMeshes
 from pipeline.rendering.software.still import Still

@@ -7,7 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rendering.software.faces import Faces, faces_of
-from pipeline.rendering.software.mujoco_3_2_7 import OPAQUE, SKINS, Meshes, Skins
+from pipeline.rendering.software.mujoco_3_2_7.context import SKINS
+from pipeline.rendering.software.mujoco_3_2_7.meshes import Meshes
+from pipeline.rendering.software.mujoco_3_2_7.passes import OPAQUE
+from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.samples import Projection, faces_that_show, room
 
 LEAST_FACES = 256

@@ -1,0 +1,194 @@
+"""The display lists of meshes in MuJoCo 3.2.7's context: which meshes each pass of ``mjr_render`` draws."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Hashable, Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.rendering.opengl import calls, check
+from pipeline.rendering.software.faces import PARTS
+from pipeline.rendering.software.mujoco_3_2_7.layers import Layer, recorded
+from pipeline.rendering.software.mujoco_3_2_7.passes import Draws, Pass
+
+
+class _Lists:
+    """A pass's display lists: one for each mesh, one more, and for each mesh what follows its skin.
+
+    Attributes:
+        base, end, closing: numbers of the first, the one more, and the first that follows a skin.
+        ends: what the one more does: the base that it sets, and a list that it calls before.
+        drawn: (nmesh,) whose faces are drawn.
+        opened: (nmesh,) which are followed by a skin.
+        shut: (nmesh,) whose skin is not drawn.
+    """
+
+    def __init__(self, meshes: int):
+        self.base = calls().glGenLists(2 * meshes + 1)
+        self.end, self.closing = self.base + meshes, self.base + meshes + 1
+        self.ends = (0, 0)
+        self.drawn, self.opened, self.shut = np.zeros((3, meshes), np.bool_)
+
+
+class Meshes:
+    """The display lists of a model's meshes in a context, which must be the current one.
+
+    The list that MuJoCo calls for a mesh calls another one: the mesh's own in a set of lists that begins at OpenGL's
+    list base. So one call of ``mjr_render`` can draw other meshes in each of its passes. The last mesh of every pass is
+    one of ours (:meth:`show`): it puts layers, and sets the list base for the next pass.
+
+    MuJoCo takes skins to be in the world's frame. So a mesh that has a skin leaves its place on OpenGL's stack of
+    matrices, and one more mesh of ours, drawn after the skin, takes it away.
+
+    Attributes:
+        closing: (nmesh,) of each mesh that is drawn, what follows its skin, as MuJoCo numbers meshes.
+
+    Args:
+        context: whose meshes they become.
+        model: whose meshes they are.
+        drawn: numbers of the meshes that are drawn.
+        former: those that the context had. What both have stays; the rest is given up, and so is ``former``.
+    """
+
+    def __init__(
+        self, context: mujoco.MjrContext, model: mujoco.MjModel, drawn: Sequence[int], former: Meshes | None = None
+    ):
+        self._context, self._meshes = context, drawn
+        self._of_geom = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
+        kept = former._give_up() if former else {}
+        calls().glDeleteLists(context.baseMesh, context.rangeMesh)
+        context.rangeMesh = 2 * model.nmesh
+        context.baseMesh = calls().glGenLists(context.rangeMesh)
+        self.contents = {mesh: _content(model, mesh) for mesh in drawn}
+        self._faces: dict[bytes, int] = {}
+        for mesh, content in self.contents.items():
+            if content not in self._faces:
+                self._faces[content] = kept.pop(content, 0) or _uploaded(model, context, mesh)
+        for number in kept.values():
+            calls().glDeleteLists(number, 2)
+        self._own = calls().glGenLists(1 + len(drawn))
+        for place, mesh in enumerate(drawn):
+            _call_from_base(context.baseMesh + 2 * mesh, place)
+            _call_from_base(self._own + 1 + place, len(drawn) + 1 + place)
+        _call_from_base(self._own, len(drawn))
+        self.closing: NDArray[np.intp] = np.zeros(model.nmesh, np.intp)
+        self.closing[[*drawn]] = self._own + 1 + np.arange(len(drawn)) - context.baseMesh
+        self._nothing = _query_of_nothing()
+        self._passes: dict[Hashable, list[_Lists]] = {}
+
+    def _give_up(self) -> dict[bytes, int]:
+        """Delete all but the faces, which are returned: what tells a mesh to the number of its list."""
+        calls().glDeleteLists(self._own, 1 + len(self._meshes))
+        for lists in (lists for made in self._passes.values() for lists in made):
+            calls().glDeleteLists(lists.base, 2 * len(self._meshes) + 1)
+        calls().glDeleteQueries(1, [self._nothing])
+        return self._faces
+
+    def show(
+        self,
+        name: Hashable,
+        passes: Sequence[Pass],
+        scene: mujoco.MjvScene,
+        skinned: NDArray[np.bool_] | None = None,
+        layer: Layer | None = None,
+    ) -> None:
+        """Have the next drawing of a scene draw of the meshes what its passes have to.
+
+        Args:
+            name: of what is drawn, for which most lists stay as they were the last time.
+            passes: those of ``mjr_render``; any after the last draw the same.
+            scene: of all that is drawn; it gets one more mesh, the last.
+            skinned: (nmesh,) which meshes have a skin in the scene, that draws what the camera sees of them.
+            layer: put behind what the camera sees.
+        """
+        made = self._passes.setdefault(name, [])
+        while len(made) < len(passes):
+            made.append(_Lists(len(self._meshes)))
+        by_skin = np.zeros(len(self._meshes), np.bool_) if skinned is None else skinned[[*self._meshes]]
+        for number, (lists, one) in enumerate(zip(made, passes, strict=False)):
+            self._write(lists, one, by_skin)
+            then = made[min(number + 1, len(passes) - 1)]
+            ends = then.base, layer.number if layer and one.draws is Draws.CAMERA else 0
+            if lists.ends != ends:
+                with recorded(lists.end):
+                    if layer and one.draws is Draws.CAMERA:
+                        calls().glCallList(layer.number)
+                    calls().glListBase(then.base)
+                lists.ends = ends
+        calls().glListBase(made[0].base)
+        self._add_last(scene)
+
+    def _write(self, lists: _Lists, one: Pass, by_skin: NDArray[np.bool_]) -> None:
+        wanted = np.isin(self._meshes, self._of_geom[one.geoms])
+        drawn = wanted & ~(by_skin & one.draws.by_camera)
+        # Lamps' maps have no skins, mirror images must not show them.
+        opened = by_skin & (one.draws is not Draws.LAMP_MAP)
+        shut = opened & ((one.draws is Draws.MIRROR) | ~wanted)
+        changed = (drawn != lists.drawn) | (opened != lists.opened) | (shut != lists.shut)
+        for mesh in np.flatnonzero(changed).tolist():
+            with recorded(lists.base + mesh):
+                if drawn[mesh]:
+                    calls().glCallList(self._faces[self.contents[self._meshes[mesh]]])
+                if opened[mesh]:
+                    calls().glPushMatrix()
+                if shut[mesh]:
+                    calls().glBeginConditionalRender(self._nothing, calls().GL_QUERY_WAIT)
+            with recorded(lists.closing + mesh):
+                if shut[mesh]:
+                    calls().glEndConditionalRender()
+                if opened[mesh]:
+                    calls().glPopMatrix()
+        lists.drawn, lists.opened, lists.shut = drawn, opened, shut
+
+    def _add_last(self, scene: mujoco.MjvScene) -> None:
+        """Have the one more list called as if it were a mesh of the scene, after all others that are opaque."""
+        geom = scene.geoms[scene.ngeom]
+        white, nowhere, straight = np.ones(4, np.float32), np.zeros(3), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_MESH, nowhere, nowhere, straight, white)
+        # As decor, which mjv_initGeom makes it, it would not be called for shadows.
+        geom.category, geom.dataid = mujoco.mjtCatBit.mjCAT_DYNAMIC, self._own - self._context.baseMesh
+        # What mjv_initGeom leaves as it was: nothing to write beside it, and nothing to show of it in a segmentation.
+        geom.label, geom.segid = "", -1
+        scene.ngeom += 1
+
+
+def _content(model: mujoco.MjModel, mesh: int) -> bytes:
+    """Tells what a mesh's faces look like from those of any other mesh."""
+    digest = hashlib.sha256()
+    for part, names in PARTS.items():
+        first, count = getattr(model, f"mesh_{part}adr")[mesh], getattr(model, f"mesh_{part}num")[mesh]
+        for name in names:
+            digest.update(getattr(model, f"mesh_{name}")[first : first + count].tobytes())
+    return digest.digest()
+
+
+def _query_of_nothing() -> int:
+    """A query whether something was drawn, answered with no."""
+    opengl = calls()
+    number = int(opengl.glGenQueries(1)[0])
+    opengl.glBeginQuery(opengl.GL_ANY_SAMPLES_PASSED, number)
+    opengl.glEndQuery(opengl.GL_ANY_SAMPLES_PASSED)
+    return number
+
+
+def _call_from_base(number: int, place: int) -> None:
+    """Have a list call the one in a place after the list base."""
+    with recorded(number):
+        calls().glCallLists(np.array([place], np.uint32))
+
+
+def _uploaded(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int) -> int:
+    """Have MuJoCo write a mesh's faces into the first of two new lists; the second is of no use."""
+    base, hull = context.baseMesh, int(model.mesh_graphadr[mesh])
+    number: int = calls().glGenLists(2)
+    try:
+        model.mesh_graphadr[mesh] = -1
+        context.baseMesh = number - 2 * mesh
+        mujoco.mjr_uploadMesh(model, context, mesh)
+        check("mjr_uploadMesh")
+    finally:
+        context.baseMesh, model.mesh_graphadr[mesh] = base, hull
+    return number
