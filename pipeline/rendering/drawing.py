@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import ExitStack
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
@@ -32,10 +33,11 @@ class Surfaces(NamedTuple):
     kind: NDArray[np.int32]
 
 
-def texels(model: mujoco.MjModel) -> list[NDArray[np.uint8]]:
-    """The part of a model's ``tex_data`` that belongs to each texture; not copied."""
+def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> list[NDArray[np.uint8]]:
+    """The part of a model's ``tex_data``, or of another array like it, that belongs to each texture; not copied."""
+    data = model.tex_data if tex_data is None else tex_data
     ends = model.tex_adr + model.tex_height * model.tex_width * model.tex_nchannel
-    return [model.tex_data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
+    return [data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
 
 
 class Drawing(Protocol):
@@ -86,10 +88,14 @@ class PlainDrawing:
         height, width, _ = SCHEMA.frame.shape
         self._model, self._rectangle = model, mujoco.MjrRect(0, 0, width, height)
         self._gl = gl_context.GLContext(width, height)
-        self._gl.make_current()
-        with making_context():
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        with ExitStack() as undo:
+            # An OpenGL context that is left open counts against those that the driver has.
+            undo.callback(self._gl.free)
+            self._gl.make_current()
+            with making_context():
+                self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+                mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+            undo.pop_all()
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(model, MOST_GEOMS)
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()

@@ -90,7 +90,7 @@ class Culling:
         corners_m = data.geom_xpos[:, None] + self._corners_m @ turns
         seen = self.shown & view.shows(corners_m)
         with_shadows = np.flatnonzero(self._model.light_castshadow & self._model.light_active)
-        lamps = tuple(self._lamp(data, view, corners_m, seen, clear, lamp) for lamp in with_shadows.tolist())
+        lamps = tuple(self._lamp(data, view, corners_m, seen, lamp) for lamp in with_shadows.tolist())
         images = np.zeros_like(seen)
         if mirror is not None and seen[mirror]:
             images = self.shown & self._images(data, view, corners_m, mirror)
@@ -129,10 +129,9 @@ class Culling:
         view: _View,
         corners_m: Floats,
         seen: NDArray[np.bool_],
-        clear: NDArray[np.bool_],
         lamp: int,
     ) -> Lamp:
-        model, origin_m = self._model, data.light_xpos[lamp]
+        model, origin_m, clear = self._model, data.light_xpos[lamp], self._see_through()
         # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
         if model.light_directional[lamp]:
             return Lamp(self.shown, seen | clear)

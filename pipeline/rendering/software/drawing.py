@@ -10,6 +10,7 @@ drawing.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import NamedTuple
 
@@ -57,13 +58,16 @@ class SoftwareDrawing(PlainDrawing):
         # A context is made for what all scenes have alike, and then goes on with this one.
         bare = private.bare(model)
         super().__init__(bare)
-        self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
-        self._meshes = Meshes(self._context, bare, [])
-        self._skinned = SkinnedMeshes(self._skins, self._samples, bare, np.zeros(bare.ngeom, np.bool_), self._meshes)
-        self._still: dict[str, Still] = {}
-        self._layers: dict[tuple[str, str], Layer] = {}
-        self._held: HeldTextures | None = None
-        self._show(model)
+        with ExitStack() as undo:
+            undo.callback(self.close)
+            self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
+            self._meshes = Meshes(self._context, bare, [])
+            self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, np.zeros(bare.ngeom, np.bool_))
+            self._still: dict[str, Still] = {}
+            self._layers: dict[tuple[str, str], Layer] = {}
+            self._held: HeldTextures | None = None
+            self._show(model)
+            undo.pop_all()
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
@@ -86,7 +90,7 @@ class SoftwareDrawing(PlainDrawing):
         shown = self._culling.shown
         drawn = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
         self._meshes = Meshes(self._context, model, drawn, self._meshes)
-        self._skinned = SkinnedMeshes(self._skins, self._samples, model, shown, self._meshes, self._skinned)
+        self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, shown, self._skinned)
         self._forget_layers()
 
     def load(self, textures: Collection[int]) -> None:

@@ -44,6 +44,7 @@ class Meshes:
     matrices, and one more mesh of ours, drawn after the skin, takes it away.
 
     Attributes:
+        model: whose meshes they are.
         closing: (nmesh,) of each mesh that is drawn, what follows its skin, as MuJoCo numbers meshes.
 
     Args:
@@ -56,7 +57,7 @@ class Meshes:
     def __init__(
         self, context: mujoco.MjrContext, model: mujoco.MjModel, drawn: Sequence[int], former: Meshes | None = None
     ):
-        self._context, self._meshes = context, drawn
+        self.model, self._context, self._meshes = model, context, drawn
         self._of_geom = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
         kept = former._give_up() if former else {}
         calls().glDeleteLists(context.baseMesh, context.rangeMesh)
