@@ -1,4 +1,4 @@
-"""What an episode's agent view shows of the things that the task is about, of the hand, and of added objects."""
+"""Whether the first frame of a perturbed scene shows enough: the task's things, the hand, and added objects."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Sight:
 
     @classmethod
     def of(cls, renderer: Renderer, task: Task, hand_m: Floats) -> Sight:
-        """What the agent view of a renderer sees, in the state that it was put in.
+        """What the agent view of a renderer sees in the restored state.
 
         Args:
             renderer: of a scene of the task.
@@ -64,11 +64,13 @@ class Sight:
         )
 
     def faults(self, original: Sight) -> list[str]:
-        """What a camera shows too little of; none when it is enough.
+        """Names of what a camera shows too little of; empty when it shows enough.
 
-        Where the scene's own camera shows more: ``task_object_not_seen`` when a thing shows on fewer than ``LEAST_PX``
-        pixels, ``hand_not_seen`` when the hand is outside of the frame for more than ``MOST_OUTSIDE`` of the steps.
-        ``added_objects_not_seen`` when fewer of these show than the layout axis asks for.
+        * ``task_object_not_seen``: a thing shows on fewer than ``LEAST_PX`` pixels.
+        * ``hand_not_seen``: the hand is outside of the frame for more than ``MOST_OUTSIDE`` of the steps.
+        * ``added_objects_not_seen``: fewer of these show than the layout axis asks for.
+
+        The first two do not count when the scene's own camera shows no more.
         """
         lost = any(px < min(LEAST_PX, original.things_px[thing]) for thing, px in self.things_px.items())
         away = self.hand_outside > max(MOST_OUTSIDE, original.hand_outside)

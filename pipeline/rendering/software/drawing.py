@@ -1,9 +1,8 @@
-"""Draws pictures with less work for Mesa, and one scene after the other in one context, with the pixels of MuJoCo's own
-drawing.
+"""Renders the pixels of ``PlainDrawing`` with less work for Mesa, and one scene after the other in one context.
 
-* What a picture cannot show is not drawn (``culling.py``).
-* Of large meshes, single faces are drawn (``skins.py``, ``samples.py``).
-* What stands still before a camera is drawn once (``still.py``).
+* Geoms outside of the view are not rendered (``culling.py``).
+* Of large meshes, only faces that cover a sample are rendered (``skins.py``, ``samples.py``).
+* What stands still before a camera is rendered once, and its colour and depth are kept as a layer (``still.py``).
 * Meshes and textures that a scene shares with the one before stay in the context.
 """
 
@@ -33,14 +32,14 @@ from pipeline.rendering.software.still import Still
 from pipeline.types import Frame
 
 LOOK = tuple(name for name in FIELDS if name != "tex_data")
-"""What a picture depends on in a model, of what may change, beside textures and where its geoms and sites are."""
+"""Arrays of a model that perturbations may change and a picture depends on, beside textures."""
 
 CULLED = mujoco.mjNGROUP - 1
-"""A group of geoms and sites that nothing in LIBERO is in, and that is not drawn."""
+"""A group of geoms and sites that LIBERO does not use and that is never rendered."""
 
 
 class Shot(NamedTuple):
-    """A picture to draw: of which state, from which camera, and what has to be drawn for it."""
+    """A picture to render: the state, the camera, and what has to be rendered."""
 
     data: mujoco.MjData
     camera: str
@@ -48,14 +47,14 @@ class Shot(NamedTuple):
 
 
 class SoftwareDrawing(PlainDrawing):
-    """Draws models that are ``possible``.
+    """Renders models that are ``possible``.
 
     Raises:
         PipelineError: when OpenGL does not do what is asked of it.
     """
 
     def __init__(self, model: mujoco.MjModel):
-        # A context is made for what all scenes have alike, and then goes on with this one.
+        # The context is made for what all scenes have in common, and then goes on with this model.
         bare = private.bare(model)
         super().__init__(bare)
         with ExitStack() as undo:
@@ -71,7 +70,7 @@ class SoftwareDrawing(PlainDrawing):
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
-        """Whether a model has nothing that only a context of its own could show, as LIBERO's have not."""
+        """Whether a model has nothing that needs a context of its own. LIBERO's models have no such thing."""
         bounded = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] > 0
         return not model.nhfield and not model.nskin and bool(bounded.all()) and model.vis.quality.offsamples == SAMPLES
 
@@ -129,14 +128,14 @@ class SoftwareDrawing(PlainDrawing):
         return self._pixels()
 
     def _draw_in_layers(self, shot: Shot) -> None:
-        """Draw a picture with a layer of what no held texture is on, or of what stands still."""
+        """Render a picture over a layer: of the geoms without a held texture, or of those that stand still."""
         opaque = shot.picture.opaque & ~shot.picture.mirror
         painted = opaque & self._painted
         view, places = self._view(shot), np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1)
         places = places.astype(np.float32)
 
         def layer(name: str, geoms: NDArray[np.bool_], draw: Callable[[], None]) -> Layer:
-            """A layer of the camera's pictures; it is drawn if its content is not what it was."""
+            """A layer of the camera's pictures, rendered anew if its content has changed."""
             if (shot.camera, name) not in self._layers:
                 height, width = self._rectangle.height, self._rectangle.width
                 self._layers[shot.camera, name] = Layer(self._context, height, width)
@@ -161,11 +160,11 @@ class SoftwareDrawing(PlainDrawing):
             draw_over_still(opaque, last=True)
 
     def _draw(self, shot: Shot, opaque: NDArray[np.bool_], layer: Layer | None = None, last: bool = True) -> None:
-        """Draw opaque geoms (ngeom,) of a picture, over a layer.
+        """Render opaque geoms (ngeom,) of a picture over a layer.
 
         Args:
-            last: with what no layer has: the mirror and what shows in it, what can be seen through, the sites, the
-                light of lamps with shadows, and the sky.
+            last: whether this completes the picture, with what is in no layer: mirror, transparent geoms, sites,
+                shadows and sky.
         """
         picture = shot.picture
         if not last:
@@ -184,7 +183,7 @@ class SoftwareDrawing(PlainDrawing):
     def _draw_passes(
         self, shot: Shot, drawn: NDArray[np.bool_], passes: Sequence[Pass], layer: Layer | None, last: bool
     ) -> None:
-        """Draw geoms (ngeom,), of meshes in each pass those that it needs."""
+        """Render geoms (ngeom,); each pass renders the meshes that it needs."""
         model, picture, flags = self._model, shot.picture, self._scene.flags
         groups, site_groups = model.geom_group.copy(), model.site_group.copy()
         try:
@@ -206,13 +205,13 @@ class SoftwareDrawing(PlainDrawing):
             flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
 
     def _update(self, data: mujoco.MjData, camera: str) -> None:
-        """Have everything drawn, as for surfaces."""
+        """Include everything, as surfaces need."""
         super()._update(data, camera)
         everything = Pass(Draws.CAMERA, np.ones(self._model.ngeom, np.bool_))
         self._meshes.show("everything", [everything], self._scene)
 
     def _view(self, shot: Shot) -> bytes:
-        """All that a picture depends on beside textures, geoms and sites."""
+        """The bytes of all that a picture depends on beside textures, geoms and sites."""
         data, number = shot.data, self._model.camera(shot.camera).id
         fields = [getattr(self._model, name) for name in LOOK]
         fields += [data.cam_xpos[number], data.cam_xmat[number], data.light_xpos, data.light_xdir]

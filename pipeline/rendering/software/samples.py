@@ -1,8 +1,8 @@
-"""Which faces of a mesh a picture can show: those that cover one of its samples.
+"""Which faces of a mesh cover a sample of the picture; the others change no pixel.
 
-A picture has four samples a pixel, and most faces of LIBERO's meshes lie between them: of 90,000 faces of the arm that
-an agent view looks at, 17,000 cover a sample and do not face away. MuJoCo hands all of them to OpenGL, which finds
-that out one by one.
+A picture has four samples a pixel (multisampling), and most faces of LIBERO's meshes lie between samples: of 90,000
+faces of the arm in an agent view, 17,000 cover a sample and face the camera. MuJoCo passes all of them to OpenGL, which
+tests each one.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pipeline.rendering.software.faces import Faces
 from pipeline.types import Floats
 
 BATCH_FACES = 341
-"""llvmpipe draws so many faces of a display list or of a buffer at once. Where one of them has a corner outside of the
-view, all of them are sorted by front and back before their corners are rounded, else afterwards."""
+"""llvmpipe processes so many faces of a display list or an index buffer at once. If one of them has a corner outside of
+the view, it tests which side of each face is seen before it rounds the corners, else afterwards."""
 
 MARGIN_PX = 1 / 128
 """How far beside a face a sample counts as covered. OpenGL rounds corners to 1/256 of a pixel, so by half of that."""

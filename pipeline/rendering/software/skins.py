@@ -1,4 +1,4 @@
-"""The large meshes of a model, drawn by those of their faces that a picture can show."""
+"""Renders of large meshes only the faces that a picture can show, by an index buffer for each."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.samples import Projection, faces_that_show, room
 
 LEAST_FACES = 256
-"""Smaller meshes are drawn as they are."""
+"""Meshes with fewer faces are rendered whole."""
 
 
 class SkinnedMeshes:
-    """Gives each geom of a large mesh a skin, which draws chosen faces of it.
+    """Gives each geom of a large mesh a skin, which renders chosen faces of it.
 
     Args:
         skins: of a context.
