@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from operator import attrgetter
 
 import mujoco
 import numpy as np
@@ -19,37 +20,32 @@ _SKIN = (
     '<skin vertex="0 0 0 1 0 0 0 1 0" face="0 1 2"{}>'
     '<bone body="bone" bindpos="0 0 0" bindquat="1 0 0 0" vertid="0 1 2" vertweight="1 1 1"/></skin>'
 )
-_ALIKE = {
-    "global_": ("offwidth", "offheight", "linewidth"),
-    "quality": ("offsamples", "shadowsize", "numslices", "numstacks", "numquads"),
-    "map": ("shadowclip", "shadowscale", "fogstart", "fogend", "zfar"),
-    "rgba": ("fog",),
-}
-"""What MuJoCo makes a context from, beside what is in a model."""
+_FIXED = (
+    *("global_.offwidth", "global_.offheight", "global_.linewidth", "rgba.fog"),
+    *("quality.offsamples", "quality.shadowsize", "quality.numslices", "quality.numstacks", "quality.numquads"),
+)
+"""Settings of ``mjVisual`` that a context keeps as they were when it was made."""
 
 
 def bare(model: mujoco.MjModel) -> mujoco.MjModel:
-    """A model of nothing but another one's planes and ``SKINS`` of both kinds; its context is as the other's."""
+    """A model with nothing but another model's planes and settings, and ``SKINS`` skins of both kinds."""
     planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     made = mujoco.MjModel.from_xml_string(
         f"""<mujoco><worldbody>{'<geom type="plane" size="1 1 1"/>' * len(planes)}<body name="bone"/></worldbody>
         <deformable>{_SKIN.format(_TEXTURE) * SKINS + _SKIN.format("") * SKINS}</deformable></mujoco>"""
     )
     made.geom_size[:] = model.geom_size[planes]
-    made.stat.extent = model.stat.extent
-    for part, names in _ALIKE.items():
-        for name in names:
-            setattr(getattr(made.vis, part), name, getattr(getattr(model.vis, part), name))
+    made.stat.extent, made.vis.map.zfar = model.stat.extent, model.vis.map.zfar
+    for setting in _FIXED:
+        part, name = setting.split(".")
+        setattr(getattr(made.vis, part), name, getattr(getattr(model.vis, part), name))
     return made
 
 
-def fixed(model: mujoco.MjModel) -> tuple[object, ...]:
-    """What a context is made for once and for all: buffers, the fineness of round bodies, lines, fog and planes."""
-    window, quality = model.vis.global_, model.vis.quality
-    buffers = window.offwidth, window.offheight, quality.offsamples, quality.shadowsize
-    fineness = quality.numslices, quality.numstacks, quality.numquads
+def fixed(model: mujoco.MjModel) -> list[bytes]:
+    """What a context cannot change for another model: its settings and planes."""
     planes = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE]
-    return *buffers, *fineness, window.linewidth, tuple(model.vis.rgba.fog), planes.tobytes()
+    return [np.array(attrgetter(setting)(model.vis)).tobytes() for setting in _FIXED] + [planes.tobytes()]
 
 
 def samples(count: int) -> NDArray[np.float32]:
@@ -66,7 +62,7 @@ def samples(count: int) -> NDArray[np.float32]:
 
 
 def adopt_size(context: mujoco.MjrContext, model: mujoco.MjModel) -> None:
-    """Have a context know a model's size as ``mjr_makeContext`` works it out."""
+    """Set what ``mjr_makeContext`` computes from a model's size."""
     context.shadowClip = model.stat.extent * model.vis.map.shadowclip
     context.shadowScale = model.vis.map.shadowscale
     context.fogStart = model.stat.extent * model.vis.map.fogstart
@@ -78,7 +74,7 @@ _SKY = -mujoco.mjtTextureRole.mjNTEXROLE + mujoco.mjtTextureRole.mjTEXROLE_RGB
 
 
 def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mujoco.MjModel) -> None:
-    """Have a context of a former model's textures hold a model's: a scene has 140 MB, and those that both have stay."""
+    """Replace a former model's textures in a context by a model's. Those that both have stay: a scene has 140 MB."""
     kinds = [(m.tex_type, m.tex_height, m.tex_width, m.tex_nchannel) for m in (model, former)]
     there = texels(former)
     left = dict(enumerate(context.texture[: len(there)].tolist()))
@@ -106,14 +102,14 @@ def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mu
 
 
 class HeldTextures:
-    """Looks of a context's textures beside each other: OpenGL holds them under names of their own."""
+    """Several variants of a context's textures, each under OpenGL names of its own."""
 
     def __init__(self, context: mujoco.MjrContext):
         self._context, self._own = context, context.texture.copy()
         self._held: list[int] = []
 
     def hold(self, textures: Collection[int]) -> dict[int, int]:
-        """Keep what the context has for these textures; the model's own get new names, and have to be loaded.
+        """Keep what is uploaded for these textures. The model's own get new names and have to be uploaded again.
 
         Returns:
             Texture to the name of what was kept.
@@ -125,7 +121,7 @@ class HeldTextures:
         return names
 
     def show(self, names: Mapping[int, int]) -> None:
-        """Draw with what was kept, and for other textures with the model's own."""
+        """Render with what was kept, and otherwise with the model's own textures."""
         self._context.texture[:] = self._own
         self._context.texture[[*names]] = [*names.values()]
 

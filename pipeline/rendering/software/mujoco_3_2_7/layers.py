@@ -12,7 +12,7 @@ from pipeline.rendering.opengl import calls, failure
 
 @contextmanager
 def recorded(number: int) -> Iterator[None]:
-    """Have a display list do, whenever it is called, what OpenGL is asked to do meanwhile."""
+    """Record OpenGL's commands into a display list instead of executing them."""
     calls().glNewList(number, calls().GL_COMPILE)
     try:
         yield
@@ -36,17 +36,17 @@ void main() {
 
 
 class Layer:
-    """A part of a picture that is drawn once and laid into many: colour and depth of every sample.
+    """A part of a picture that is rendered once and used in many: colour and depth of every sample.
 
     The context must be the current one.
 
     Attributes:
-        number: of the display list that draws it into the off-screen buffer, where nothing nearer is drawn; what is at
-            the same depth is drawn over. MuJoCo calls it after all that is opaque (``Meshes``).
-        content: tells what was kept from anything else; empty at first.
+        number: of the display list that writes the layer into the off-screen buffer, at samples where nothing nearer
+            was rendered; at equal depth the layer wins. MuJoCo calls it after all opaque geoms (``Meshes``).
+        content: identifies what was kept; empty at first.
 
     Args:
-        context: of MuJoCo, in whose off-screen buffer the pictures are drawn.
+        context: of MuJoCo, with the off-screen buffer that pictures are rendered into.
         height, width: of the pictures, which begin in that buffer's corner.
     """
 
@@ -70,7 +70,7 @@ class Layer:
         self.content = b""
 
     def keep(self, content: bytes) -> None:
-        """Copy what is drawn in the off-screen buffer."""
+        """Copy the off-screen buffer."""
         # Of less than all, OpenGL here does not copy each sample by itself.
         opengl, rectangle = calls(), (0, 0, self._width, self._height)
         opengl.glPushAttrib(opengl.GL_SCISSOR_BIT)

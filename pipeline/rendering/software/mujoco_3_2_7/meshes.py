@@ -16,14 +16,14 @@ from pipeline.rendering.software.mujoco_3_2_7.passes import Draws, Pass
 
 
 class _Lists:
-    """A pass's display lists: one for each mesh, one more, and for each mesh what follows its skin.
+    """The display lists of one pass: a list for each mesh, an end list, and for each mesh a list that closes its skin.
 
     Attributes:
-        base, end, closing: numbers of the first, the one more, and the first that follows a skin.
-        ends: what the one more does: the base that it sets, and a list that it calls before.
-        drawn: (nmesh,) whose faces are drawn.
-        opened: (nmesh,) which are followed by a skin.
-        shut: (nmesh,) whose skin is not drawn.
+        base, end, closing: numbers of the first mesh's list, of the end list, and of the first closing list.
+        ends: what the end list does: the list base that it sets, and a list that it calls before.
+        drawn: (nmesh,) meshes whose faces are rendered.
+        opened: (nmesh,) meshes that a skin follows.
+        shut: (nmesh,) meshes whose skin is not rendered.
     """
 
     def __init__(self, meshes: int):
@@ -36,22 +36,22 @@ class _Lists:
 class Meshes:
     """The display lists of a model's meshes in a context, which must be the current one.
 
-    The list that MuJoCo calls for a mesh calls another one: the mesh's own in a set of lists that begins at OpenGL's
-    list base. So one call of ``mjr_render`` can draw other meshes in each of its passes. The last mesh of every pass is
-    one of ours (:meth:`show`): it puts layers, and sets the list base for the next pass.
+    The list that MuJoCo calls for a mesh calls a second list, whose number is relative to OpenGL's list base. Each pass
+    has second lists of its own, so one call of ``mjr_render`` can render different meshes in each pass. An extra mesh,
+    the last of every pass (:meth:`show`), puts layers and sets the list base for the next pass.
 
-    MuJoCo takes skins to be in the world's frame. So a mesh that has a skin leaves its place on OpenGL's stack of
-    matrices, and one more mesh of ours, drawn after the skin, takes it away.
+    MuJoCo renders skins in the world's frame. So the list of a mesh with a skin pushes the mesh's matrix onto OpenGL's
+    stack, and an extra mesh after the skin, the closing one, pops it.
 
     Attributes:
         model: whose meshes they are.
-        closing: (nmesh,) of each mesh that is drawn, what follows its skin, as MuJoCo numbers meshes.
+        closing: (nmesh,) number, as MuJoCo numbers meshes, of the closing mesh of each mesh that is rendered.
 
     Args:
         context: whose meshes they become.
         model: whose meshes they are.
-        drawn: numbers of the meshes that are drawn.
-        former: those that the context had. What both have stays; the rest is given up, and so is ``former``.
+        drawn: numbers of the meshes that are rendered.
+        former: the display lists of the model before; unusable afterwards. Lists of meshes that both have are kept.
     """
 
     def __init__(
@@ -81,7 +81,11 @@ class Meshes:
         self._passes: dict[Hashable, list[_Lists]] = {}
 
     def _give_up(self) -> dict[bytes, int]:
-        """Delete all but the faces, which are returned: what tells a mesh to the number of its list."""
+        """Delete all but the lists of faces.
+
+        Returns:
+            Hash of a mesh to the number of its list of faces.
+        """
         calls().glDeleteLists(self._own, 1 + len(self._meshes))
         for lists in (lists for made in self._passes.values() for lists in made):
             calls().glDeleteLists(lists.base, 2 * len(self._meshes) + 1)
@@ -96,13 +100,13 @@ class Meshes:
         skinned: NDArray[np.bool_] | None = None,
         layer: Layer | None = None,
     ) -> None:
-        """Have the next drawing of a scene draw of the meshes what its passes have to.
+        """Choose the meshes of each pass of the next ``mjr_render``.
 
         Args:
-            name: of what is drawn, for which most lists stay as they were the last time.
-            passes: those of ``mjr_render``; any after the last draw the same.
-            scene: of all that is drawn; it gets one more mesh, the last.
-            skinned: (nmesh,) which meshes have a skin in the scene, that draws what the camera sees of them.
+            name: tells pictures apart; of one name, lists that do not change are kept from the last time.
+            passes: those of ``mjr_render``; further ones render the same as the last.
+            scene: what is rendered; the extra mesh is appended to it.
+            skinned: (nmesh,) meshes that have a skin in the scene, which renders what the camera sees of them.
             layer: put behind what the camera sees.
         """
         made = self._passes.setdefault(name, [])
@@ -125,7 +129,7 @@ class Meshes:
     def _write(self, lists: _Lists, one: Pass, by_skin: NDArray[np.bool_]) -> None:
         wanted = np.isin(self._meshes, self._of_geom[one.geoms])
         drawn = wanted & ~(by_skin & one.draws.by_camera)
-        # Lamps' maps have no skins, mirror images must not show them.
+        # MuJoCo renders no skins into shadow maps, and mirror images must not show them.
         opened = by_skin & (one.draws is not Draws.LAMP_MAP)
         shut = opened & ((one.draws is Draws.MIRROR) | ~wanted)
         changed = (drawn != lists.drawn) | (opened != lists.opened) | (shut != lists.shut)
@@ -145,7 +149,7 @@ class Meshes:
         lists.drawn, lists.opened, lists.shut = drawn, opened, shut
 
     def _add_last(self, scene: mujoco.MjvScene) -> None:
-        """Have the one more list called as if it were a mesh of the scene, after all others that are opaque."""
+        """Append the extra mesh to the scene: MuJoCo renders it after all other opaque geoms."""
         geom = scene.geoms[scene.ngeom]
         white, nowhere, straight = np.ones(4, np.float32), np.zeros(3), np.eye(3).ravel()
         mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_MESH, nowhere, nowhere, straight, white)
@@ -157,7 +161,7 @@ class Meshes:
 
 
 def _content(model: mujoco.MjModel, mesh: int) -> bytes:
-    """Tells what a mesh's faces look like from those of any other mesh."""
+    """A hash of all that a mesh's faces are rendered from."""
     digest = hashlib.sha256()
     for part, names in PARTS.items():
         first, count = getattr(model, f"mesh_{part}adr")[mesh], getattr(model, f"mesh_{part}num")[mesh]
@@ -167,7 +171,7 @@ def _content(model: mujoco.MjModel, mesh: int) -> bytes:
 
 
 def _query_of_nothing() -> int:
-    """A query whether something was drawn, answered with no."""
+    """An occlusion query that no sample passed."""
     opengl = calls()
     number = int(opengl.glGenQueries(1)[0])
     opengl.glBeginQuery(opengl.GL_ANY_SAMPLES_PASSED, number)
@@ -176,13 +180,13 @@ def _query_of_nothing() -> int:
 
 
 def _call_from_base(number: int, place: int) -> None:
-    """Have a list call the one in a place after the list base."""
+    """Record a list that calls the list at an offset from the list base."""
     with recorded(number):
         calls().glCallLists(np.array([place], np.uint32))
 
 
 def _uploaded(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int) -> int:
-    """Have MuJoCo write a mesh's faces into the first of two new lists; the second is of no use."""
+    """The number of a new list into which MuJoCo uploads a mesh's faces; a second one after it stays unused."""
     base, hull = context.baseMesh, int(model.mesh_graphadr[mesh])
     number: int = calls().glGenLists(2)
     try:

@@ -23,7 +23,7 @@ REFLECTING_SQUARE = np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])
 
 
 class Draws(Enum):
-    """What a pass of ``mjr_render`` is for; the passes come in this order, the last two for each lamp with shadows."""
+    """The kinds of passes of ``mjr_render``, in their order; the last two come once for each light with shadows."""
 
     MIRROR = auto()
     """What shows in the mirror."""
@@ -40,7 +40,7 @@ class Draws(Enum):
 
 
 class Pass(NamedTuple):
-    """One pass and the geoms (ngeom,) that it has to draw of meshes."""
+    """One pass, and a mask (ngeom,) of the geoms whose meshes it has to render."""
 
     draws: Draws
     geoms: NDArray[np.bool_]

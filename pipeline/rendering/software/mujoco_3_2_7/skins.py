@@ -27,14 +27,14 @@ GEOM = np.dtype(
 
 
 class Skins:
-    """The skins of a context and a scene that were made from a ``bare`` model, to draw chosen faces of meshes with.
+    """The skins of a context and a scene made from a ``bare`` model; they render chosen faces of meshes.
 
-    The display list of a mesh always draws the same faces, and to write one takes as long as to draw a third of them.
-    For a skin MuJoCo has OpenGL draw the faces that a buffer lists. It would fill the skins with that model's own at
-    every drawing, so they are hidden from it.
+    A display list always renders the same faces, and recording one takes as long as rendering a third of them. For a
+    skin MuJoCo renders the faces of an index buffer. Before each rendering it would overwrite the skins with those of
+    the bare model, so ``nskin`` is set to 0, which hides them from that step.
 
     Attributes:
-        drawn: (2 ``SKINS``,) how many faces of each are drawn; the first ``SKINS`` have places in a texture.
+        drawn: (2 ``SKINS``,) number of faces that each skin renders; the first ``SKINS`` have texture coordinates.
     """
 
     def __init__(self, context: mujoco.MjrContext, scene: mujoco.MjvScene):
@@ -47,7 +47,7 @@ class Skins:
         self._filled: dict[int, bytes] = {}
 
     def fill_vertices(self, skin: int, faces: Faces, content: bytes) -> None:
-        """Copy a mesh's vertices to a skin, unless they are there."""
+        """Upload a mesh's vertices to a skin, unless they are there."""
         if self._filled.get(skin) == content:
             return
         opengl, context = calls(), self._context
@@ -67,7 +67,7 @@ class Skins:
         return shown, of_mesh
 
     def fill_faces(self, skin: int, corners: NDArray[np.uint32]) -> None:
-        """Have a skin draw the faces of these corners (3 F,)."""
+        """Upload the index buffer (3 F,) of the faces that a skin renders."""
         self.drawn[skin] = len(corners) // 3
         if len(corners):
             opengl = calls()
@@ -76,12 +76,12 @@ class Skins:
             opengl.glBindBuffer(opengl.GL_ELEMENT_ARRAY_BUFFER, 0)
 
     def follow(self, shown: NDArray[np.void], skins: NDArray[np.intp], closing: NDArray[np.intp]) -> None:
-        """Write the scene's geoms: after each with a skin comes the skin, and the mesh that takes away its place.
+        """Write the scene's geoms; after each with a skin come the skin and its closing mesh (``Meshes``).
 
         Args:
             shown: (N,) of ``GEOM``.
-            skins: (N,) their skins, -1 for none.
-            closing: (K,) for each that has one, that mesh as MuJoCo numbers it.
+            skins: (N,) the skin of each, -1 for none.
+            closing: (K,) number of the closing mesh of each geom that has a skin.
         """
         having = skins >= 0
         written = np.repeat(shown, np.where(having, 3, 1))
