@@ -154,7 +154,12 @@ class HDF5Source:
                             entry = _entry(self._read(task, key, data))
                             first = first_with.setdefault(entry.sha256, entry)
                             if first is not entry:
-                                raise _copy_of(first, f"{self._path(task)} data/{key}")
+                                # Episodes are identified by content: two copies would make two rows with one id.
+                                raise PipelineError(
+                                    f"holds the same actions, states and model as {first.demo_id}",
+                                    where=f"{self._path(task)} data/{key}",
+                                    remedy="delete one of the two",
+                                )
                             entries.append(entry)
                             usable += 1
                         except PipelineError as error:
@@ -280,13 +285,6 @@ class _Recorded(NamedTuple):
 
 def _entry(demo: Demo) -> DemoEntry:
     return DemoEntry(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
-
-
-def _copy_of(first: DemoEntry, where: str) -> PipelineError:
-    # Episodes are identified by content: two copies would make two rows with one id.
-    return PipelineError(
-        f"holds the same actions, states and model as {first.demo_id}", where=where, remedy="delete one of the two"
-    )
 
 
 def _parse(demo_id: str) -> tuple[Task, str]:
