@@ -92,11 +92,7 @@ fi
 export PATH=$PWD/.venv/bin:$PATH
 case $VERB in
 run)
-    # DVC writes two lock files in place, and refuses to start where it was killed meanwhile. What is finished the run
-    # knows by itself.
-    dvc stage list >/dev/null 2>&1 || rm -f dvc.lock
-    python -m json.tool .dvc/tmp/rwlock >/dev/null 2>&1 || rm -f .dvc/tmp/rwlock
-    dvc repro
+    python -m pipeline run
     ;;
 quick | test)
     ruff check

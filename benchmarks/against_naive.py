@@ -41,8 +41,8 @@ from pipeline.physics.environment import DUMMY_ACTION  # noqa: E402
 from pipeline.planning import plan  # noqa: E402
 from pipeline.planning.streams import streams_of  # noqa: E402
 from pipeline.run.outcome import rejections  # noqa: E402
-from pipeline.run.render import render_plan  # noqa: E402
-from pipeline.run.replay import replay_plan  # noqa: E402
+from pipeline.run.render_stage import render_plan  # noqa: E402
+from pipeline.run.replay_stage import Replays  # noqa: E402
 from pipeline.stores.frame_store import FrameStore, shown_of  # noqa: E402
 from pipeline.stores.trajectory_store import TrajectoryStore  # noqa: E402
 from pipeline.testset import benchmark  # noqa: E402
@@ -59,7 +59,7 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         trajectories, frames = Path(temporary) / "trajectories", Path(temporary) / "frames"
         begun = time.process_time()
-        verdicts = replay_plan(rows, config.demos, config.replay, trajectories, loop)
+        verdicts = Replays(config.demos, config.replay, trajectories, loop).of(rows)
         replayed = time.process_time()
         render_plan(rows, config, trajectories, frames, loop)
         rendered = time.process_time()

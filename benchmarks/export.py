@@ -57,7 +57,11 @@ def synthetic_episode(episode_id: str, steps: int) -> Episode:
         joint_state=rng.normal(size=(steps, *SCHEMA.joint_state.shape)).astype(np.float32),
         action=rng.uniform(-1, 1, (steps, *SCHEMA.action.shape)).astype(np.float32),
         instruction="put the black bowl on the plate",
-        provenance=dict.fromkeys(SCHEMA.provenance, "text") | {"episode_id": episode_id, "seed": 0},
+        provenance={
+            column: dict[str, Any](string="", int64=0, float32=0.0)[dtype]
+            for column, dtype in SCHEMA.provenance.items()
+        }
+        | {"episode_id": episode_id},
         geometry=dict.fromkeys(SCHEMA.views, Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))),
     )
 
@@ -78,7 +82,7 @@ def dataset(writer: str, out: Path, parts: int) -> Format[Any]:
     if writer == "rlds":
         return Rlds(out, RldsConfig(name="benchmark", shards=parts))
     frames: Literal["video", "images"] = "video" if writer == "lerobot_video" else "images"
-    return LeRobot(out, LeRobotConfig(name="benchmark", parts=parts, frames=frames))
+    return LeRobot(out, LeRobotConfig(name="benchmark", shards=parts, frames=frames))
 
 
 def measure(writer: str, episodes: int, steps: int, workers: int) -> dict[str, float]:

@@ -36,7 +36,7 @@ from pipeline.images.jpeg import encode, to_policy
 from pipeline.planning import plan
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.replay import replay_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 from pipeline.types import Frame, Trajectory
@@ -80,7 +80,7 @@ def main() -> None:
         rows = plan.make(demos.index().entries, config.plan, config.replay, benchmark.load())
         twin = next(row for row in rows if row.role == "twin")
         with TemporaryDirectory() as folder:
-            replay_plan([twin], demos, config.replay, Path(folder), loop)
+            Replays(demos, config.replay, Path(folder), loop).of([twin])
             trajectory = TrajectoryStore(Path(folder)).load(twin.trajectory_id)
         figures[arena] = {
             view + shadows: compared(trajectory, spec.camera, frames, bool(shadows), drawn)

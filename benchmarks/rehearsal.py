@@ -90,8 +90,8 @@ def configuration(source: Path, episodes: int, workers: int) -> Path:
     content["name"] = f"rehearsal_{episodes}"
     content["demos"] |= {"root": str(DEMOS), "per_task": max(1, round(PUBLISHED * share))}
     content["plan"]["episodes"] = {name: max(1, round(n * share)) for name, n in content["plan"]["episodes"].items()}
-    for section, name in (("rlds", "shards"), ("lerobot", "parts")):
-        content["export"][section][name] = max(1, round(content["export"][section][name] * share))
+    for section in ("rlds", "lerobot"):
+        content["export"][section]["shards"] = max(1, round(content["export"][section]["shards"] * share))
     content["compute"] = {"cluster": "local", "workers": workers}
     file = Path("data") / f"rehearsal_{episodes}.yaml"
     file.write_text(yaml.safe_dump(content, sort_keys=False))

@@ -19,8 +19,8 @@ import pipeline  # before NumPy, whose machine code it fixes
 import cv2
 import numpy as np
 
-import pipeline.run.render
-import pipeline.run.replay
+import pipeline.run.render_job
+import pipeline.run.replay_job
 import pipeline.validation.doctor
 import pipeline.validation.validate
 from pipeline import seeding
@@ -96,9 +96,9 @@ def _pattern(name: str) -> Frame:
 def put_in() -> None:
     """Have this process work with the stand-ins."""
     for module, name, stand_in in (
-        (pipeline.run.replay, "shared", lambda task: None),
-        (pipeline.run.replay, "replay", replay),
-        (pipeline.run.render, "render", render),
+        (pipeline.run.replay_job, "shared", lambda task: None),
+        (pipeline.run.replay_job, "replay", replay),
+        (pipeline.run.render_job, "render", render),
         (pipeline.validation.validate, "rendered", lambda *_: ()),
     ):
         setattr(module, name, stand_in)

@@ -26,12 +26,12 @@ os.environ |= {"LP_NUM_THREADS": "1"}
 from episode_slice import sliced
 
 from pipeline import gl
-from pipeline.compute.pool import Run, loop, runner
+from pipeline.compute.pool import Workers, loop, runner
 from pipeline.config import ComputeConfig, load
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.render import render_plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.testset import benchmark
 from pipeline.types import Frame
 
@@ -47,9 +47,9 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         root = Path(temporary)
         trajectories = root / "trajectories"
-        replay_plan(rows, config.demos, config.replay, trajectories, loop)
+        Replays(config.demos, config.replay, trajectories, loop).of(rows)
 
-        def rendered(run: Run, name: str) -> float:
+        def rendered(run: Workers, name: str) -> float:
             start = time.perf_counter()
             render_plan(rows, config, trajectories, root / name, run)
             return time.perf_counter() - start
@@ -69,7 +69,7 @@ def main() -> None:
         for workers in (1, arguments.workers):
             config_of_workers = ComputeConfig(cluster="local", workers=workers)
             # A worker that has cores to spare would draw with as many threads.
-            with patch("dask.system.CPU_COUNT", workers), runner(config_of_workers, root, gl.Shared) as run:
+            with patch("dask.system.CPU_COUNT", workers), runner(config_of_workers, root, gl.WorkerSetup) as run:
                 run(_warm, range(4 * workers), "workers")
                 by_workers[workers] = rendered(run, f"by_{workers}")
     (bare_s, bare_cpu_s), several_s = map(sum, zip(*drawn_s, strict=True)), by_workers[arguments.workers]

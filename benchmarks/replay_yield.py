@@ -32,7 +32,7 @@ from pipeline.evaluation.statistics import wilson
 from pipeline.libero.tasks import SUITES
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 
@@ -73,7 +73,7 @@ def main() -> None:
         runner(ComputeConfig(workers=arguments.workers), Path("data")) as run,
     ):
         store = TrajectoryStore(arguments.folder or Path(temporary))
-        replay_plan(list(rows.values()), demos, REPLAY, store.root, run)
+        Replays(demos, REPLAY, store.root, run).of(list(rows.values()))
         replayed = store.rows()
         lines = _lines(rows.values(), replayed)
         shapes = list(_shapes(rows.values(), replayed, store))

@@ -1,4 +1,4 @@
-"""What a policy sees in LIBERO's and LIBERO-Plus's evaluations, for `python -m pipeline coverage`.
+"""What a policy sees in LIBERO's and LIBERO-Plus's evaluations, for `python -m pipeline analyse coverage`.
 
     nice -n 10 python benchmarks/test_tasks_seen.py > pipeline/testset/seen.json
 

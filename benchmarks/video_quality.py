@@ -27,16 +27,19 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline import seeding
+from pipeline.axes import Axes
 from pipeline.axes.noise import NoiseAxis
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig, DemosConfig, RenderConfig, ReplayConfig
+from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.lerobot_video import Video
 from pipeline.images.jpeg import decode, encode, to_policy
 from pipeline.libero.demonstrations import DemoEntry
+from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.replay import ReplayJob
+from pipeline.run.replay_job import ReplayJob
 from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.testset.benchmark import TestSet
 from pipeline.types import Frame
 
 TASKS = (
@@ -76,8 +79,9 @@ def _shown(entry: DemoEntry, demos: DemosConfig) -> Iterator[tuple[str, list[Fra
     """What is shown to the frames of an episode, as a policy sees them and before they are encoded."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        ReplayJob("measured", entry.demo_id, entry.sha256, "[]", "measured", demos, ReplayConfig(), folder)()
-        trajectory = TrajectoryStore(folder).load("measured")
+        (twin,) = plan.make([entry], PlanConfig(seed=0, axes=Axes(), episodes={}), ReplayConfig(), TestSet(()))
+        ReplayJob(twin, twin.trajectory_id, demos, ReplayConfig(), folder)()
+        trajectory = TrajectoryStore(folder).load(twin.trajectory_id)
     raw: dict[str, list[Frame]] = {view: [] for view in SCHEMA.views}
     renderer = Renderer(trajectory.model_xml)
     for state, alpha in zip(trajectory.states[:-1], trajectory.site_alpha[:-1], strict=True):

@@ -1,18 +1,20 @@
-"""The typed configuration: one file is one complete run, a section per stage, nothing inherited."""
+"""The typed configuration: one file is one run, a section per stage; what it does not say has a default."""
 
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from pipeline.axes import AnyAxis, Axes, axes_of
+from pipeline.axes import AnyAxis, Axes, axes_of, components_of
 from pipeline.axes.base import Frozen
+from pipeline.axes.language import load_bank
 from pipeline.errors import PipelineError
-from pipeline.export_config import Count, ExportConfig, known_to_oft
+from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
 from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import select_tasks
 from pipeline.types import Extra
@@ -22,7 +24,8 @@ class DemosConfig(Frozen):
     """Which demonstrations to start from.
 
     Attributes:
-        source: ``starter`` for the 130 demonstrations that a Python package carries, ``hdf5`` for LIBERO's own files.
+        source: ``starter`` for the 130 demonstrations that a Python package carries, ``hdf5`` for LIBERO's own files;
+            when left out, as ``root`` says.
         root: folder with ``<suite>/<task>_demo.hdf5``; only with ``source: hdf5``.
         tasks: shell-style patterns matched against ``<suite>/<task>``.
         per_task: at most so many demonstrations of each task; all of them when left out.
@@ -32,6 +35,13 @@ class DemosConfig(Frozen):
     root: Path | None = None
     tasks: tuple[str, ...] = ("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*")
     per_task: Count | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _source_of_root(cls, raw: Any) -> Any:
+        if isinstance(raw, Mapping) and raw.get("root") is not None:
+            return {"source": "hdf5", **raw}
+        return raw
 
     @model_validator(mode="after")
     def _root_with_hdf5(self) -> DemosConfig:
@@ -52,16 +62,25 @@ class PlanConfig(Frozen):
 
     Attributes:
         seed: every random draw of the run is keyed by it.
-        axes: the ranges each axis draws from.
+        axes: the ranges each axis draws from; the default ones where an axis of ``episodes`` is not named.
         episodes: how many kept episodes are wanted, spread evenly over the tasks: for an axis of ``axes``, or for
             several that perturb each episode together, joined by + in any order, such as ``camera+light+language``.
         reserve: share of further candidates to draw of each task, rounded up, used in order where an episode fails.
     """
 
-    seed: int = Field(ge=-(2**63), lt=2**63)
-    axes: Axes
+    seed: int = Field(default=0, ge=-(2**63), lt=2**63)
+    axes: Axes = Axes()
     episodes: dict[str, Count]
-    reserve: float = Field(default=0.0, ge=0.0, le=10.0)
+    reserve: float = Field(default=0.5, ge=0.0, le=10.0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _default_ranges(cls, raw: Any) -> Any:
+        axes = raw.get("axes", {}) if isinstance(raw, Mapping) else None
+        if not isinstance(axes, Mapping) or not isinstance(raw.get("episodes"), Mapping):
+            return raw
+        drawn = {axis for name in raw["episodes"] for axis in str(name).split("+") if axis in Axes.model_fields}
+        return {**raw, "axes": {axis: {} for axis in drawn} | dict(axes)}
 
     @field_validator("episodes")
     @classmethod
@@ -110,7 +129,7 @@ class ReplayConfig(Frozen):
             starter demonstrations of the four suites reach their goal open-loop, settled.
     """
 
-    mode: Literal["open_loop", "tracked", "auto"] = "open_loop"
+    mode: Literal["open_loop", "tracked", "auto"] = "auto"
     noops: Literal["drop", "trim_ends", "keep"] = "drop"
     settle_steps: int = Field(default=10, ge=0, le=200)
     fixture_seed: int = Field(default=0, ge=0, lt=2**32)
@@ -118,6 +137,31 @@ class ReplayConfig(Frozen):
 
 def _each_once(extras: tuple[Extra, ...]) -> tuple[Extra, ...]:
     return tuple(sorted(set(extras)))
+
+
+class FilterConfig(Frozen):
+    """Which successful replays are dropped all the same, by the columns of the same names; none by default.
+
+    An episode is dropped, with the column as its reason, where the figure is above the limit, or below it in
+    ``joint_margin_rad``; then reserves take its place. Trajectories stay as they are.
+    """
+
+    non_target_moved_m: float | None = Field(default=None, ge=0.0)
+    non_target_left_m: float | None = Field(default=None, ge=0.0)
+    touched_steps: int | None = Field(default=None, ge=0)
+    path_m: float | None = Field(default=None, gt=0.0)
+    jerk_rms_m_s3: float | None = Field(default=None, gt=0.0)
+    idle_share: float | None = Field(default=None, ge=0.0, le=1.0)
+    joint_margin_rad: float | None = Field(default=None, ge=-1.0, le=3.0)
+    lag_m: float | None = Field(default=None, gt=0.0)
+
+    def fault(self, quality: Mapping[str, Any]) -> str | None:
+        """The first column whose figure is refused."""
+        for name, limit in self.model_dump(exclude_none=True).items():
+            figure = quality[name]
+            if figure < limit if name == "joint_margin_rad" else figure > limit:
+                return name
+        return None
 
 
 class RenderConfig(Frozen):
@@ -174,30 +218,81 @@ class ComputeConfig(Frozen):
 
 
 class Config(Frozen):
-    """A whole run."""
+    """A whole run.
+
+    Attributes:
+        name: of the run, and of its folder.
+        folder: that the folders of runs lie in.
+    """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    demos: DemosConfig
+    # Left out where it says nothing, so that what was finished before there was the field stays what it is.
+    folder: Path = Field(default=Path("data"), exclude_if=lambda folder: folder == Path("data"))
+    demos: DemosConfig = DemosConfig()
     plan: PlanConfig
-    replay: ReplayConfig
-    render: RenderConfig
-    export: ExportConfig
+    replay: ReplayConfig = ReplayConfig()
+    filter: FilterConfig = Field(default=FilterConfig(), exclude_if=lambda limits: limits == FilterConfig())
+    render: RenderConfig = RenderConfig()
+    export: ExportConfig = Field(default=ExportConfig(), validate_default=True)
     compute: ComputeConfig = ComputeConfig()
+
+    @field_validator("demos")
+    @classmethod
+    def _known_tasks(cls, demos: DemosConfig) -> DemosConfig:
+        try:
+            select_tasks(demos.tasks)
+        except PipelineError as error:
+            raise ValueError(f"tasks: {error.what}, expected {error.expected}") from error
+        return demos
 
     @field_validator("export")
     @classmethod
-    def _known_to_oft(cls, export: ExportConfig) -> ExportConfig:
-        if not known_to_oft(export.rlds.name):
+    def _named(cls, export: ExportConfig, info: ValidationInfo) -> ExportConfig:
+        named = export.named(f"libero_{info.data.get('name', '')}")
+        if named.rlds and not known_to_oft(named.rlds.name):
             raise ValueError(
-                f"export.rlds.name {export.rlds.name!r} would be read with another robot's constants and cameras by "
+                f"export.rlds.name {named.rlds.name!r} would be read with another robot's constants and cameras by "
                 "OpenVLA-OFT, which goes by the name; expected a name with libero and without aloha in it"
             )
-        return export
+        return named
+
+    @model_validator(mode="after")
+    def _rewrites_of_every_task(self) -> Config:
+        """LIBERO-90 has none among those that are shipped."""
+        if self.plan.axes.language is None:
+            return self
+        banks = [load_bank(), *([load_bank(bank)] if (bank := self.plan.axes.language.bank) else [])]
+        without = [
+            f"{task.suite}/{task.name}"
+            for task in select_tasks(self.demos.tasks)
+            if not any(one.get(task.suite, {}).get(task.name) for one in banks)
+        ]
+        if without:
+            raise ValueError(
+                f"plan.axes.language: no rewrites of {len(without)} tasks, such as {without[0]}; leave language out, "
+                "leave them out of demos.tasks, or name a bank that has some (the command rewrite makes one)"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _something_where(self) -> Config:
+        if (where := self.export.where) is None:
+            return self
+        axes = {axis for name in self.plan.episodes for axis in axes_of(name)}
+        known = {
+            "axis": {CLEAN, *self.plan.episodes},
+            "component": {CLEAN, *(component for axis in axes for component in components_of(axis))},
+            "suite": {task.suite for task in select_tasks(self.demos.tasks)},
+        }
+        for field, names in known.items():
+            if unknown := [name for name in getattr(where, field) or () if name not in names]:
+                raise ValueError(f"export.where.{field}: the run has no {unknown[0]!r}, expected of {sorted(names)}")
+        return self
 
     @property
     def data(self) -> Path:
         """The folder that everything this run makes lies in."""
-        return Path("data") / self.name
+        return self.folder / self.name
 
 
 def load(path: Path) -> Config:

@@ -136,7 +136,7 @@ class EpisodeSchema(_Model):
     state: StateSpec
     joint_state: VectorSpec
     action: ActionSpec
-    provenance: dict[str, Literal["string", "int64"]]
+    provenance: dict[str, Literal["string", "int64", "float32"]]
 
 
 SCHEMA = EpisodeSchema.model_validate_json(SCHEMA_FILE.read_text())
@@ -187,7 +187,7 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     if set(episode.provenance) != set(SCHEMA.provenance):
         wrong = sorted(set(episode.provenance) ^ set(SCHEMA.provenance))
         raise _fault(episode, "provenance", f"lacks or adds {wrong}", f"exactly {list(SCHEMA.provenance)}")
-    types = {"string": str, "int64": int}
+    types = {"string": str, "int64": int, "float32": float}
     if wrong := sorted(k for k, v in episode.provenance.items() if not isinstance(v, types[SCHEMA.provenance[k]])):
         expected = ", ".join(f"{SCHEMA.provenance[key]} in {key}" for key in wrong)
         raise _fault(episode, "provenance", f"holds something else in {wrong}", expected)

@@ -1,11 +1,12 @@
-"""The configuration's section ``export``: one class and one field for each output format. Light to import."""
+"""The configuration's section ``export``: one class and one field for each output format, and which episodes go in."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import count
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from pipeline.errors import PipelineError
 
@@ -41,6 +42,8 @@ def _of_some(share: float) -> float:
 
 
 Share = Annotated[float, Field(ge=0.0, le=0.5), AfterValidator(_of_some)]
+Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$")]
+"""Of a dataset; empty for ``libero_`` and the name of the run, which ``Config`` puts in its place."""
 
 
 class _Frozen(BaseModel):
@@ -51,13 +54,13 @@ class RldsConfig(_Frozen):
     """How the RLDS sets are written.
 
     Attributes:
-        name: what the sets' names begin with.
-        shards: TFRecord files, over all sets.
+        name: what the sets' names begin with; ``libero_`` and the name of the run when left out.
+        shards: TFRecord files, over all sets; when left out, so many that each has about 400 MB.
         validation: share of each task's demonstrations whose episodes go into the split ``val`` instead of ``train``.
     """
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    shards: Count
+    name: Name = ""
+    shards: Count | None = None
     validation: Share = 0.0
 
 
@@ -65,21 +68,89 @@ class LeRobotConfig(_Frozen):
     """How the LeRobot dataset is written.
 
     Attributes:
-        name: of the dataset.
-        parts: files of each kind, written in parallel, at least; more where one would have more than 200 MB.
+        name: of the dataset; ``libero_`` and the name of the run when left out.
+        shards: files of each kind, at least; more where one would have more than 200 MB.
         frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
         validation: share of each task's demonstrations whose episodes come last, as the split ``val``.
     """
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    parts: Count
+    name: Name = ""
+    # Finished datasets are identified by their options, in which the field has its first name.
+    shards: Count | None = Field(default=None, serialization_alias="parts")
     frames: Literal["video", "images"] = "video"
     validation: Share = 0.0
 
+    @model_validator(mode="before")
+    @classmethod
+    def _first_name(cls, raw: Any) -> Any:
+        if isinstance(raw, Mapping) and "parts" in raw:
+            raise ValueError("parts is called shards now, as in rlds")
+        return raw
+
+
+CLEAN = "clean"
+"""Axis and component of a clean twin in ``where``, as in the manifest; its level is 0."""
+
+
+class Where(_Frozen):
+    """Which of the kept episodes are written: those whose value is listed, for each field that is not left out.
+
+    A clean twin has the axis and the component ``clean`` and the level 0.
+
+    Attributes:
+        axis: names as in ``plan.episodes``.
+        component, level: of an episode of several axes, all have to be listed.
+        suite: LIBERO's.
+    """
+
+    axis: tuple[str, ...] | None = Field(default=None, min_length=1)
+    component: tuple[str, ...] | None = Field(default=None, min_length=1)
+    level: tuple[Annotated[int, Field(ge=0, le=5)], ...] | None = Field(default=None, min_length=1)
+    suite: tuple[str, ...] | None = Field(default=None, min_length=1)
+
+    def takes(self, axis: str, component: str, level: str, suite: str) -> bool:
+        """Whether an episode is written, by its columns of the plan."""
+        return (
+            (self.axis is None or axis in self.axis)
+            and (self.component is None or set(component.split("+")) <= set(self.component))
+            and (self.level is None or set(map(int, level.split("+"))) <= set(self.level))
+            and (self.suite is None or suite in self.suite)
+        )
+
 
 class ExportConfig(_Frozen):
-    rlds: RldsConfig
-    lerobot: LeRobotConfig
+    """The output formats, and which of the kept episodes they get.
+
+    Attributes:
+        rlds, lerobot: null leaves a format out.
+        where: a subset of the kept episodes; all of them when left out.
+    """
+
+    rlds: RldsConfig | None = RldsConfig()
+    lerobot: LeRobotConfig | None = LeRobotConfig()
+    # Left out where it says nothing, so that what was finished before there was the field stays what it is.
+    where: Where | None = Field(default=None, exclude_if=lambda where: where is None)
+
+    @model_validator(mode="after")
+    def _some_format(self) -> ExportConfig:
+        if not self.formats:
+            raise ValueError("no format is left, expected rlds or lerobot or both")
+        return self
+
+    @property
+    def formats(self) -> dict[str, RldsConfig | LeRobotConfig]:
+        """Name to options of each format that is asked for."""
+        return {name: options for name in ("rlds", "lerobot") if (options := getattr(self, name)) is not None}
+
+    @property
+    def name(self) -> str:
+        """What the datasets of a run are called together."""
+        return (self.lerobot or next(iter(self.formats.values()))).name
+
+    def named(self, name: str) -> ExportConfig:
+        """With a name for each dataset that has none."""
+        unnamed = {one: options for one, options in self.formats.items() if not options.name}
+        return self.model_copy(update={one: o.model_copy(update={"name": name}) for one, o in unnamed.items()})
 
     def refuse_too_few(self, demonstrations: int) -> None:
         """Refuse a validation split that nothing could be in.
@@ -90,7 +161,6 @@ class ExportConfig(_Frozen):
         Raises:
             PipelineError: when a share holds none of them out.
         """
-        for name in ExportConfig.model_fields:
-            share: float = getattr(self, name).validation
-            if share and not held_out(share, demonstrations):
-                raise too_few(share, f"export.{name}.validation")
+        for name, options in self.formats.items():
+            if options.validation and not held_out(options.validation, demonstrations):
+                raise too_few(options.validation, f"export.{name}.validation")

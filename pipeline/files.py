@@ -140,16 +140,11 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def keep_only(folder: Path, names: set[str]) -> None:
-    """Delete what ``folder`` holds beside ``names``: shards of an earlier plan, temporaries of a killed run."""
-    if folder.is_dir():
-        for entry in folder.iterdir():
-            if entry.name not in names:
-                remove(entry)
-
-
 def keep_below(folder: Path, files: set[Path]) -> None:
-    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one."""
+    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one.
+
+    Such as shards of an earlier plan, and temporaries of a killed run.
+    """
     if not folder.is_dir():
         return
     on_the_way = {parent for file in files for parent in file.parents}

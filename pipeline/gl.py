@@ -33,13 +33,13 @@ class GlChoice:
         backend: ``egl`` or ``osmesa``.
         device: the renderer and its driver, as OpenGL names them.
         reason: why this one.
-        asked: whether ``MUJOCO_EGL_DEVICE_ID`` named the device, so that no other may be used.
+        device_named: whether ``MUJOCO_EGL_DEVICE_ID`` named the device, so that no other may be used.
     """
 
     backend: str
     device: str
     reason: str
-    asked: bool = False
+    device_named: bool = False
 
     @property
     def software(self) -> bool:
@@ -58,7 +58,7 @@ def choose() -> GlChoice:
     """Try what is there in short subprocesses (0.7 s each), set the environment, return the choice for printing.
 
     ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set. A worker of this machine takes over
-    what the run's own process chose (``Shared``).
+    what the run's own process chose (``WorkerSetup``).
 
     Raises:
         PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does.
@@ -66,7 +66,7 @@ def choose() -> GlChoice:
     if _of_the_run is not None:
         return _of_the_run
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
-    device_asked = "MUJOCO_EGL_DEVICE_ID" in os.environ
+    device_named = "MUJOCO_EGL_DEVICE_ID" in os.environ
     faults = {}
     for backend in BACKENDS:
         if asked not in ("", backend):
@@ -80,7 +80,7 @@ def choose() -> GlChoice:
         if index is not None:
             os.environ["MUJOCO_EGL_DEVICE_ID"] = index
         reason = "MUJOCO_GL asks for it" if asked else _reason(backend, device, faults)
-        return GlChoice(backend, device, reason, device_asked)
+        return GlChoice(backend, device, reason, device_named)
 
     what = "; ".join(f"{backend} fails: {fault}" for backend, fault in faults.items())
     if not asked:
@@ -103,7 +103,7 @@ def gpus() -> tuple[str, ...]:
         PipelineError: when nothing renders here, as in ``choose``.
     """
     choice = choose()
-    if choice.software or choice.asked or choice.backend != "egl":
+    if choice.software or choice.device_named or choice.backend != "egl":
         return ()
     visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
     if visible and not visible[0].isdigit():
@@ -120,7 +120,7 @@ def gpus() -> tuple[str, ...]:
     return tuple(found)
 
 
-class Shared:
+class WorkerSetup:
     """What renders here, for worker processes of this machine: they need not try it again.
 
     Raises:

@@ -23,7 +23,7 @@ SEAL = b"sha256"
 """The table's metadata that has the checksum of its values."""
 
 
-_TYPES = {str: pa.string(), int: pa.int64(), bool: pa.bool_()}
+_TYPES = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
 
 
 def column(name: str, values: pa.DataType, meaning: str) -> pa.Field:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,6 +133,23 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class Quality:
+    """How well a trajectory was moved (``physics/quality.py``): columns of the manifest, with what they mean.
+
+    Another object is one that the goal does not name, and that stands on or in nothing that the goal moves.
+    """
+
+    non_target_moved_m: Annotated[float, "largest displacement of another object at any step, from the first look"]
+    non_target_left_m: Annotated[float, "largest displacement of another object after the last step"]
+    touched_steps: Annotated[int, "steps after which the robot touches something else than the things of the goal"]
+    path_m: Annotated[float, "length of the end effector's path"]
+    jerk_rms_m_s3: Annotated[float, "root mean square of the end effector's jerk, by third differences at 20 Hz"]
+    idle_share: Annotated[float, "share of steps in which hand and fingers move less than 0.5 mm and 0.25 degrees"]
+    joint_margin_rad: Annotated[float, "smallest distance of a joint of the arm to its limit"]
+    lag_m: Annotated[float, "largest distance between where an action asks the hand to be and where the step takes it"]
+
+
+@dataclass(frozen=True)
 class Trajectory:
     """What physics did: no pixels.
 
@@ -144,6 +161,7 @@ class Trajectory:
         actions: (K, 7) executed actions.
         site_alpha: (K+1, nsite) opacity of the model's sites; LIBERO shows a lit burner through one.
         verdict: the judge's word after the last action.
+        quality: how well it was moved; None where nothing was executed, or nobody measured.
     """
 
     trajectory_id: str
@@ -153,6 +171,7 @@ class Trajectory:
     actions: Floats
     site_alpha: NDArray[np.float32]
     verdict: Verdict
+    quality: Quality | None = None
 
     @property
     def model_xml(self) -> str:
@@ -191,6 +210,7 @@ class Rendered:
         geometry: id of a stream's geometry to what it is.
         object_poses: (K, 24, 7), None where they were not asked for.
         instances: names of the things that segmentation and poses number; none without those.
+        quality: the trajectory's.
     """
 
     replay_mode: str
@@ -202,6 +222,7 @@ class Rendered:
     geometry: Mapping[str, Geometry] = field(default_factory=dict)
     object_poses: NDArray[np.float32] | None = None
     instances: Sequence[str] = ()
+    quality: Quality | None = None
 
 
 @dataclass(frozen=True)
@@ -227,7 +248,7 @@ class Episode:
     joint_state: NDArray[np.float32]
     action: NDArray[np.float32]
     instruction: str
-    provenance: Mapping[str, str | int]
+    provenance: Mapping[str, str | int | float]
     geometry: Mapping[str, Geometry]
     object_poses: NDArray[np.float32] | None = None
     instances: Sequence[str] = ()

@@ -7,7 +7,7 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    card.write(config.data, formats_of(config.data, config.export, config.render.extras), config.export.lerobot.name)
+    card.write(config.data, formats_of(config.data, config.export, config.render.extras), config.export.name)
     print(f"{config.data / 'card'} has a README.md for each format; `python -m pipeline push` uploads it with the data")
 
 

@@ -24,7 +24,7 @@ def run(config: Config) -> None:
             remedy="do what such lines say at their end, and run again",
         )
     if not tried:
-        machine.record(config.data, doctor.trial())
+        machine.record(config.data, machine.trial())
         finished.of_doctor(config, gl.choose().device).keep()
 
 

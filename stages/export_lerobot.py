@@ -7,7 +7,7 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    export_run(LeRobot(config.data, config.export.lerobot, config.render.extras), config)
+    export_run(LeRobot, config)
 
 
 if __name__ == "__main__":

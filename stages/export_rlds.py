@@ -7,7 +7,7 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    export_run(Rlds(config.data, config.export.rlds, config.render.extras), config)
+    export_run(Rlds, config)
 
 
 if __name__ == "__main__":

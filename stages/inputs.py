@@ -1,6 +1,10 @@
-"""Stage inputs: list the user's own files, and look whether stored ones are gone or changed, so that DVC notices."""
+"""Stage inputs: write out the configuration, list the user's own files, and look whether stored ones have changed.
+
+So DVC notices what it cannot see itself.
+"""
 
 from pipeline.config import Config
+from pipeline.files import write_json
 from pipeline.formats.registry import formats_of
 from pipeline.run import export, inputs
 from pipeline.run.stage import main
@@ -9,11 +13,12 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def run(config: Config) -> None:
-    inputs.write(inputs.listing(config), config.data / "inputs.json")
-    TrajectoryStore(config.data / "trajectories").settle()
-    FrameStore(config.data / "frames", config.render).settle()
+    write_json(config.data / "settings.json", inputs.settings(config))
+    write_json(config.data / "inputs.json", inputs.listing(config))
+    TrajectoryStore(config.data / "trajectories").notice_changes()
+    FrameStore(config.data / "frames", config.render).notice_changes()
     for one in formats_of(config.data, config.export, config.render.extras):
-        export.settle(one)
+        export.notice_changes(one)
 
 
 if __name__ == "__main__":

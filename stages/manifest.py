@@ -4,7 +4,7 @@ from pipeline.config import Config
 from pipeline.files import write_json
 from pipeline.formats import motion_statistics, registry
 from pipeline.formats.rlds_layout import by_suite
-from pipeline.run import manifest, outcome
+from pipeline.run import counts, manifest, outcome
 from pipeline.run.stage import main
 from pipeline.stores.frame_store import FrameStore
 
@@ -19,18 +19,16 @@ def run(config: Config) -> None:
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 
-    rows = {row.episode_id: row for row in episodes.rows}
-    frames = FrameStore(data / "frames", config.render)
-    motions = {
-        name: frames.motion(name) for name in dict.fromkeys(rows[episode].trajectory_id for episode in episodes.kept)
-    }
-    sets = by_suite(episodes.kept, {episode: row.suite for episode, row in rows.items()}, config.export.rlds.name)
+    frames, row_of = FrameStore(data / "frames", config.render), episodes.row_of
+    motions = {name: frames.motion(name) for name in {row_of[episode].trajectory_id for episode in episodes.kept}}
+    suites = {episode: row.suite for episode, row in row_of.items()}
+    name = (config.export.rlds or config.export).name
     figures = {
-        name: motion_statistics.openvla([motions[rows[episode].trajectory_id] for episode in members])
-        for name, members in sets.items()
+        name: motion_statistics.openvla([motions[row_of[episode].trajectory_id] for episode in members])
+        for name, members in by_suite(episodes.kept, suites, name).items()
     }
     write_json(data / "dataset_statistics.json", figures)
-    write_json(data / "counts.json", manifest.counts(table.to_pylist()))
+    write_json(data / "counts.json", counts.by_axis_and_suite(table.to_pylist()))
 
 
 if __name__ == "__main__":

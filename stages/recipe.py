@@ -7,10 +7,11 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    file, name = config.data / "manifest.parquet", config.export.lerobot.name
-    recipe = build(file, manifest.read(file), name=config.export.rlds.name, lerobot=name)
-    folder = config.data / "finetune"
-    write(recipe, config.data / "lerobot" / name, folder)
+    file, folder = config.data / "manifest.parquet", config.data / "finetune"
+    rlds, lerobot = config.export.rlds, config.export.lerobot
+    names = {"name": rlds.name if rlds else None, "lerobot": lerobot.name if lerobot else None}
+    recipe = build(file, manifest.read(file), **names)
+    write(recipe, config.data / "lerobot" / lerobot.name if lerobot else None, folder)
     print(f"{folder / 'finetune.yaml'} has the recipe and a command line for each of {', '.join(recipe['clients'])}")
 
 

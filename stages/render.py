@@ -1,6 +1,6 @@
 """Stage render: make the frames of every kept episode from the stored states. Resumes where it was stopped.
 
-Where frames are refused, it replays the reserves that take their place, as the stage replay does.
+Where frames are rejected, it replays the reserves that take their place, as the stage replay does.
 """
 
 from pipeline import gl
@@ -11,8 +11,8 @@ from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
 from pipeline.run.outcome import rejections
 from pipeline.run.remake import outdated
-from pipeline.run.render import render_plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.run.stage import main
 from pipeline.stores.frame_store import FrameStore, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -27,16 +27,18 @@ def run(config: Config) -> None:
     replayed = int(read_json(config.data / "replay.json")["replayed"])
     trajectories = TrajectoryStore(config.data / "trajectories")
     frames = FrameStore(config.data / "frames", config.render)
-    with runner(config.compute, config.data, gl.Shared) as workers:
+    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
         rejected: dict[str, str] | None = None
-        while (refused := rejections(rows, shown_of(frames.rows()))) != rejected:
-            rejected = refused
-            verdicts = replay_plan(rows, config.demos, config.replay, trajectories.root, workers, rejected)
+        while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
+            rejected = known
+            verdicts = Replays(config.demos, config.replay, trajectories.root, workers, config.filter).of(
+                rows, rejected
+            )
             rendered = render_plan(rows, config, trajectories.root, frames.root, workers)
             frames.keep(rendered)
     trajectories.keep(verdicts)
     if further := len(verdicts) - replayed:
-        print(f"replayed {further} reserves, as frames before them were refused")
+        print(f"replayed {further} reserves, as frames before them were rejected")
     print(f"{len(rendered)} files of frames are in {frames.root}")
 
 

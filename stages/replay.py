@@ -6,7 +6,7 @@ from pipeline.files import write_json
 from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
 from pipeline.run.remake import outdated
-from pipeline.run.replay import replay_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.run.stage import main
 from pipeline.stores.trajectory_store import TrajectoryStore
 
@@ -16,8 +16,8 @@ def run(config: Config) -> None:
     refuse_unasked(outdated(rows, config), config.data)
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:
-        verdicts = replay_plan(rows, config.demos, config.replay, folder, workers)
-    # Of the reserves, those too that the stage render replayed because frames were refused.
+        verdicts = Replays(config.demos, config.replay, folder, workers, config.filter).of(rows)
+    # Of the reserves, those too that the stage render replayed because frames were rejected.
     TrajectoryStore(folder).keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
     write_json(config.data / "replay.json", {"replayed": len(verdicts), "kept": kept})

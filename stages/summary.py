@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from pipeline.config import Config
-from pipeline.run import finished, manifest
+from pipeline.run import counts, finished, manifest
 from pipeline.run.stage import main
 
 
@@ -16,19 +16,7 @@ def run(config: Config) -> None:
         memory.keep()
     from rich.console import Console
 
-    console = Console()
-    console.print(manifest.counts_table(rows))
-    sheets, previews = sorted((config.data / "sheets").iterdir()), sorted((config.data / "previews").iterdir())
-    made = {
-        "RLDS": config.data / "rlds",
-        "LeRobot": config.data / "lerobot" / config.export.lerobot.name,
-        "manifest": config.data / "manifest.parquet",
-        **{f"{file.stem} sheet": file for file in sheets},
-        **{f"{folder.name} previews": folder for folder in previews},
-    }
-    width = max(map(len, made))
-    for name, path in made.items():
-        console.print(f"{name:>{width}}  {path}", soft_wrap=True, highlight=False)
+    Console().print(counts.shown(rows))
 
 
 def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
@@ -37,9 +25,9 @@ def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
     from pipeline.report import preview, sheets
     from pipeline.run.episode_loader import EpisodeLoader
 
-    load = EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render)
+    load = EpisodeLoader(config.data, config.render)
     sheets.draw(rows, load, config.data / "sheets")
-    with runner(config.compute, config.data, gl.Shared) as workers:
+    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
         preview.for_run(config, config.data / "previews", workers)
 
 

@@ -18,7 +18,7 @@ def run(config: Config) -> None:
     from pipeline.compute.pool import runner
     from pipeline.validation.validate import validate
 
-    with runner(config.compute, config.data, gl.Shared) as workers:
+    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
         report = validate(config, workers)
     write_json(file, report)
     off = {check: found["findings"] for check, found in report.items() if found["findings"]}

@@ -187,7 +187,7 @@ def tiny_config(demos: Path) -> dict[str, Any]:
         # Their last second begins with the gripper closed, which settling would open.
         "replay": {"mode": "open_loop", "settle_steps": 0},
         "render": {"jpeg_quality": 95},
-        "export": {"rlds": {"name": "libero_tiny", "shards": 2}, "lerobot": {"name": "tiny", "parts": 2}},
+        "export": {"rlds": {"name": "libero_tiny", "shards": 2}, "lerobot": {"name": "tiny", "shards": 2}},
         "compute": {"cluster": "loop"},
     }
 
@@ -297,7 +297,7 @@ def in_a_clone(config: dict[str, object], clone: Path) -> None:
         copy_of(name, REPOSITORY, clone)
     (clone / "configs").mkdir()
     (clone / "configs" / "tiny.yaml").write_text(yaml.safe_dump(config))
-    (clone / "params.yaml").write_text("run: tiny\n")
+    (clone / "params.yaml").write_text("run: tiny\ndata: data\n")
     shutil.copytree(REPOSITORY / ".dvc", clone / ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
     link_testset(clone)
     subprocess.run(["git", "init", "--quiet"], cwd=clone, check=True)

@@ -43,7 +43,7 @@ STARTER: dict[str, object] = {
     "plan": {"seed": 7, "axes": {"light": {}, "robot": {}}, "episodes": {"light": 1, "robot": 1}},
     "replay": {"mode": "auto", "settle_steps": 0},
     "render": {"jpeg_quality": 95},
-    "export": {"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "parts": 3}},
+    "export": {"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 3}},
     "compute": {"cluster": "local", "workers": 2},
 }
 

@@ -65,8 +65,11 @@ def episode(episode_id: str) -> Episode:
         joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
         action=action,
         instruction=["put the bowl on the plate", "öffne die obere Schublade"][int(rng.integers(2))],
-        provenance={column: f"{column} of {episode_id}" for column in SCHEMA.provenance}
-        | {"episode_id": episode_id, "seed": 7},
+        provenance={
+            column: dict[str, Any](string=f"{column} of {episode_id}", int64=7, float32=0.5)[dtype]
+            for column, dtype in SCHEMA.provenance.items()
+        }
+        | {"episode_id": episode_id},
         geometry={view: Geometry(matrix(3), matrix(4)) for view in SCHEMA.views},
     )
 
@@ -124,7 +127,7 @@ def write_lerobot(
     name: str = NAME,
     extras: Sequence[Extra] = (),
 ) -> LeRobot:
-    target = LeRobot(out, LeRobotConfig(name=name, parts=3, frames=frames), extras)
+    target = LeRobot(out, LeRobotConfig(name=name, shards=3, frames=frames), extras)
     export(target, episodes(load), run)
     return target
 

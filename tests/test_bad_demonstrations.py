@@ -21,7 +21,7 @@ from pipeline.libero import hdf5
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError
 from pipeline.planning import plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Scene, Verdict
@@ -118,7 +118,7 @@ def test_each_bad_demonstration_is_a_verdict(
     wanted = PlanConfig(seed=0, axes=axes, episodes={"layout": count})
     rows = plan.make(index.entries, wanted, REPLAY, TestSet(()))
     folder = tmp_path / "trajectories"
-    verdicts = replay_plan(rows, demos, REPLAY, folder, loop)
+    verdicts = Replays(demos, REPLAY, folder, loop).of(rows)
     log, store = capfd.readouterr().err, TrajectoryStore(folder)
     reasons = dict(zip([f"{NAME}/demo_{n}" for n in range(1, count - 1)], BAD.values(), strict=True))
     for row in rows:
@@ -134,7 +134,7 @@ def test_each_bad_demonstration_is_a_verdict(
             assert len(stored.actions) == 0
             assert detail in json.loads(stored.resolved)["fault"]
             assert re.search(rf"{row.demo_id}\b.*{detail}", log), row.demo_id
-    assert replay_plan(rows, demos, REPLAY, folder, nothing_left) == verdicts
+    assert Replays(demos, REPLAY, folder, nothing_left).of(rows) == verdicts
     assert all(not verdict.kept for verdict in plan.select(rows, verdicts).values())
 
 

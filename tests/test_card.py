@@ -110,7 +110,7 @@ def write_rows(data: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def write(data: Path) -> None:
-    options = ExportConfig(rlds=RldsConfig(name=NAME, shards=1), lerobot=LeRobotConfig(name=NAME, parts=1))
+    options = ExportConfig(rlds=RldsConfig(name=NAME, shards=1), lerobot=LeRobotConfig(name=NAME, shards=1))
     card.write(data, formats_of(data, options), NAME)
 
 

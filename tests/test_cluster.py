@@ -20,14 +20,20 @@ from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 from PIL import Image
 
 from pipeline import gl
+from pipeline.axes import Axes
 from pipeline.compute.cluster import Workplace
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig, RenderConfig
+from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.machine_code import SETTINGS
-from pipeline.run.render import RenderJob
+from pipeline.planning import plan
+from pipeline.run.render_job import RenderJob
+from pipeline.testset.benchmark import TestSet
 
 Start = Callable[..., str]
+
+CLEAN, NONE = PlanConfig(seed=0, axes=Axes(), episodes={}), TestSet(())
+"""A plan of twins alone, for which no test tasks matter."""
 
 
 @pytest.fixture
@@ -136,8 +142,8 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     address = cluster((1, {}), (1, {"PYTHONPATH": str(edited)}), (2, {}), (1, other))
     # Every process has its own folder at this path.
     folder = Path("/proc/self/cwd") / "data"
-    with pytest.raises(PipelineError) as caught, runner(ComputeConfig(cluster=address), folder):
-        pass
+    with pytest.raises(PipelineError) as caught, runner(ComputeConfig(cluster=address), folder) as work:
+        work(str, [0], "none")
     message = str(caught.value)
     assert "4 of 4 workers" in message
     assert f"does not see {folder}" in message
@@ -153,9 +159,9 @@ def test_workers_that_cannot_work_for_the_run_are_refused_before_they_start(clus
     # As a worker finds out that joins when the work is under way.
     with (
         Client(address) as client,
-        pytest.raises(PipelineError, match=r"does not see .* other packages, code or machine code"),
+        pytest.raises(PipelineError, match=r"does not see .* has Python 3\.\d+\.\d+, the run has 2"),
     ):
-        client.submit(Workplace(Path.cwd(), folder / "token", "another setup").enter).result()
+        client.submit(Workplace(Path.cwd(), folder / "token", {"Python": "2"}).enter).result()
 
 
 @pytest.mark.slow
@@ -163,7 +169,8 @@ def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path)
     # The device's name tells the width of its vectors.
     address = cluster((1, {"MUJOCO_GL": "osmesa", "LP_NATIVE_VECTOR_WIDTH": "128"}))
     device = gl.choose().device
-    job = RenderJob("0123", STOVE, (), 1, tmp_path / "trajectories", tmp_path / "frames", RenderConfig(), device)
+    (row,) = plan.make(DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",)).index().entries, CLEAN, ReplayConfig(), NONE)
+    job = RenderJob(row, (), tmp_path / "trajectories", tmp_path / "frames", RenderConfig(), device)
     with (
         runner(ComputeConfig(cluster=address), tmp_path / "data") as work,
         pytest.raises(PipelineError, match="this worker renders with") as caught,

@@ -88,7 +88,7 @@ def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(
     # None that is there: a worker that tried what renders would find another.
     monkeypatch.setattr(gl, "choose", lambda: gl.GlChoice("egl", "two GPUs", "a test"))
     monkeypatch.setattr(gl, "gpus", lambda: ("0", "2"))
-    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, gl.Shared) as run:
+    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, gl.WorkerSetup) as run:
         found = sorted((device, index or "") for _, device, index in set(run(gpu, range(30), "GPUs")))
         assert found == [("two GPUs", "0"), ("two GPUs", "0"), ("two GPUs", "2")]
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
@@ -209,9 +209,14 @@ def test_no_scheduler_answers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     with (
         dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
         pytest.raises(PipelineError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"),
-        runner(ComputeConfig(cluster="tcp://127.0.0.1:9"), tmp_path),
+        runner(ComputeConfig(cluster="tcp://127.0.0.1:9"), tmp_path) as run,
     ):
-        pass
+        run(str, [1], "work")
+
+
+def test_without_work_nothing_is_started(tmp_path: Path) -> None:
+    with runner(ComputeConfig(cluster="tcp://127.0.0.1:9"), tmp_path) as run:
+        assert run(str, [], "nothing") == []
 
 
 @pytest.mark.slow

@@ -27,14 +27,14 @@ from pipeline.types import Extra
 from pipeline.validation import doctor
 from pipeline.validation.disk import needed_mb
 
-REAL_TRIAL = doctor.trial
+REAL_TRIAL = machine.trial
 
 
 @pytest.fixture(autouse=True)
 def trial(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """A trial that takes no time; the real one is run on its own."""
     result = {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"}
-    monkeypatch.setattr(doctor, "trial", lambda: result)
+    monkeypatch.setattr(machine, "trial", lambda: result)
     return result
 
 
@@ -68,7 +68,7 @@ def test_disk_is_asked_for_as_the_configuration_needs_it(
     assert "fail  disk" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("name", "gb"), [("full", 440), ("paper", 350)])
+@pytest.mark.parametrize(("name", "gb"), [("full", 440), ("paper", 350), ("small", 30)])
 def test_the_room_that_configurations_name_is_what_doctor_asks_for(name: str, gb: int) -> None:
     file = REPOSITORY / "configs" / f"{name}.yaml"
     assert f"room for about {gb} GB" in file.read_text()
@@ -81,7 +81,7 @@ def needed(episodes: dict[str, int], extras: tuple[Extra, ...] = (), frames: str
         "demos": {"tasks": [f"{BOWL.suite}/{BOWL.name}"]},
         "plan": {"seed": 3, "axes": {name: {} for name in episodes}, "episodes": episodes, "reserve": 0.5},
         "render": {"extras": extras},
-        "export": {"rlds": {"name": "libero_m", "shards": 2}, "lerobot": {"name": "m", "parts": 2, "frames": frames}},
+        "export": {"rlds": {"name": "libero_m", "shards": 2}, "lerobot": {"name": "m", "shards": 2, "frames": frames}},
     }
     return needed_mb(Config.model_validate(fields))
 
@@ -117,7 +117,7 @@ def test_the_twins_of_all_demonstrations_take_room() -> None:
     """Also where fewer episodes are wanted than there are demonstrations."""
     config = load(REPOSITORY / "configs" / "starter.yaml")
     many = config.demos.model_copy(update={"tasks": ("libero_goal/*", "libero_10/*")})
-    one = PlanConfig.model_validate({"seed": 1, "axes": {"noise": {}}, "episodes": {"noise": 1}})
+    one = PlanConfig.model_validate({"episodes": {"noise": 1}, "reserve": 0.0})
     rows = plan.make(many.index().entries, one, config.replay, TestSet(()))
     steps = sum(row.demo_steps for row in rows)
     assert (len(rows), steps > 4000) == (21, True)
@@ -158,7 +158,7 @@ def test_the_configuration_that_params_name_is_looked_at(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "params.yaml").write_text("run: full\n")
+    (tmp_path / "params.yaml").write_text("run: full\ndata: data\n")
     (tmp_path / "configs").symlink_to(REPOSITORY / "configs")
     monkeypatch.setattr(sys, "argv", ["pipeline", "doctor"])
     assert command_line.main() == 1

@@ -96,7 +96,7 @@ def small_experiment(folder: Path, demos: Path) -> Path:
     run["plan"] = {"seed": 7, "axes": {"noise": {}}, "episodes": {"noise": 1}}
     run["export"] = {
         "rlds": {"name": "libero_tiny", "shards": 1},
-        "lerobot": {"name": "tiny", "parts": 1, "frames": "images"},
+        "lerobot": {"name": "tiny", "shards": 1, "frames": "images"},
     }
     (folder / "data.yaml").write_text(yaml.safe_dump(run))
     experiment = {

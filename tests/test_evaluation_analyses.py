@@ -200,13 +200,16 @@ def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFix
     for task in tasks:
         recorded = json.loads(to_json([draw(task, 0)]))
         EpisodeFiles(tmp_path).save({**result(task, False), "perturbations": recorded})
-    file = tmp_path / "plan.parquet"
+    config = tmp_path / "mine.yaml"
+    config.write_text(f"name: mine\nfolder: {tmp_path}\nplan:\n  episodes: {{robot: 1}}\n")
+    file = tmp_path / "mine" / "plan.parquet"
+    file.parent.mkdir()
     plan.write([planned_row(tasks[0], draw(tasks[0], 0))], file)
-    assert analyse("leakage", str(tmp_path), "--plan", str(file)) == 1
+    assert analyse("leakage", str(tmp_path), str(config)) == 1
     printed = json.loads(capsys.readouterr().out)
     assert (printed["robot"]["overlaps"], printed["light"]["overlaps"]) == (1, 0)
     plan.write([planned_row(tasks[0], draw(tasks[0], 1))], file)
-    assert analyse("leakage", str(tmp_path), "--plan", str(file)) == 0
+    assert analyse("leakage", str(tmp_path), str(config)) == 0
 
 
 def test_language_has_no_held_out_draws_and_says_what_else_there_is() -> None:

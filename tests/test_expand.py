@@ -18,7 +18,7 @@ from pipeline.libero.assets import libero_assets
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
-from pipeline.run.expand import APART_RAD, Expansion, expand
+from pipeline.run.expand import APART_RAD, Expansion, candidates, expand
 from pipeline.testset import benchmark
 
 TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
@@ -28,7 +28,8 @@ TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
 def expanded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Expansion]:
     folder = tmp_path_factory.mktemp("expanded")
     link_testset(folder)
-    return folder / "demos", expand(folder / "demos", TASKS, 2, 1, benchmark.load(folder / benchmark.FOLDER), loop)
+    rows = candidates(TASKS, 2, 1, benchmark.load(folder / benchmark.FOLDER))
+    return folder / "demos", expand(folder / "demos", TASKS, rows, 2, loop)
 
 
 def test_as_many_as_asked_for_in_liberos_layout(expanded: tuple[Path, Expansion]) -> None:
@@ -57,7 +58,8 @@ def test_a_second_time_nothing_is_replayed_and_the_bytes_are_the_same(expanded: 
     root, made = expanded
     before = made.files[0].read_bytes()
     replays = {file: file.stat().st_mtime_ns for file in (root / ".replays").iterdir()}
-    again = expand(root, TASKS, 2, 1, benchmark.load(root.parent / benchmark.FOLDER), loop)
+    rows = candidates(TASKS, 2, 1, benchmark.load(root.parent / benchmark.FOLDER))
+    again = expand(root, TASKS, rows, 2, loop)
     assert again.written == 2
     assert made.files[0].read_bytes() == before
     assert {file: file.stat().st_mtime_ns for file in (root / ".replays").iterdir()} == replays

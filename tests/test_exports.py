@@ -32,7 +32,7 @@ KILLED = [
 def target(name: str, data: Path) -> Format[Any]:
     if name == "rlds":
         return Rlds(data, RldsConfig(name="synthetic", shards=PIECES))
-    return LeRobot(data, LeRobotConfig(name="synthetic", parts=PIECES))
+    return LeRobot(data, LeRobotConfig(name="synthetic", shards=PIECES))
 
 
 def kill() -> None:

@@ -89,10 +89,10 @@ def test_a_dataset_with_a_lost_or_changed_file_counts_as_not_there(config: Confi
         name = max(content, key=lambda name: len(content[name]))
         # As in a copy that has the time of the copying.
         (one.folder / name).write_bytes(content[name])
-        export.settle(one)
+        export.notice_changes(one)
         assert export.untouched(one)
         (one.folder / name).write_bytes(content[name][:-1])
-        export.settle(one)
+        export.notice_changes(one)
         assert not one.record_file.exists()
 
 

@@ -36,8 +36,8 @@ from pipeline.rendering.render import render
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import export
-from pipeline.run.render import render_plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Extra, Rendered, Task, Trajectory
@@ -157,11 +157,11 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     config, data = Config.model_validate(fields), tmp_path_factory.mktemp("run")
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
     plan.write(rows, data / "plan.parquet")
-    judged = replay_plan(rows, config.demos, config.replay, data / "trajectories", loop)
+    judged = Replays(config.demos, config.replay, data / "trajectories", loop).of(rows)
     render_plan(rows, config, data / "trajectories", data / "frames", loop)
     outcome = plan.select(rows, judged)
     kept = [row for row in rows if outcome[row.episode_id].kept]
-    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    load = EpisodeLoader(data, config.render)
     known = {
         row.episode_id: Known(row.suite, "", row.demo_id, row.instruction, len(load(row.episode_id))) for row in kept
     }
@@ -174,7 +174,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def cases(data: Path) -> list[Case]:
     """Every episode, as the store and both datasets have it."""
     config = Config.model_validate_json((data / "config.json").read_text())
-    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
+    load = EpisodeLoader(data, config.render)
     rows = {row.episode_id: vars(row) for row in plan.read(data / "plan.parquet")}
     formats = formats_of(data, config.export, config.render.extras)
     places: dict[str, dict[str, Any]] = {}

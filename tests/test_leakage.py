@@ -30,7 +30,7 @@ from pipeline.errors import PipelineError
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
-from pipeline.planning.plan import Row, draws_of
+from pipeline.planning.plan import Draws, Row
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Task
@@ -130,7 +130,7 @@ def test_scenes_are_drawn_clear_of_every_test_scene_and_cover_them_all(test: Tes
     axis, rows = PoseAxis(components=("scene",)), []
     for suite in SUITES[:4]:
         for task in tasks(suite):
-            draws = islice(draws_of("pose", (axis,), task.name, task, 5, test), 20)
+            draws = islice(Draws("pose", (axis,), 5, test).of(task.name, task), 20)
             rows += [row(task, drawn, f"{task.name}{number}") for number, drawn in enumerate(draws)]
     finding = leakage.check(rows, test)["pose"]
     assert (finding.rows, finding.overlaps, finding.verdict) == (800, 0, "disjoint")

@@ -52,7 +52,11 @@ def episode(name: str) -> Episode:
         joint_state=rng.normal(size=(steps, 7)).astype(np.float32),
         action=action,
         instruction=f"Put the bowl {name} on the plate",
-        provenance=dict.fromkeys(SCHEMA.provenance, "") | {"episode_id": name, "seed": 0},
+        provenance={
+            column: dict[str, Any](string="", int64=0, float32=0.0)[dtype]
+            for column, dtype in SCHEMA.provenance.items()
+        }
+        | {"episode_id": name},
         geometry={view: Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32)) for view in SCHEMA.views},
     )
 

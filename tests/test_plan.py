@@ -169,7 +169,7 @@ def test_a_demonstration_that_has_no_more_draws_leaves_the_places_to_the_others(
     drawn = {
         demo.demo_id: {
             to_json(draw)
-            for draw in plan.draws_of("background", (few,), demo.demo_id, demo.task, wanted.seed, NO_TESTS)
+            for draw in plan.Draws("background", (few,), wanted.seed, NO_TESTS).of(demo.demo_id, demo.task)
         }
         for demo in demos
     }

@@ -30,6 +30,7 @@ from pipeline.catalogue.scene_files import located, portable
 from pipeline.catalogue.sources import Folder
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.files import write_json
 from pipeline.formats.tfrecord import framed
 from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.planning import plan
@@ -119,7 +120,7 @@ def test_a_plan_from_the_user_s_folders_does_not_tell_where_they_lie(own: tuple[
     rows = plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
     assert {row.axis for row in rows} == {"clean", "background", "layout"}
     plan.write(rows, Path("plan.parquet"))
-    inputs.write(inputs.listing(config), Path("inputs.json"))
+    write_json(Path("inputs.json"), inputs.listing(config))
     assert told(Path("plan.parquet")) | told(Path("inputs.json")) == set()
     assert sorted(json.loads(Path("inputs.json").read_text())) == [
         "plan.axes.background.sources.0.folder/wall of ours.png",

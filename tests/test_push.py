@@ -37,7 +37,7 @@ LARGE = (".parquet", ".mp4", ".png")
 
 
 def prepare(data: Path, kind: str) -> Upload:
-    options = ExportConfig(rlds=RldsConfig(name="synthetic", shards=3), lerobot=LeRobotConfig(name=NAME, parts=3))
+    options = ExportConfig(rlds=RldsConfig(name="synthetic", shards=3), lerobot=LeRobotConfig(name=NAME, shards=3))
     return push.prepare(next(target for target in formats_of(data, options) if target.name == kind))
 
 

@@ -18,7 +18,7 @@ from conftest import BOWL, MILK, STOVE
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.axes import PhysicsPerturbation
+from pipeline.axes import Axes, PhysicsPerturbation
 from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
@@ -26,7 +26,8 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay, verdict
 from pipeline.planning import plan
-from pipeline.run.replay import ReplayJob, replay_plan
+from pipeline.run.replay_job import ReplayJob
+from pipeline.run.replay_stage import Replays
 from pipeline.scenes.noops import NOOP_NORM, kept_actions
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
@@ -133,7 +134,7 @@ def test_a_demonstration_that_changed_since_the_plan_is_refused(short_demos: Pat
     with h5py.File(file, "r+") as opened:
         opened["data/demo_0/actions"][0, 0] += 0.01
     with pytest.raises(PipelineError, match=r"changed since the plan(?s:.*)run the plan stage again") as caught:
-        replay_plan(rows, demos, ReplayConfig(), tmp_path / "trajectories", loop)
+        Replays(demos, ReplayConfig(), tmp_path / "trajectories", loop).of(rows)
     assert f"{file} demo_0" in str(caught.value)
     assert not list(tmp_path.rglob("*.h5"))
 
@@ -167,11 +168,12 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
 def test_what_misses_once_settled_is_tracked_along_its_unsettled_replay(tmp_path: Path) -> None:
     """Of a starter demonstration no states are recorded that could be followed instead."""
     demos = DemosConfig(tasks=("libero_10/LIVING_ROOM_SCENE1_*",))
-    (entry,) = demos.index().entries
-    job = ReplayJob("twin", entry.demo_id, entry.sha256, "[]", "twin", demos, ReplayConfig(mode="open_loop"), tmp_path)
+    wanted = PlanConfig(seed=0, axes=Axes(), episodes={})
+    (twin,) = plan.make(demos.index().entries, wanted, ReplayConfig(), TestSet(()))
+    job = ReplayJob(twin, twin.trajectory_id, demos, ReplayConfig(mode="open_loop"), tmp_path)
     assert job() == Verdict(False, "goal_not_reached")
     assert replace(job, config=ReplayConfig(mode="auto"))() == Verdict(True, "kept")
-    assert TrajectoryStore(tmp_path).load("twin").mode == "tracked"
+    assert TrajectoryStore(tmp_path).load(twin.trajectory_id).mode == "tracked"
 
 
 def test_two_seeds_place_fixtures_differently_and_one_seed_always_the_same() -> None:

@@ -13,11 +13,10 @@ from kills import contents
 
 from pipeline import gl
 from pipeline.config import Config
-from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
-from pipeline.run.render import RenderJob
+from pipeline.run.render_job import RenderJob
 
 AXES = ("layout", "pose", "robot")
 """Each of their episodes has a replay of its own."""
@@ -52,10 +51,8 @@ def refuse_frames_of_first_candidates(clone: Path, fields: dict[str, object]) ->
     for row in plan.read(data / "plan.parquet"):
         if row.axis in AXES and row.rank == 0:
             streams = tuple(streams_of(row.perturbations).values())
-            task, folders = find_task(row.suite, row.task), (data / "trajectories", data / "frames")
-            RenderJob(
-                row.trajectory_id, task, streams, row.demo_steps, *folders, config.render, gl.choose().device
-            ).lost()
+            folders = data / "trajectories", data / "frames"
+            RenderJob(row, streams, *folders, config.render, gl.choose().device).lost()
 
 
 def made(clone: Path, target: str, *options: str) -> list[str]:

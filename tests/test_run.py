@@ -40,7 +40,7 @@ def rows(finished: Path) -> list[dict[str, Any]]:
 
 
 def loader(data: Path) -> EpisodeLoader:
-    return EpisodeLoader(data / "plan.parquet", data / "frames", RenderConfig())
+    return EpisodeLoader(data, RenderConfig())
 
 
 def test_every_planned_episode_is_accounted_for(finished: Path, rows: list[dict[str, Any]]) -> None:
@@ -243,11 +243,18 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path, 
     original = file.read_text()
     cases: list[tuple[tuple[str, ...], Any, set[str]]] = [
         # The report quotes the whole configuration, but for where it ran.
-        (("export", "rlds", "shards"), 3, {"export_rlds", "report"}),
-        (("export", "lerobot", "parts"), 3, {"doctor", "export_lerobot", "report"}),
-        (("render", "jpeg_quality"), 90, {"doctor", "render", "report"}),
+        (("export", "rlds", "shards"), 3, {"export_rlds", "manifest", "validate", "recipe", "card", "report"}),
+        (("export", "lerobot", "frames"), "images", {"export_lerobot", "validate", "recipe", "card", "report"}),
+        (
+            ("export", "where"),
+            {"level": [0, 1]},
+            {"export_rlds", "export_lerobot", "manifest", "validate", "card"} | {"report"},
+        ),
+        (("render", "jpeg_quality"), 90, {"render", "report"}),
         (("compute", "workers"), 5, set()),
-        (("plan", "seed"), 8, {"doctor", "plan", "summary", "report"}),
+        (("plan", "seed"), 8, {"plan", "summary", "report"}),
+        # What is written out as the default is, is no change.
+        (("replay", "noops"), "drop", set()),
     ]
     for keys, value, expected in cases:
         config = yaml.safe_load(original)
@@ -256,4 +263,5 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path, 
             section = section.setdefault(key, {})
         section[keys[-1]] = value
         file.write_text(yaml.safe_dump(config))
-        assert stages_to_run(clone) == expected | {"inputs"}, keys
+        assert dvc(clone, "repro", "inputs").returncode == 0
+        assert stages_to_run(clone) == expected | {"inputs", "doctor"}, keys

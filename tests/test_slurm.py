@@ -109,8 +109,8 @@ def test_the_work_is_done_by_jobs_of_slurm_and_again_where_one_is_ended(slurm: P
 @pytest.mark.slow
 def test_what_slurm_refuses_is_said_in_its_words(slurm: Path, tmp_path: Path) -> None:
     compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(partition="nowhere"))
-    with pytest.raises(PipelineError, match="invalid partition") as caught, runner(compute, tmp_path / "data"):
-        pass
+    with pytest.raises(PipelineError, match="invalid partition") as caught, runner(compute, tmp_path / "data") as work:
+        work(job_of, [0], "none")
     assert "compute.slurm" in str(caught.value)
 
 

@@ -8,7 +8,7 @@ import os
 import resource
 import shutil
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,22 +24,22 @@ from pipeline.axes import to_json
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.compute.pool import loop
-from pipeline.config import Config
+from pipeline.config import Config, FilterConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.render import render
 from pipeline.run import outcome
 from pipeline.run.remake import outdated
-from pipeline.run.render import STREAMS_OF_A_JOB, RenderJob, portions, render_plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.render_job import RenderJob
+from pipeline.run.render_stage import STREAMS_OF_A_JOB, portions, render_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.seeding import rng
 from pipeline.stores.frame_store import FrameStore, shown_of
 from pipeline.stores.sealed_file import sealed
 from pipeline.stores.store import TABLE
-from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
@@ -62,7 +62,7 @@ def rows(config: Config) -> list[plan.Row]:
 @pytest.fixture(scope="module")
 def replayed(config: Config, rows: list[plan.Row], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("replayed")
-    judged = replay_plan(rows, config.demos, config.replay, folder, loop)
+    judged = Replays(config.demos, config.replay, folder, loop).of(rows)
     TrajectoryStore(folder).keep(judged)
     assert all(verdict.kept for verdict in judged.values())
     return folder
@@ -82,6 +82,30 @@ def test_the_table_spares_opening_the_files(replayed: Path, monkeypatch: pytest.
 
     monkeypatch.setattr(h5py, "File", never)
     assert TrajectoryStore(replayed).rows() == rows
+
+
+def test_quality_is_stored_and_a_filter_drops_by_it(config: Config, rows: list[plan.Row], replayed: Path) -> None:
+    store = TrajectoryStore(replayed)
+    ((name, told),) = store.rows().items()
+    quality = store.load(name).quality
+    assert quality is not None
+    figures = asdict(quality)
+    assert {column: told[column] for column in figures} == figures
+    assert set(FilterConfig.model_fields) == set(figures)
+    assert verdicts_of(store.rows(), FilterConfig()) == {name: Verdict(True, "kept")}
+    for column, figure in figures.items():
+        if column == "joint_margin_rad":
+            refusing, letting = figure + 0.01, figure
+        else:
+            refusing, letting = figure * 0.99, figure
+        if figure > 0:
+            refused = verdicts_of(store.rows(), FilterConfig(**{column: refusing}))
+            assert refused == {name: Verdict(False, column)}
+        assert verdicts_of(store.rows(), FilterConfig(**{column: letting}))[name].kept
+
+    limits = FilterConfig(path_m=figures["path_m"] / 2)
+    judged = Replays(config.demos, config.replay, replayed, nothing_to_do, limits).of(rows)
+    assert set(judged.values()) == {Verdict(False, "path_m")}
 
 
 def test_a_lost_or_damaged_table_is_rebuilt(trajectories: Path) -> None:
@@ -121,7 +145,7 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     fault(file)
     with pytest.raises(PipelineError, match=rf"(?s){file.name}.*run the replay stage again"):
         outcome.replayed(rows, trajectories)
-    replay_plan(rows, config.demos, config.replay, trajectories, loop)
+    Replays(config.demos, config.replay, trajectories, loop).of(rows)
     assert file.read_bytes() == before
     assert outcome.replayed(rows, trajectories)
 
@@ -283,10 +307,10 @@ def test_the_table_no_longer_tells_of_files_that_are_gone_or_changed(trajectorie
     """DVC looks at the table alone, and starts the stage that makes the file again."""
     store, table = TrajectoryStore(trajectories), trajectories / TABLE
     before = table.read_bytes()
-    store.settle()
+    store.notice_changes()
     assert table.read_bytes() == before
     change(next(trajectories.glob("*.h5")))
-    store.settle()
+    store.notice_changes()
     assert table.read_bytes() != before
     assert not store.rows()
 
@@ -345,7 +369,7 @@ def test_frames_are_the_same_in_one_file_and_in_several(
 ) -> None:
     """As when a trajectory has more streams than a job renders."""
     render_plan(rows, config, replayed, tmp_path / "one", loop)
-    monkeypatch.setattr("pipeline.run.render.STREAMS_OF_A_JOB", 1)
+    monkeypatch.setattr("pipeline.run.render_stage.STREAMS_OF_A_JOB", 1)
     files = render_plan(rows, config, replayed, tmp_path / "several", loop)
     streams = {s.stream_id: s.geometry.stream_id for row in rows[:2] for s in streams_of(row.perturbations).values()}
     assert len(streams) == len(files) == 4
@@ -367,14 +391,14 @@ def test_a_plan_that_grows_or_shrinks_has_the_files_of_a_first_run_and_renders_w
     monkeypatch: pytest.MonkeyPatch,
     streams_of_a_job: int,
 ) -> None:
-    monkeypatch.setattr("pipeline.run.render.STREAMS_OF_A_JOB", streams_of_a_job)
+    monkeypatch.setattr("pipeline.run.render_stage.STREAMS_OF_A_JOB", streams_of_a_job)
     made: list[str] = []
 
     def noted(trajectory: Any, task: Any, streams: Sequence[Stream], render_config: Any, opened: Any) -> Any:
         made.extend(stream.stream_id for stream in streams)
         return render(trajectory, task, streams, render_config, opened)
 
-    monkeypatch.setattr("pipeline.run.render.render", noted)
+    monkeypatch.setattr("pipeline.run.render_job.render", noted)
 
     def files(planned: Sequence[plan.Row], folder: str) -> dict[str, bytes]:
         store = FrameStore(tmp_path / folder, config.render)
@@ -420,7 +444,7 @@ def test_a_rejection_that_is_no_longer_planned_is_forgotten(
 def test_a_damaged_file_is_rendered_again_and_hinders_no_other(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.run.render.STREAMS_OF_A_JOB", 2)
+    monkeypatch.setattr("pipeline.run.render_stage.STREAMS_OF_A_JOB", 2)
     files = render_plan(rows, config, replayed, tmp_path, loop)
     store = FrameStore(tmp_path, config.render)
     whole, damaged = sorted(files)
@@ -468,9 +492,9 @@ def nothing_to_do(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
 def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_again(
     config: Config, rows: list[plan.Row], tmp_path: Path
 ) -> None:
-    judged = replay_plan(rows, config.demos, config.replay, tmp_path, given_up)
+    judged = Replays(config.demos, config.replay, tmp_path, given_up).of(rows)
     assert judged == {rows[0].trajectory_id: Verdict(False, "worker_lost")}
-    assert replay_plan(rows, config.demos, config.replay, tmp_path, nothing_to_do) == judged
+    assert Replays(config.demos, config.replay, tmp_path, nothing_to_do).of(rows) == judged
     assert {verdict.reason for verdict in plan.select(rows, judged).values()} == {"worker_lost"}
     assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
     assert outcome.replayed(rows, tmp_path)
@@ -497,11 +521,8 @@ def test_states_are_those_of_the_replay_where_a_worker_was_lost_over_other_strea
 ) -> None:
     """What is stored for a lost worker has no states, and is joined with what is rendered later."""
     twin = rows[0]
-    task, streams = find_task(twin.suite, twin.task), tuple(streams_of(twin.perturbations).values())
-    job = RenderJob(
-        *(twin.trajectory_id, task, streams, twin.demo_steps),
-        *(replayed, tmp_path, config.render, gl.choose().device),
-    )
+    streams = tuple(streams_of(twin.perturbations).values())
+    job = RenderJob(twin, streams, replayed, tmp_path, config.render, gl.choose().device)
     replace(job, streams=streams[:1]).lost()
     job()
     made = FrameStore(tmp_path, config.render).load(twin.trajectory_id, [streams[1].stream_id])

@@ -11,6 +11,7 @@ from conftest import REPOSITORY
 
 FLOORS = (
     "__main__",
+    "commands",
     "publish",
     "report",
     "validation",
@@ -41,7 +42,6 @@ FLOORS = (
     "files",
     "rotations",
     "types",
-    "arguments",
     "exit_status",
     "machine_code",
     "errors",

@@ -147,7 +147,7 @@ def named(rows: Rows) -> dict[str, tuple[str, Task] | str]:
 
 def spoil_rlds(data: Path, names: Mapping[str, tuple[str, Task] | str]) -> None:
     """Write every shard again, with faults in the examples."""
-    load = EpisodeLoader(data / "plan.parquet", data / "frames", RenderConfig())
+    load = EpisodeLoader(data, RenderConfig())
     for shard in (data / "rlds").rglob("*.tfrecord-*"):
         ids = [columns(record, rlds_write.features())[f"{METADATA}episode_id"][0].decode() for record in records(shard)]
         with shard.open("wb") as file:

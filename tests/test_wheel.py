@@ -7,16 +7,19 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import Distribution
 from pathlib import Path
 
 import pytest
+
+from pipeline.__main__ import main
 
 REPOSITORY = Path(__file__).parent.parent
 READ = """
 import json
 from pathlib import Path
 import pipeline
-from pipeline.__main__ import config_schema
+from pipeline.commands.develop import config_schema
 from pipeline.axes.language import load_bank
 from pipeline.catalogue.objects import models
 from pipeline.episode_schema import SCHEMA, SCHEMA_FILE
@@ -75,3 +78,10 @@ def test_the_wheel_holds_every_file_of_the_library_and_nothing_else(installed: P
     expected = files(REPOSITORY / "pipeline") | {f"schemas/{name}" for name in files(REPOSITORY / "schemas")}
     assert files(installed / "pipeline") == expected
     assert sorted(path.name.partition("-")[0] for path in installed.iterdir()) == ["pipeline", "pipeline"]
+
+
+def test_the_wheel_brings_a_command_of_its_own_name(installed: Path) -> None:
+    (information,) = installed.glob("*.dist-info")
+    (command,) = Distribution.at(information).entry_points.select(group="console_scripts")
+    assert command.name == "perturbed-demos"
+    assert command.load() is main

@@ -93,7 +93,7 @@ def test_physics_runs_and_rendering_says_what_to_install(tmp_path: Path, machine
 def test_preview_says_what_to_install(tmp_path: Path, machine: dict[str, str]) -> None:
     command = [sys.executable, "-m", "pipeline", "preview", f"{STOVE.suite}/{STOVE.name}", "camera"]
     done = subprocess.run(
-        [*command, "--config", str(REPOSITORY / "configs" / "starter.yaml")],
+        [*command, str(REPOSITORY / "configs" / "starter.yaml")],
         cwd=tmp_path,
         env=machine,
         capture_output=True,

@@ -151,7 +151,7 @@ def make_data(experiment: Experiment, datasets: dict[str, Path], shell: Shell) -
         shell([sys.executable, "-m", "pipeline", *words])
     for stage in STAGES:
         shell([sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(experiment.data)])
-    source = experiment.run.data / "lerobot" / experiment.run.export.lerobot.name
+    source = experiment.lerobot
     rows = provenance(source)
     with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
         jobs = [
@@ -168,7 +168,7 @@ def evaluate(experiment: Experiment, policies: Sequence[str], out: Path, shell: 
     suites, names = zip(*(task.split("/") for task in tasks), strict=True)
     each = math.ceil(wanted.episodes / len(tasks))
     selections = [["--source", "libero", "--episodes", str(min(each, 50))]]
-    apart = ["--plan", str(experiment.run.data / "plan.parquet")]
+    apart = ["--trained-on", str(experiment.data)]
     # A draw is made for each task, axis and one of five levels.
     draws = ["--episodes", str(math.ceil(each / 5))]
     for source, axes, options in (

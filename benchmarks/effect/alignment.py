@@ -26,6 +26,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.settings import VIEWS, Settings, Wanted
+from pipeline.formats.registry import formats_of
 from pipeline.images.jpeg import decode
 from pipeline.types import Floats
 
@@ -37,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("data", type=Path, help="configuration of the run, with frames: images")
     config = load(parser.parse_args().data)
-    root = config.data / "lerobot" / config.export.lerobot.name
+    (root,) = (one.root for one in formats_of(config.data, config.export) if one.name == "lerobot")
     columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *KEYS.values()]
     table = pq.read_table(root / "data", columns=columns)
     environment = EpisodeEnvironment(Settings(initial_states="demonstration"))

@@ -94,13 +94,19 @@ class Experiment(Frozen):
             raise ValueError(f"{self.data} has no episodes of {', '.join(sorted(unknown))}")
         if self.demonstrations is not None and self.run.demos.root is None:
             raise ValueError(f"demonstrations: {self.data} has no demos.root to make them in")
-        if self.run.export.lerobot.frames != "images":
-            raise ValueError(f"{self.data} has export.lerobot.frames: video; write frames: images there")
+        if self.run.export.lerobot is None or self.run.export.lerobot.frames != "images":
+            raise ValueError(f"{self.data} does not export lerobot with images; write frames: images there")
         return self
 
     @cached_property
     def run(self) -> Config:
         return load(self.data)
+
+    @property
+    def lerobot(self) -> Path:
+        """Root of the run's LeRobot dataset."""
+        assert self.run.export.lerobot is not None
+        return self.run.data / "lerobot" / self.run.export.lerobot.name
 
     @property
     def tasks(self) -> tuple[str, ...]:
@@ -109,7 +115,11 @@ class Experiment(Frozen):
 
     def dataset_name(self, arm: str) -> str:
         """Says what a dataset is made from, so that another configuration makes another."""
-        made_from = self.run.model_dump(mode="json", exclude={"compute"}), self.demonstrations, self.arms[arm]
+        made_from = (
+            self.run.model_dump(mode="json", exclude={"compute", "folder"}, by_alias=True),
+            self.demonstrations,
+            self.arms[arm],
+        )
         return f"{arm}_{digest(*made_from, self.frame_px)[:8]}"
 
     def policy_name(self, arm: str, seed: int) -> str:

@@ -91,6 +91,11 @@ def kind_of(axis: str) -> type[Perturbation]:
     return _KINDS[axis][0]
 
 
+def components_of(axis: str) -> tuple[str, ...]:
+    """What can stand in the column ``component`` for an axis."""
+    return tuple(one for kind in _KINDS[axis] for one in get_args(kind.model_fields["component"].annotation))
+
+
 def in_order(perturbations: Iterable[Kind]) -> tuple[Kind, ...]:
     """Perturbations in the order in which they apply, whatever order they were listed in."""
     return tuple(sorted(perturbations, key=lambda p: _PLACE[p.axis]))
@@ -133,6 +138,7 @@ __all__ = [
     "RenderPerturbation",
     "TextPerturbation",
     "axes_of",
+    "components_of",
     "from_json",
     "in_order",
     "kind_of",

@@ -1,4 +1,4 @@
-"""Whether OpenVLA-OFT would train on a dataset as it was meant: `python -m pipeline check-oft data/<run>`."""
+"""Whether OpenVLA-OFT would train on a dataset as it was meant: a part of `python -m pipeline check`."""
 
 from __future__ import annotations
 

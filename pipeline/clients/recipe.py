@@ -67,20 +67,22 @@ TRAINING = {
 }
 
 
-def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, lerobot: str) -> dict[str, Any]:
+def build(
+    manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str | None, lerobot: str | None
+) -> dict[str, Any]:
     """The fine-tuning recipe of a run.
 
     Args:
         manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
             episode, its place in each format, and the versions and the device that made it.
         rows: its rows.
-        name: what OpenVLA-OFT is to call all RLDS datasets together.
-        lerobot: name of the LeRobot dataset.
+        name: what OpenVLA-OFT is to call all RLDS datasets together; None where there are none.
+        lerobot: name of the LeRobot dataset; None where there is none.
 
     Raises:
         PipelineError: when nothing was kept, or OFT would take the name for another robot's.
     """
-    if not known_to_oft(name):
+    if name is not None and not known_to_oft(name):
         raise PipelineError(
             f"{name} would be read with another robot's constants and cameras by OpenVLA-OFT, which goes by the name",
             where="export.rlds.name",
@@ -89,54 +91,59 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str, 
     kept = [row for row in rows if row["kept"]]
     if not kept:
         raise PipelineError("no episode was kept", where=manifest_file, remedy="read its column reason")
-    suites = {row["suite"]: dataset_of(row) for row in kept}
     counts: dict[str, dict[str, int]] = {}
     for row in kept:
         by_axis = counts.setdefault(row["suite"], {})
         by_axis[row["axis"]] = by_axis.get(row["axis"], 0) + 1
-    recipe = {
-        "name": name,
-        "dataset": {
-            "sha256": sourced(checksum(manifest_file), "hash of " + MANIFEST),
-            "episodes": sourced(len(kept), MANIFEST),
-            "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
-            "episodes_by_suite_and_axis": sourced(counts, MANIFEST),
-            "suites": sourced(suites, MANIFEST + ": the RLDS dataset that holds each suite"),
-            "mixtures": sourced(
-                {name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
-                "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
-            ),
-            "lerobot": sourced(lerobot, "the run's configuration, export.lerobot.name"),
-        },
-        "training": TRAINING,
-        "clients": _clients(name, lerobot),
+    dataset = {
+        "sha256": sourced(checksum(manifest_file), "hash of " + MANIFEST),
+        "episodes": sourced(len(kept), MANIFEST),
+        "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
+        "episodes_by_suite_and_axis": sourced(counts, MANIFEST),
     }
+    if name is not None:
+        suites = {row["suite"]: dataset_of(row) for row in kept}
+        dataset["suites"] = sourced(suites, MANIFEST + ": the RLDS dataset that holds each suite")
+        dataset["mixtures"] = sourced(
+            {name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
+            "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
+        )
+    if lerobot is not None:
+        dataset["lerobot"] = sourced(lerobot, "the run's configuration, export.lerobot.name")
+    recipe = {"name": name or lerobot, "dataset": dataset, "training": TRAINING, "clients": _clients(name, lerobot)}
     check(recipe, manifest_file)
     return recipe
 
 
-def write(recipe: Mapping[str, Any], lerobot: Path, folder: Path) -> None:
+def write(recipe: Mapping[str, Any], lerobot: Path | None, folder: Path) -> None:
     """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``folder``.
 
     Args:
         recipe: what ``build`` returned.
-        lerobot: root of the LeRobot dataset, whose actions and states are measured, but for those held out.
+        lerobot: root of the LeRobot dataset, whose actions and states are measured, but for those held out; None where
+            there is none.
         folder: where to write; the scripts look for ``rlds`` and ``lerobot`` beside it.
     """
-    columns = [SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key]
-    rows = trained_on(read_json(lerobot / "meta" / "info.json"))
-    table = pq.read_table(lerobot / "data", columns=columns, filters=rows)
-    actions, states = (np.stack(table[column].to_numpy()) for column in columns)
     with replaced(folder) as unfinished:
-        (unfinished / "openpi_assets").mkdir(parents=True)
-        (unfinished / "openpi_assets" / "norm_stats.json").write_text(
-            json.dumps(motion_statistics.openpi(actions, states), indent=1) + "\n"
-        )
+        unfinished.mkdir()
+        if lerobot is not None:
+            _write_statistics(lerobot, unfinished / "openpi_assets")
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / "finetune.yaml").write_text(text)
         for file in COPIED:
             shutil.copyfile(TEMPLATES / file, unfinished / file)
+
+
+def _write_statistics(lerobot: Path, folder: Path) -> None:
+    """What openpi normalises by."""
+    columns = [SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key]
+    rows = trained_on(read_json(lerobot / "meta" / "info.json"))
+    table = pq.read_table(lerobot / "data", columns=columns, filters=rows)
+    actions, states = (np.stack(table[column].to_numpy()) for column in columns)
+    folder.mkdir()
+    figures = motion_statistics.openpi(actions, states)
+    (folder / "norm_stats.json").write_text(json.dumps(figures, indent=1) + "\n")
 
 
 def check(recipe: Mapping[str, Any], where: object) -> None:
@@ -165,11 +172,12 @@ def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
 _Dumper.add_representer(str, _text)
 
 
-def _clients(name: str, lerobot: str) -> dict[str, dict[str, str]]:
+def _clients(name: str | None, lerobot: str | None) -> dict[str, dict[str, str]]:
     """Command lines; ``$DATA`` stands for the run's data folder, by its absolute path."""
-    train = f"lerobot-train --dataset.repo_id={lerobot} --dataset.root=$DATA/lerobot/{lerobot}"
-    local = "--policy.push_to_hub=false"
-    views = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), start=1)}
+    return ({} if name is None else _on_rlds()) | ({} if lerobot is None else _on_lerobot(lerobot))
+
+
+def _on_rlds() -> dict[str, dict[str, str]]:
     return {
         "openvla_oft": {
             "where": "a checkout of github.com/moojink/openvla-oft, in its environment",
@@ -178,6 +186,14 @@ def _clients(name: str, lerobot: str) -> dict[str, dict[str, str]]:
             "source": "training above; --dataset_name NAME trains on one suite, see dataset.suites; with an account, "
             "--wandb_entity NAME --wandb_project NAME in place of WANDB_MODE=offline",
         },
+    }
+
+
+def _on_lerobot(lerobot: str) -> dict[str, dict[str, str]]:
+    train = f"lerobot-train --dataset.repo_id={lerobot} --dataset.root=$DATA/lerobot/{lerobot}"
+    local = "--policy.push_to_hub=false"
+    views = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), start=1)}
+    return {
         "openpi": {
             "where": "a checkout of github.com/Physical-Intelligence/openpi",
             "command": "uv run python $DATA/finetune/run_openpi.py scripts/train.py "

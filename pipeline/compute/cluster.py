@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import platform
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from functools import cache
@@ -39,12 +39,12 @@ class Workplace:
     Attributes:
         folder: absolute path of the folder that the run was started in, from which its relative paths start.
         token: absolute path of a file that the run wrote for its workers to find.
-        setup: digest of ``setup()``.
+        setup: what ``setup()`` is there.
     """
 
     folder: Path
     token: Path
-    setup: str
+    setup: Mapping[str, str]
 
     def enter(self) -> None:
         """Make sure that this process may work for the run, and forget what it knows of earlier ones.
@@ -57,14 +57,23 @@ class Workplace:
             return
         from distributed import get_worker
 
-        faults = [] if self.token.is_file() else [_not_shared(self)]
-        if digest("setup", setup()) != self.setup:
-            faults.append("has other packages, code or machine code than the run")
-        faults += _crowded(get_worker().state.nthreads)
-        if faults:
+        if faults := self.faults(get_worker()):
             raise _refusal(f"worker on {platform.node()}", faults)
         _forget()
         _entered = self
+
+    def faults(self, dask_worker: Any) -> list[str]:
+        """In a worker, which Dask fills in by the argument's name: why it cannot work for the run."""
+        found = []
+        if not (self.token.is_file() and self.folder.is_dir()):
+            found.append(f"does not see {self.token.parent}, or another folder lies at that path there")
+        here = setup()
+        for name, version_of_run in self.setup.items():
+            if here.get(name) != version_of_run:
+                found.append(f"has {name} {here.get(name, 'not installed')}, the run has {version_of_run}")
+        if (threads := dask_worker.state.nthreads) != 1:
+            found.append(f"runs {threads} threads, and the simulator needs a process for itself")
+        return found
 
 
 _entered: Workplace | None = None
@@ -90,6 +99,7 @@ def setup() -> dict[str, str]:
 
     A process keeps the code that it imported first, so this is found out once and not again.
     """
+
     # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
@@ -105,7 +115,7 @@ def setup() -> dict[str, str]:
 
 
 @contextmanager
-def joined(client: Any, folder: Path) -> Iterator[Workplace]:
+def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
     """Check every worker that a Dask client has now; later ones are checked when they get their first work.
 
     Args:
@@ -117,14 +127,15 @@ def joined(client: Any, folder: Path) -> Iterator[Workplace]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     token = folder.absolute() / f".cluster-{uuid4().hex}"
-    workplace = Workplace(Path.cwd(), token, digest("setup", setup()))
+    workplace = Workplace(Path.cwd(), token, setup())
     token.touch()
     try:
-        reports = client.run(_report, workplace, on_error="return")
-        threads = {address: worker["nthreads"] for address, worker in client.scheduler_info()["workers"].items()}
+        reports = client.run(workplace.faults, on_error="return")
         addresses: dict[str, list[str]] = {}
-        for address, report in reports.items():
-            for fault in _faults(workplace, report, threads.get(address, 1)):
+        for address, found in reports.items():
+            if isinstance(found, BaseException):
+                found = [f"cannot execute this run's code ({type(found).__name__}: {found})"]
+            for fault in found:
                 addresses.setdefault(fault, []).append(address)
         if addresses:
             refused = {address for of_fault in addresses.values() for address in of_fault}
@@ -134,30 +145,6 @@ def joined(client: Any, folder: Path) -> Iterator[Workplace]:
         yield workplace
     finally:
         token.unlink(missing_ok=True)
-
-
-def _report(workplace: Workplace) -> tuple[bool, dict[str, str]]:
-    """In a worker: whether the run's folder is seen, and the setup."""
-    return workplace.token.is_file() and workplace.folder.is_dir(), setup()
-
-
-def _faults(workplace: Workplace, report: Any, threads: int) -> list[str]:
-    if isinstance(report, BaseException):
-        return [f"cannot execute this run's code ({type(report).__name__}: {report})"]
-    seen, theirs = report
-    faults = [] if seen else [_not_shared(workplace)]
-    for name, ours in setup().items():
-        if theirs.get(name) != ours:
-            faults.append(f"has {name} {theirs.get(name, 'not installed')}, the run has {ours}")
-    return faults + _crowded(threads)
-
-
-def _crowded(threads: int) -> list[str]:
-    return [] if threads == 1 else [f"runs {threads} threads, and the simulator needs a process for itself"]
-
-
-def _not_shared(workplace: Workplace) -> str:
-    return f"does not see {workplace.token.parent}, or another folder lies at that path there"
 
 
 def _refusal(where: str, faults: list[str]) -> PipelineError:

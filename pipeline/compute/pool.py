@@ -5,7 +5,7 @@ from __future__ import annotations
 import faulthandler
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from math import inf
@@ -13,7 +13,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
 
-from pipeline.compute.cluster import InPlace, Workplace, joined
+from pipeline.compute.cluster import InPlace, Workplace, workplace_of
 from pipeline.compute.local import local_cluster
 from pipeline.compute.progress import progress_of
 from pipeline.compute.slurm import slurm_cluster
@@ -60,7 +60,7 @@ class Expendable(Generic[Item, Result]):
         return self.fn(item)
 
 
-class Run(Protocol):
+class Workers(Protocol):
     """Apply ``fn`` to every item, in any order and place; the results come back in the order of the items.
 
     A worker that dies is replaced, and its item is done again. An item over which workers die again and again ends the
@@ -88,20 +88,34 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 @contextmanager
 def runner(
     config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None = None
-) -> Iterator[Run]:
-    """Open what ``config.cluster`` names and yield the function that runs work on it.
+) -> Iterator[Workers]:
+    """Yield the function that runs work on what ``config.cluster`` names. Nothing is started before there is work.
+
+    With the first work comes a ``PipelineError`` when no scheduler answers, or a worker cannot work for this run.
 
     Args:
         config: where to run.
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
-        opengl: for work that renders, ``gl.Shared``: gives what each local worker calls with its number.
-
-    Raises:
-        PipelineError: when no scheduler answers, or a worker cannot work for this run.
+        opengl: for work that renders, ``gl.WorkerSetup``: gives what each local worker calls with its number.
     """
     if config.cluster == "loop":
         yield loop
         return
+    with ExitStack() as opened:
+        workers: list[_Workers] = []
+
+        def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
+            if items and not workers:
+                workers.append(opened.enter_context(_started(config, folder, opengl)))
+            return workers[0](fn, items, description) if items else []
+
+        yield run
+
+
+@contextmanager
+def _started(
+    config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None
+) -> Iterator[_Workers]:
     # One thread a worker process: GL contexts and the simulator are not shared, and OpenCV and NumPy would otherwise
     # each start a thread for every core in every worker. The environment is inherited by spawned workers.
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
@@ -125,7 +139,7 @@ def runner(
     elif config.cluster == "slurm":
         with slurm_cluster(config, folder) as cluster, Client(cluster) as client:
             client.wait_for_workers(1)
-            with joined(client, folder) as workplace:
+            with workplace_of(client, folder) as workplace:
                 # Jobs that end are asked for again; they may wait in the queue for hours.
                 yield _Workers(client, workplace, partial(cluster.scale, config.workers), patience_s=inf)
     else:
@@ -137,7 +151,7 @@ def runner(
                 where=config.cluster,
                 remedy="start one, or set compute.cluster: local",
             ) from error
-        with client, joined(client, folder) as workplace:
+        with client, workplace_of(client, folder) as workplace:
             yield _Workers(client, workplace)
 
 
@@ -267,15 +281,12 @@ def _result(outcome: Result | Exception) -> Result:
     from distributed import KilledWorker
 
     if isinstance(outcome, KilledWorker):
-        raise _killed(outcome)
+        raise PipelineError(
+            f"one piece of work ended {outcome.allowed_failures + 1} workers",
+            where=f"the last was {outcome.last_worker.address}",
+            expected="workers that live: the system may have ended them because memory ran out",
+            remedy=f"see the system's log, use fewer workers, and {GO_ON}",
+        )
     if isinstance(outcome, Exception):
         raise outcome
     return outcome
-
-
-def _killed(error: Any) -> PipelineError:
-    return PipelineError(
-        f"one piece of work ended {error.allowed_failures + 1} workers, the last on {error.last_worker.address}",
-        expected="workers that live: the system may have ended them because memory ran out",
-        remedy=f"see the system's log, use fewer workers, and {GO_ON}",
-    )

@@ -35,17 +35,17 @@ def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
     """
     from dask_jobqueue.slurm import SLURMCluster
 
-    asked = config.slurm or SlurmConfig()
+    job = config.slurm or SlurmConfig()
     logs = (folder / LOGS).absolute()
     logs.mkdir(parents=True, exist_ok=True)
     cluster = SLURMCluster(
         cores=1,
         processes=1,
-        memory=f"{asked.memory_gb}GB",
-        queue=asked.partition,
-        account=asked.account,
-        walltime=asked.walltime,
-        job_extra_directives=list(asked.options),
+        memory=f"{job.memory_gb}GB",
+        queue=job.partition,
+        account=job.account,
+        walltime=job.walltime,
+        job_extra_directives=list(job.options),
         # Not every site hands on the environment that a job is asked for in.
         job_script_prologue=[f"export {in_shell(SETTINGS | dict.fromkeys(ONE_THREAD, '1'))}"],
         log_directory=str(logs),

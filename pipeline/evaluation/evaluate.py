@@ -8,7 +8,7 @@ from itertools import islice
 from typing import Any
 
 from pipeline import gl
-from pipeline.compute.pool import Expendable, Run
+from pipeline.compute.pool import Expendable, Workers
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import Row, refuse_shared_names
 from pipeline.evaluation.rollout import Evaluation, EvaluationJob, without_result
@@ -29,7 +29,7 @@ SCENE_AXES = ("pose", "layout", "light", "background")
 """The axes whose test tasks have a scene each."""
 
 
-def evaluate(evaluation: Evaluation, selection: Selection, run: Run, workers: int = 1) -> dict[str, Any]:
+def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers: int = 1) -> dict[str, Any]:
     """Run what the folder does not hold yet, and write ``summary.json`` of what was selected.
 
     An episode in which the policy gives no action has no result, and the others are run.

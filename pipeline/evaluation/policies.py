@@ -145,7 +145,7 @@ class Server:
             from vla_eval.connection import Connection
         except ImportError as error:
             raise PipelineError(
-                "the package vla-eval is not installed", remedy="pip install 'pipeline[evaluation]', or vla-eval==0.8.0"
+                "the package vla-eval is not installed", remedy="pip install vla-eval==0.8.0"
             ) from error
         self.name, self._next_look = address, NextLook(look_every)
         self._loop = asyncio.new_event_loop()

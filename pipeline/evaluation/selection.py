@@ -18,6 +18,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import goals, libero_plus
 from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, drawn_task
 from pipeline.evaluation.tasks import EvaluationTask, Source, balanced, libero_task, read_tasks
+from pipeline.libero import tasks as libero
 from pipeline.libero.tasks import tasks
 from pipeline.testset.benchmark import SUITES, load
 from pipeline.types import Task
@@ -81,7 +82,9 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
 
 def _check_names(selection: Selection) -> None:
     """Refuse what can be refused before anything is listed."""
-    _check_known("suites", selection.suites, SUITES, selection)
+    # The benchmark leaves LIBERO-90 out.
+    of_benchmark = selection.source == "libero_plus" and selection.file is None
+    _check_known("suites", selection.suites, SUITES if of_benchmark else libero.SUITES, selection)
     if selection.file is not None:
         return
     if selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
@@ -180,7 +183,7 @@ def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> Non
             known = {getattr(task, COLUMNS[field]) for task in listed}
             _check_known(field, getattr(selection, field), known, selection)
     names = {name for task in listed for name in (task.name, task.base)}
-    names |= {task.name for suite in SUITES for task in tasks(suite)}
+    names |= {task.name for suite in libero.SUITES for task in tasks(suite)}
     for pattern in selection.tasks:
         if not fnmatch.filter(names, pattern):
             closest = difflib.get_close_matches(pattern, names, cutoff=0)

@@ -79,6 +79,11 @@ class Format(ABC, Generic[Options]):
         return self.data / self.name
 
     @property
+    def root(self) -> Path:
+        """What a client opens."""
+        return self.folder
+
+    @property
     def record_file(self) -> Path:
         return self.data / f"{self.name}.json"
 

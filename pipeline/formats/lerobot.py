@@ -43,7 +43,7 @@ class LeRobot(Format[LeRobotConfig]):
         pieces: list[Piece] = []
         tasks: dict[str, int] = {}
         for split_name, members in episodes.by_split(self.options.validation).items():
-            share = round(self.options.parts * len(members) / len(episodes.known))
+            share = round((self.options.shards or 0) * len(members) / len(episodes.known))
             least = ceil(sum(episodes.known[one].steps for one in members) / self._steps_of_a_file())
             for ids in split(members, max(1, share, least)):
                 instructions = dict.fromkeys(episodes.known[one].instruction for one in ids)

@@ -21,8 +21,8 @@ FORMATS: tuple[type[Format[Any]], ...] = (
 
 
 def formats_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
-    """Every format's dataset of a run whose folder is ``data`` and whose episodes have these extras."""
-    return [kind(data, getattr(options, kind.name), extras) for kind in FORMATS]
+    """The datasets that are asked for, of a run whose folder is ``data`` and whose episodes have these extras."""
+    return [kind(data, options.formats[kind.name], extras) for kind in FORMATS if kind.name in options.formats]
 
 
 def columns() -> list[pa.Field]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import ceil
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +17,9 @@ from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, by_suite, dataset_of, shard_path
 from pipeline.identity import Step
 from pipeline.tables import column
+
+SHARD_MB = 400
+"""Of a shard, about, where their number is not said."""
 
 
 class Rlds(Format[RldsConfig]):
@@ -32,14 +36,22 @@ class Rlds(Format[RldsConfig]):
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
+        shards = self.options.shards or ceil(
+            sum(known.steps for known in episodes.known.values()) / self._shard_steps()
+        )
         for split_name, members in episodes.by_split(self.options.validation).items():
             suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
             for name, ids in by_suite(members, suites, self.options.name).items():
-                slices = episodes.slices(ids, self.options.shards)
+                slices = episodes.slices(ids, shards)
                 for shard, slice_ids in enumerate(slices):
                     path = shard_path(name, split_name, shard, len(slices))
                     pieces.append(Piece(f"dataset/{path}", slice_ids, split_name))
         return pieces
+
+    def _shard_steps(self) -> int:
+        """So many steps make a shard of ``SHARD_MB``; sizes as in ``benchmarks/disk.py``, rounded up."""
+        map_kb = sum({"depth": 31.0, "segmentation": 3.0}.get(extra, 0.0) for extra in self.extras)
+        return int(1000 * SHARD_MB / (len(SCHEMA.views) * (20.0 + map_kb) + 1.0))
 
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats import rlds_write

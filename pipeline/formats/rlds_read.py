@@ -120,8 +120,8 @@ def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) ->
     return Geometry(**matrices, maps=maps)
 
 
-def _said(value: Any) -> str | int:
-    return value.decode() if isinstance(value, bytes) else int(value)
+def _said(value: Any) -> str | int | float:
+    return value.decode() if isinstance(value, bytes) else value.item()
 
 
 def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> Copy:

@@ -9,7 +9,6 @@ with several counts for each of its axes: the benchmark perturbs one at a time, 
 
 from __future__ import annotations
 
-import json
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
@@ -25,7 +24,7 @@ from rich.text import Text
 from pipeline.axes import AnyPerturbation, from_json
 from pipeline.axes.base import Nearest
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import write_json
 from pipeline.libero.tasks import find_task
 from pipeline.planning.plan import Row
 from pipeline.testset.benchmark import TestSet
@@ -141,8 +140,7 @@ def _finding(
 
 
 def write(findings: dict[str, AxisDistance], path: Path) -> None:
-    with replaced(path) as temporary:
-        temporary.write_text(json.dumps({axis: asdict(finding) for axis, finding in findings.items()}, indent=1) + "\n")
+    write_json(path, {axis: asdict(finding) for axis, finding in findings.items()})
 
 
 def report(findings: dict[str, AxisDistance]) -> Group:

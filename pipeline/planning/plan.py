@@ -6,7 +6,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from itertools import count
+from itertools import count, islice
 from math import ceil
 from pathlib import Path
 from typing import Annotated
@@ -73,14 +73,11 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     by_task: dict[str, list[DemoEntry]] = defaultdict(list)
     for demo in demos:
         by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
-    rows = [
-        _row(demo, (), plan.seed, 0, rank, True, replay)
-        for group in by_task.values()
-        for rank, demo in enumerate(group)
-    ]
+    planner = _Planner(plan.seed, replay)
+    rows = [row for group in by_task.values() for row in twins(group, plan.seed, replay)]
     for name, episodes in plan.episodes.items():
-        axes = plan.drawn_from(name)
-        groups = [group for group in by_task.values() if all(axis.applies(group[0].task) for axis in axes)]
+        draws = Draws(name, plan.drawn_from(name), plan.seed, test)
+        groups = [group for group in by_task.values() if all(axis.applies(group[0].task) for axis in draws.axes)]
         if not groups:
             raise PipelineError(
                 "none of the chosen tasks has anything that this could change",
@@ -88,8 +85,13 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
                 remedy="widen demos.tasks, or take it out of plan.episodes",
             )
         for group, wanted in zip(groups, _shares(episodes, len(groups)), strict=True):
-            rows += _candidates(name, axes, group, wanted, plan, replay, test)
+            rows += islice(planner.candidates(draws, group, wanted), wanted + ceil(wanted * plan.reserve))
     return rows
+
+
+def twins(demos: Sequence[DemoEntry], seed: int, replay: ReplayConfig) -> list[Row]:
+    """The clean twin of each demonstration of a task."""
+    return [_Planner(seed, replay).row(demo, (), rank) for rank, demo in enumerate(demos)]
 
 
 def demonstrations(rows: Sequence[Row]) -> int:
@@ -110,101 +112,108 @@ def _shares(total: int, parts: int) -> list[int]:
     return [total // parts + (index < total % parts) for index in range(parts)]
 
 
-def _candidates(
-    name: str,
-    axes: Sequence[AnyAxis],
-    group: Sequence[DemoEntry],
-    wanted: int,
-    plan: PlanConfig,
-    replay: ReplayConfig,
-    test: TestSet,
-) -> Iterator[Row]:
-    """A task's candidates: every demonstration's first variant, then every second one, and so on.
+@dataclass(frozen=True)
+class Draws:
+    """What a plan draws for its episodes of one axis or combination.
 
-    A demonstration of which no more different draws are left that keep clear of the test set is passed over; there are
-    fewer candidates than wanted when none is left of any.
-    """
-    left = {demo: draws_of(name, axes, demo.demo_id, demo.task, plan.seed, test) for demo in group}
-    rank, candidates = 0, wanted + ceil(wanted * plan.reserve)
-    for variant in count():
-        for demo, draws in [*left.items()]:
-            if rank == candidates:
-                return
-            perturbations = next(draws, None)
-            if perturbations is None:
-                del left[demo]
-                continue
-            yield _row(demo, perturbations, plan.seed, variant, rank, rank < wanted, replay)
-            rank += 1
-        if not left:
-            return
-
-
-def draws_of(
-    name: str, axes: Sequence[AnyAxis], demo_id: str, task: Task, seed: int, test: TestSet
-) -> Iterator[tuple[AnyPerturbation, ...]]:
-    """What a plan draws for one demonstration, variant after variant: all different, and clear of the test set.
-
-    Args:
+    Attributes:
         name: of the axis or combination, as in ``plan.episodes``.
         axes: what it draws from.
         seed: of the plan.
-
-    Yields:
-        One perturbation of each axis, until no different draw is left.
+        test: the benchmark's tasks, of which draws keep clear.
     """
-    first = int(rng(seed, name, demo_id).integers(2**31))
-    drawn: set[tuple[str, ...]] = set()
-    for variant in count():
-        for attempt in range(_ATTEMPTS):
-            key = rng(seed, name, demo_id, variant, attempt)
-            perturbations = tuple(axis.sample(key, task, first + variant + attempt) for axis in axes)
-            content = tuple(p.model_dump_json() for p in perturbations)
-            if content not in drawn and all(p.nearest(test, task).distance >= p.clearance for p in perturbations):
-                break
-        else:
-            return
-        drawn.add(content)
-        yield perturbations
+
+    name: str
+    axes: Sequence[AnyAxis]
+    seed: int
+    test: TestSet
+
+    def of(self, demo_id: str, task: Task) -> Iterator[tuple[AnyPerturbation, ...]]:
+        """Draws for one demonstration, variant after variant: all different, and clear of the test set.
+
+        Yields:
+            One perturbation of each axis, until no different draw is left.
+        """
+        first = int(rng(self.seed, self.name, demo_id).integers(2**31))
+        drawn: set[tuple[str, ...]] = set()
+        for variant in count():
+            for attempt in range(_ATTEMPTS):
+                key = rng(self.seed, self.name, demo_id, variant, attempt)
+                perturbations = tuple(axis.sample(key, task, first + variant + attempt) for axis in self.axes)
+                content = tuple(p.model_dump_json() for p in perturbations)
+                if content not in drawn and self._clear(perturbations, task):
+                    break
+            else:
+                return
+            drawn.add(content)
+            yield perturbations
+
+    def _clear(self, perturbations: Sequence[AnyPerturbation], task: Task) -> bool:
+        return all(p.nearest(self.test, task).distance >= p.clearance for p in perturbations)
 
 
-def _row(
-    demo: DemoEntry,
-    perturbations: Sequence[AnyPerturbation],
-    seed: int,
-    variant: int,
-    rank: int,
-    wanted: bool,
-    replay: ReplayConfig,
-) -> Row:
-    perturbations = in_order(perturbations)
-    physics = to_json(of_layer(perturbations, PhysicsPerturbation))
-    listed = to_json(perturbations)
-    instruction = demo.task.instruction
-    for change in of_layer(perturbations, TextPerturbation):
-        instruction = change.apply(instruction)
-    return Row(
-        episode_id=_identity("episode", demo.sha256, replay, listed),
-        twin_id=_identity("episode", demo.sha256, replay, "[]"),
-        trajectory_id=_identity("trajectory", demo.sha256, replay, physics),
-        role="perturbed" if perturbations else "twin",
-        suite=demo.task.suite,
-        task=demo.task.name,
-        demo_id=demo.demo_id,
-        demo_sha256=demo.sha256,
-        demo_source=demo.source,
-        demo_origin=demo.origin,
-        demo_steps=demo.steps,
-        axis="+".join(p.axis for p in perturbations) or "clean",
-        component="+".join(p.component for p in perturbations) or "clean",
-        level="+".join(str(p.level) for p in perturbations) or "0",
-        perturbations=listed,
-        instruction=instruction,
-        rank=rank,
-        wanted=wanted,
-        seed=seed,
-        variant=variant,
-    )
+@dataclass(frozen=True)
+class _Planner:
+    """Makes rows of one plan."""
+
+    seed: int
+    replay: ReplayConfig
+
+    def candidates(self, draws: Draws, group: Sequence[DemoEntry], wanted: int) -> Iterator[Row]:
+        """A task's candidates: every demonstration's first variant, then every second one, and so on.
+
+        A demonstration of which no more different draws are left that keep clear of the test set is passed over; the
+        candidates end when none is left of any.
+        """
+        left = {demo: draws.of(demo.demo_id, demo.task) for demo in group}
+        ranks = count()
+        for variant in count():
+            for demo, drawn in [*left.items()]:
+                perturbations = next(drawn, None)
+                if perturbations is None:
+                    del left[demo]
+                    continue
+                rank = next(ranks)
+                yield self.row(demo, perturbations, rank, variant, rank < wanted)
+            if not left:
+                return
+
+    def row(
+        self,
+        demo: DemoEntry,
+        perturbations: Sequence[AnyPerturbation],
+        rank: int,
+        variant: int = 0,
+        wanted: bool = True,
+    ) -> Row:
+        perturbations = in_order(perturbations)
+        physics = to_json(of_layer(perturbations, PhysicsPerturbation))
+        listed = to_json(perturbations)
+        instruction = demo.task.instruction
+        for change in of_layer(perturbations, TextPerturbation):
+            instruction = change.apply(instruction)
+        return Row(
+            episode_id=_identity("episode", demo.sha256, self.replay, listed),
+            twin_id=_identity("episode", demo.sha256, self.replay, "[]"),
+            trajectory_id=_identity("trajectory", demo.sha256, self.replay, physics),
+            role="perturbed" if perturbations else "twin",
+            suite=demo.task.suite,
+            task=demo.task.name,
+            demo_id=demo.demo_id,
+            demo_sha256=demo.sha256,
+            demo_source=demo.source,
+            demo_origin=demo.origin,
+            demo_steps=demo.steps,
+            axis="+".join(p.axis for p in perturbations) or "clean",
+            component="+".join(p.component for p in perturbations) or "clean",
+            level="+".join(str(p.level) for p in perturbations) or "0",
+            perturbations=listed,
+            instruction=instruction,
+            rank=rank,
+            wanted=wanted,
+            seed=self.seed,
+            variant=variant,
+        )
 
 
 @lru_cache(maxsize=4096)
@@ -240,16 +249,8 @@ def pending(
         verdicts: trajectory id to its verdict.
         rejected: episode id to the reason why its frames were rejected.
     """
-    wanted: dict[str, None] = {}
-    for group in _groups(rows):
-        need = sum(row.wanted for row in group)
-        for row in group:
-            verdict = verdicts.get(row.trajectory_id)
-            if need and (verdict is None or (verdict.kept and row.episode_id not in (rejected or {}))):
-                need -= 1
-                if verdict is None:
-                    wanted[row.trajectory_id] = None
-    return list(wanted)
+    found = _verdicts(rows, verdicts, rejected)
+    return list(dict.fromkeys(row.trajectory_id for row, verdict in found if verdict is None))
 
 
 def select(
@@ -262,23 +263,29 @@ def select(
         verdicts: trajectory id to its verdict.
         rejected: episode id to the reason why its frames were rejected.
     """
-    outcome: dict[str, Verdict] = {}
-    for group in _groups(rows):
+    unknown = Verdict(False, "not_replayed")
+    return {row.episode_id: verdict or unknown for row, verdict in _verdicts(rows, verdicts, rejected)}
+
+
+def _verdicts(
+    rows: Iterable[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None
+) -> Iterator[tuple[Row, Verdict | None]]:
+    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
+
+    The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
+    """
+    quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        quotas[row.axis, row.suite, row.task].append(row)
+    for quota in quotas.values():
+        group = sorted(quota, key=lambda row: row.rank)
         need = sum(row.wanted for row in group)
         for row in group:
-            verdict = verdicts.get(row.trajectory_id, Verdict(False, "not_replayed"))
-            if rejected and verdict.kept and row.episode_id in rejected:
-                verdict = Verdict(False, rejected[row.episode_id])
+            verdict = verdicts.get(row.trajectory_id)
             if not need:
                 verdict = Verdict(False, "reserve_not_needed")
-            need -= verdict.kept
-            outcome[row.episode_id] = verdict
-    return outcome
-
-
-def _groups(rows: Iterable[Row]) -> list[list[Row]]:
-    """Rows that fill one quota: the twins and each axis or combination, task by task, in order of rank."""
-    groups: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[row.axis, row.suite, row.task].append(row)
-    return [sorted(group, key=lambda row: row.rank) for group in groups.values()]
+            elif rejected and verdict and verdict.kept and row.episode_id in rejected:
+                verdict = Verdict(False, rejected[row.episode_id])
+            # Until it is known, it is hoped for.
+            need -= verdict is None or verdict.kept
+            yield row, verdict

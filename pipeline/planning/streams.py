@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
-from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, from_json, to_json
+from pipeline.axes import AnyPerturbation, PixelPerturbation, RenderPerturbation, from_json, of_layer, to_json
 from pipeline.episode_schema import SCHEMA
 from pipeline.seeding import digest
 
@@ -21,7 +23,7 @@ class Stream:
     view: str
     perturbations: tuple[AnyPerturbation, ...]
 
-    @property
+    @cached_property
     def stream_id(self) -> str:
         return digest("stream", self.view, to_json(self.perturbations))[:16]
 
@@ -31,8 +33,14 @@ class Stream:
         changes = (p for p in self.perturbations if isinstance(p, RenderPerturbation))
         return Stream(self.view, tuple(p for p in changes if p.sees_otherwise))
 
+    def scene(self, textures: bool = True) -> str:
+        """What streams have in common that show the same scene, or the same one but for its textures."""
+        changes = of_layer(self.perturbations, RenderPerturbation)
+        return to_json([change for change in changes if textures or not change.paints])
 
-def streams_of(perturbations_json: str) -> dict[str, Stream]:
+
+@lru_cache(maxsize=65536)
+def streams_of(perturbations_json: str) -> Mapping[str, Stream]:
     """View name to the stream that shows it, for an episode with these perturbations."""
     visible = [p for p in from_json(perturbations_json) if isinstance(p, RenderPerturbation | PixelPerturbation)]
     return {view: Stream(view, tuple(p for p in visible if view in p.views)) for view in SCHEMA.views}

@@ -23,6 +23,7 @@ from pipeline.formats.base import Format
 from pipeline.publish.attribution import attributions
 from pipeline.report.yields import LEVELS
 from pipeline.run import manifest
+from pipeline.run.counts import Counts, named, tally, tried
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """What the card is made from, besides the manifest; in the run's folder."""
@@ -189,26 +190,24 @@ def _changes(change: Perturbation, shown: AnyFormat) -> str:
 
 def _episodes(rows: Sequence[Mapping[str, Any]]) -> str:
     """Kept episodes by axis and suite, with totals."""
-    suites = list(dict.fromkeys(row["suite"] for row in rows))
+    suites = named(rows, "suite")
+    lines: list[tuple[str, dict[str, str]]] = [(axis, {"axis": axis}) for axis in named(tried(rows), "axis")]
     body = [
-        [axis, *(cells.get(suite, {}).get("kept", 0) for suite in suites)]
-        for axis, cells in manifest.counts(rows).items()
+        [name, *(Counts.of(rows, suite=suite, **of).kept for suite in suites), Counts.of(rows, **of).kept]
+        for name, of in (*lines, ("**all**", {}))
     ]
-    totals = ["**all**", *(sum(column) for column in zip(*(line[1:] for line in body), strict=True))]
-    return table(["axis", *suites, "all"], [[*line, sum(line[1:])] for line in (*body, totals)])
+    return table(["axis", *suites, "all"], body)
 
 
 def _yields(rows: Sequence[Mapping[str, Any]]) -> str:
     """What became of the planned episodes of each axis."""
-    lost = manifest.tally([row for row in manifest.asked(rows) if not row["kept"]], "reason")
-    modes = manifest.tally([row for row in rows if row["kept"]], "replay_mode")
+    lost = tally([row for row in tried(rows) if not row["kept"]], "reason")
+    modes = tally([row for row in rows if row["kept"]], "replay_mode")
     body = []
-    for axis, cells in manifest.counts(rows).items():
-        planned, replayed, kept = (
-            sum(cell[name] for cell in cells.values()) for name in ("planned", "replayed", "kept")
-        )
+    for axis in named(tried(rows), "axis"):
+        counts = Counts.of(rows, axis=axis)
         told = (_listed(found.get(axis, {})) for found in (lost, modes))
-        body.append([axis, planned, replayed, kept, f"{kept / planned:.0%}", *told])
+        body.append([axis, counts.planned, counts.replayed, counts.kept, f"{counts.kept / counts.planned:.0%}", *told])
     return table(["axis", "planned", "replayed", "kept", "yield", "dropped for", "replayed"], body)
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from pipeline.axes import to_json
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import named
 from pipeline.images.jpeg import encode
@@ -70,6 +69,7 @@ def render(
         geometry={view.stream_id: see(renderer, trajectory, view, instances, config.extras) for view in views},
         object_poses=np.stack(poses) if "object_poses" in config.extras else None,
         instances=instances.names if instances else (),
+        quality=trajectory.quality,
     )
 
 
@@ -77,10 +77,5 @@ def _scenes(streams: Iterable[Stream], in_turn: bool) -> list[list[list[Stream]]
     """The streams of each scene; with ``in_turn``, scenes that differ in textures alone are in one list."""
     groups: dict[str, dict[str, list[Stream]]] = {}
     for stream in streams:
-        groups.setdefault(scene_of(stream, textures=not in_turn), {}).setdefault(scene_of(stream), []).append(stream)
+        groups.setdefault(stream.scene(textures=not in_turn), {}).setdefault(stream.scene(), []).append(stream)
     return [[*scenes.values()] for scenes in groups.values()]
-
-
-def scene_of(stream: Stream, textures: bool = True) -> str:
-    """Tells the scene of a stream from others; without textures, from those that differ in more than these."""
-    return to_json([change for change in changes_of(stream) if textures or not change.paints])

@@ -23,7 +23,7 @@ from pipeline.axes import (
     PhysicsPerturbation,
     of_layer,
 )
-from pipeline.compute.pool import Run
+from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
@@ -33,7 +33,7 @@ from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import first_look, roll_out
-from pipeline.planning.plan import draws_of
+from pipeline.planning.plan import Draws
 from pipeline.planning.streams import Stream
 from pipeline.rendering.frames import frames_of
 from pipeline.rendering.last_scene import LastScene, scene_of_process
@@ -130,7 +130,7 @@ def configured(name: str, config: Config) -> AnyAxis:
 
 def variants(name: str, axis: AnyAxis, demo: Demo, seed: int, test: TestSet) -> list[AnyPerturbation]:
     """Draws of the plan's that cover the axis's components, and within each component its levels."""
-    draws = draws_of(name, (axis,), demo.demo_id, demo.task, seed, test)
+    draws = Draws(name, (axis,), seed, test).of(demo.demo_id, demo.task)
     left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
     chosen: list[AnyPerturbation] = []
     count = PHYSICS_VARIANTS if isinstance(left[0], PhysicsPerturbation) else VARIANTS
@@ -176,7 +176,7 @@ def draw(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
     return sheet(f"{demo.demo_id}, first state; axis {name}, seed {seed}; {', '.join(views)}", tiles)
 
 
-def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
+def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:
     """Draw every configured axis that applies on the first task of each suite that the run is about.
 
     Returns:
@@ -189,7 +189,7 @@ def for_run(config: Config, folder: Path, run: Run) -> dict[str, Path]:
     with replaced(folder) as temporary:
         jobs = [(tasks, config, temporary / suite, test) for suite, tasks in by_suite.items()]
         try:
-            run(_draw_all, jobs, "previews")
+            workers(_draw_all, jobs, "previews")
         finally:
             scene_of_process().close()
     return {suite: folder / suite for suite in by_suite}

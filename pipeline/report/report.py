@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,8 +24,9 @@ from pipeline.report.clips import Clip
 from pipeline.report.coverage import AxisPlots, Draw
 from pipeline.report.figures import Panel
 from pipeline.report.sheets import describe
-from pipeline.report.yields import Rows, Table
-from pipeline.run import manifest
+from pipeline.report.yields import Table
+from pipeline.run import counts, manifest
+from pipeline.run.counts import Counts, Rows
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
@@ -53,9 +55,9 @@ def page(config: Config, test: TestSet) -> str:
     data = config.data
     rows: Rows = manifest.read(data / "manifest.parquet")
     leakage = read_json(data / "leakage.json")
-    load = EpisodeLoader(data / "plan.parquet", data / "frames", config.render)
-    asked = manifest.asked(rows)
-    kept = [row for row in asked if row["kept"]]
+    load = EpisodeLoader(data, config.render)
+    tried = counts.tried(rows)
+    kept = [row for row in tried if row["kept"]]
     if not kept:
         raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
     actions = _actions(kept, FrameStore(data / "frames", config.render))
@@ -64,14 +66,14 @@ def page(config: Config, test: TestSet) -> str:
     return pages.render(
         "report.html.j2",
         name=config.name,
-        headline=_headline(asked, kept),
-        yields=yields.tables(asked),
+        headline=_headline(tried, kept),
+        yields=yields.tables(tried),
         axes=axes,
         overall=_overall(kept, actions),
         by_axis=_own_motion(kept, actions),
         lengths=_lengths(rows, kept),
         seen=seen.measure(config, test),
-        coverage=_coverage(asked, test),
+        coverage=_coverage(tried, test),
         rewrites=_rewrites(kept),
         leakage=leakage,
         videos=_videos(kept, load),
@@ -83,18 +85,16 @@ def page(config: Config, test: TestSet) -> str:
     )
 
 
-def _headline(asked: Rows, kept: Rows) -> dict[str, str]:
+def _headline(tried: Rows, kept: Rows) -> dict[str, str]:
     steps = sum(row["steps"] for row in kept)
-    counts = {
-        "planned": len(asked),
-        "replayed": sum(bool(row["steps"]) for row in asked),
-        "kept": len(kept),
+    headline = {
+        **asdict(Counts.of(tried)),
         "twins among them": sum(row["role"] == "twin" for row in kept),
         "tasks": len({(row["suite"], row["task"]) for row in kept}),
         "steps": steps,
         f"minutes at {SCHEMA.fps_hz} Hz": round(steps / SCHEMA.fps_hz / 60),
     }
-    return {name: f"{count:,}" for name, count in counts.items()}
+    return {name: f"{count:,}" for name, count in headline.items()}
 
 
 def _actions(kept: Rows, frames: FrameStore) -> dict[str, Floats]:
@@ -140,7 +140,7 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
     """Episode lengths by suite, and against the twins', whether these were kept or not."""
     panels = []
     for suite in dict.fromkeys(row["suite"] for row in kept):
-        of_axis = _by_axis(yields.where(kept, suite=suite)).items()
+        of_axis = _by_axis([row for row in kept if row["suite"] == suite]).items()
         lengths = {axis: {axis: np.array([float(row["steps"]) for row in group])} for axis, group in of_axis}
         panels.append(figures.strips(suite, lengths, "steps"))
     steps = {row["episode_id"]: row["steps"] for row in rows}
@@ -159,11 +159,11 @@ def _by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
     return groups
 
 
-def _coverage(asked: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
+def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
     """Axis to its coverage by kept episodes, and its yields by component and level."""
     draws: dict[str, list[Draw]] = {}
     rows: dict[str, list[Mapping[str, Any]]] = {}
-    for row in asked:
+    for row in tried:
         for made in from_json(row["perturbations"]):
             rows.setdefault(made.axis, []).append(row)
             of_axis = draws.setdefault(made.axis, [])
@@ -234,5 +234,5 @@ _Settings.add_multi_representer(
 
 def _settings(config: Config) -> str:
     # Where it is computed changes nothing, and would make the page differ.
-    chosen = config.model_dump(exclude_defaults=True, exclude={"compute"})
+    chosen = config.model_dump(exclude_defaults=True, exclude={"compute", "folder"})
     return yaml.dump(chosen, Dumper=_Settings, sort_keys=False)

@@ -21,22 +21,21 @@ class EpisodeLoader:
     """Loads kept episodes by id; small enough to send to a worker, which reads the plan once for itself.
 
     Attributes:
-        plan_file: the plan's table.
-        frames: folder of the frame store.
+        data: folder with the plan and the frame store.
         config: how its frames are encoded.
     """
 
-    plan_file: Path
-    frames: Path
+    data: Path
     config: RenderConfig
 
     def __call__(self, episode_id: str) -> Episode:
-        row = _rows_by_id(edition(self.plan_file))[episode_id]
+        row = _rows_by_id(edition(self.data / "plan.parquet"))[episode_id]
         shown = streams_of(row.perturbations)
         geometry = {view: stream.geometry.stream_id for view, stream in shown.items()}
-        store = FrameStore(self.frames, self.config)
+        store = FrameStore(self.data / "frames", self.config)
         rendered = store.load(row.trajectory_id, [s.stream_id for s in shown.values()], set(geometry.values()))
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
+        known |= asdict(rendered.quality) if rendered.quality else {}
         known |= {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
         return Episode(
             episode_id=episode_id,

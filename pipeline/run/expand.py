@@ -19,13 +19,13 @@ from pipeline.axes import Axes
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.catalogue.scene_files import portable
-from pipeline.compute.pool import Run
+from pipeline.compute.pool import Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.identity import refuse_unasked
 from pipeline.libero import hdf5
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan
-from pipeline.run.replay import replay_plan
+from pipeline.run.replay_stage import Replays
 from pipeline.scenes.compiled import CompiledScene, proprioception
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
@@ -62,22 +62,27 @@ class Expansion:
     short: dict[str, int] = field(default_factory=dict)
 
 
-def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSet, run: Run) -> Expansion:
+def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: int, workers: Workers) -> Expansion:
     """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
-    Every candidate is a demonstration whose arm starts elsewhere and, where the task moves an object, whose target
-    stands elsewhere. It is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those
+    A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those
     before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was.
+
+    Args:
+        out: folder to write to.
+        demos: what the candidates are made from.
+        rows: what ``candidates`` drew for as many demonstrations.
+        per_task: how many to write.
+        workers: do the work.
 
     Raises:
         PipelineError: when a demonstration cannot be read, or finished replays would be made anew unasked.
     """
-    rows = _rows(demos, per_task, seed, test)
     store = TrajectoryStore(out / ".replays")
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     result = Expansion()
     while True:
-        verdicts = replay_plan(rows, demos, REPLAY, store.root, run)
+        verdicts = Replays(demos, REPLAY, store.root, workers).of(rows)
         outcome = plan.select(rows, verdicts)
         kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
         faults = _faults(kept, rows, store)
@@ -104,8 +109,9 @@ def expand(out: Path, demos: DemosConfig, per_task: int, seed: int, test: TestSe
     return result
 
 
-def _rows(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
-    """The candidates: arm and target moved where a task moves something, the arm alone where it only opens or turns."""
+def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
+    """A plan for ``expand``: in every candidate the arm starts elsewhere, and the target stands elsewhere where the
+    task moves an object; where it only opens or turns something, the arm alone."""
     entries = demos.index().entries
     target = PoseAxis(components=("target",))
     axes = Axes(pose=target, robot=RobotAxis(components=("initial_joints",)))

@@ -9,16 +9,17 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from pipeline.compute.pool import Run, runner
+from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import checksum, keep_below, keep_only, put_in_place, remove, remove_if_empty, replaced, sync
+from pipeline.files import checksum, keep_below, put_in_place, remove, remove_if_empty, replaced, sync, write_json
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
@@ -29,8 +30,19 @@ from pipeline.seeding import digest
 AnyFormat = Format[Any]
 
 
-def export_run(target: Format[Any], config: Config) -> None:
-    """Bring a run's dataset up to date, and say what was done."""
+def export_run(kind: type[AnyFormat], config: Config) -> None:
+    """Bring a run's dataset of one format up to date, and say what was done.
+
+    One that is not asked for is left as it is: where there is none, its record is an empty one.
+    """
+    options = config.export.formats.get(kind.name)
+    if options is None:
+        record = config.data / f"{kind.name}.json"
+        if not record.exists():
+            write_json(record, {})
+        print(f"{kind.title} is not asked for: export.{kind.name} is null")
+        return
+    target = kind(config.data, options, config.render.extras)
     episodes = kept_episodes(config)
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
@@ -44,13 +56,12 @@ def export_run(target: Format[Any], config: Config) -> None:
 def kept_episodes(config: Config) -> Episodes:
     """The kept episodes of a run, in the order they are written."""
     run = outcome.read(config)
-    rows, contents = {row.episode_id: row for row in run.rows}, run.contents()
-    known = {}
+    contents, known = run.contents(), {}
     for episode_id in run.kept:
-        row = rows[episode_id]
+        row = run.row_of[episode_id]
         steps = run.trajectories[row.trajectory_id]["steps"]
         known[episode_id] = Known(row.suite, contents[episode_id], row.demo_id, row.instruction, steps)
-    return Episodes(known, EpisodeLoader(config.data / "plan.parquet", config.data / "frames", config.render))
+    return Episodes(known, EpisodeLoader(config.data, config.render))
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:
@@ -61,17 +72,23 @@ def identity(target: AnyFormat, episodes: Episodes) -> str:
         RECIPES[target.name],
         {package: version(package) for package in PACKAGES[target.name]},
         SCHEMA.model_dump(mode="json"),
-        target.options.model_dump(mode="json"),
+        _options(target),
         target.extras,
         [[piece.path, piece.ids] for piece in target.pieces(episodes)],
         [known.content for known in episodes.known.values()],
     )[:16]
 
 
-def asked(target: AnyFormat, episodes: Episodes) -> str:
+def request(target: AnyFormat, episodes: Episodes) -> str:
     """A short digest of what of it was asked for: the episodes with all that they are, and the options."""
     content = [known.content for known in episodes.known.values()]
-    return digest(target.options.model_dump(mode="json"), target.extras, content)[:16]
+    return digest(_options(target), target.extras, content)[:16]
+
+
+def _options(target: AnyFormat) -> dict[str, Any]:
+    """By the names that the fields had when they were first written."""
+    dumped: dict[str, Any] = target.options.model_dump(mode="json", by_alias=True)
+    return dumped
 
 
 def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
@@ -80,7 +97,7 @@ def outdated(target: AnyFormat, episodes: Episodes) -> Counter[str]:
         record = target.record()
     except PipelineError:
         return Counter()
-    if record.asked != asked(target, episodes) or record.identity == identity(target, episodes):
+    if record.asked != request(target, episodes) or record.identity == identity(target, episodes):
         return Counter()
     return Counter({f"files, made with {differences(record.made_with, _made_with(target))}": len(record.files)})
 
@@ -111,7 +128,7 @@ def untouched(target: AnyFormat) -> bool:
         return False
 
 
-def settle(target: AnyFormat) -> None:
+def notice_changes(target: AnyFormat) -> None:
     """Where files of a finished dataset are gone or have changed, have it count as not there."""
     if not target.record_file.exists() or untouched(target):
         return
@@ -125,16 +142,16 @@ def settle(target: AnyFormat) -> None:
         target.record_file.unlink()
 
 
-def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
+def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     """Write a dataset, replacing the one before, and go on where a killed call with the same episodes was.
 
-    The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``run``, and not
-    on how often the work was interrupted.
+    The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``workers``, and
+    not on how often the work was interrupted.
 
     Args:
         target: the format.
         episodes: what to write.
-        run: spreads the work; one call for each piece.
+        workers: do the work; one call for each piece.
 
     Raises:
         PipelineError: when an episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that
@@ -142,19 +159,19 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     """
     pieces = target.pieces(episodes)
     work = target.work / identity(target, episodes)
-    keep_only(target.work, {work.name})
+    keep_below(target.work, {work})
     finished = work / "record.json"
     if not finished.is_file():
-        _write_pieces(target, work, pieces, episodes.load, run)
+        _write_pieces(target, work, pieces, episodes.load, workers)
         # In a worker, which has the format's packages loaded already.
-        (places,) = run(_Assembly(target, work), [pieces], f"{target.title} assembly")
+        (places,) = workers(partial(_assembled, target, work), [pieces], f"{target.title} assembly")
         dataset = work / "dataset"
         sync(dataset)
         paths = sorted(file for file in dataset.rglob("*") if file.is_file())
-        checksums = run(checksum, paths, f"{target.title} checksums")
+        checksums = workers(checksum, paths, f"{target.title} checksums")
         files = {path.relative_to(dataset).as_posix(): sha256 for path, sha256 in zip(paths, checksums, strict=True)}
         with replaced(finished) as temporary:
-            record = Export(work.name, files, places, asked(target, episodes), _made_with(target))
+            record = Export(work.name, files, places, request(target, episodes), _made_with(target))
             temporary.write_text(json.dumps(asdict(record), indent=0) + "\n")
     target.record_file.unlink(missing_ok=True)  # It is about the dataset before.
     if (work / "dataset").is_dir():
@@ -164,36 +181,26 @@ def export(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     _clear_work(target)
 
 
-def _write_pieces(target: AnyFormat, work: Path, pieces: Sequence[Piece], load: Load, run: Run) -> None:
+def _write_pieces(target: AnyFormat, work: Path, pieces: Sequence[Piece], load: Load, workers: Workers) -> None:
     paths = {work / piece.path: piece for piece in pieces}
     whole = {path for path in paths if path.exists()}
     keep_below(work, whole)
     for folder in {path.parent for path in paths}:
         folder.mkdir(parents=True, exist_ok=True)
     todo = [(path, piece) for path, piece in paths.items() if path not in whole]
-    run(_PieceJob(target, load), todo, f"{target.title} pieces")
+    workers(partial(_write_piece, target, load), todo, f"{target.title} pieces")
 
 
-@dataclass(frozen=True)
-class _PieceJob:
-    target: AnyFormat
-    load: Load
-
-    def __call__(self, todo: tuple[Path, Piece]) -> None:
-        path, piece = todo
-        with replaced(path) as temporary:
-            self.target.write_piece(temporary, piece, self.load)
+def _write_piece(target: AnyFormat, load: Load, todo: tuple[Path, Piece]) -> None:
+    path, piece = todo
+    with replaced(path) as temporary:
+        target.write_piece(temporary, piece, load)
 
 
-@dataclass(frozen=True)
-class _Assembly:
-    target: AnyFormat
-    work: Path
-
-    def __call__(self, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
-        # Without what a worker made that was lost in the middle of it.
-        keep_below(self.work, {self.work / piece.path for piece in pieces})
-        return self.target.assemble(self.work, pieces)
+def _assembled(target: AnyFormat, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
+    # Without what a worker made that was lost in the middle of it.
+    keep_below(work, {work / piece.path for piece in pieces})
+    return target.assemble(work, pieces)
 
 
 def _clear_work(target: AnyFormat) -> None:

@@ -80,7 +80,12 @@ def of_validate(config: Config) -> Memory:
         *(one.record_file for one in formats),
     ]
     whole = all(store.untouched() for store in stores) and all(untouched(one) for one in formats)
-    settings = [_settings(config.render), _settings(config.export), _settings(config.plan.axes), checksum(BANK_FILE)]
+    settings = [
+        settings_of(config.render),
+        settings_of(config.export),
+        settings_of(config.plan.axes),
+        checksum(BANK_FILE),
+    ]
     made_by = fingerprint("checks", *settings, _contents(files, config.data)) if whole else None
     return Memory(config.data, "validate", made_by, ["validation.json"])
 
@@ -97,7 +102,7 @@ def of_summary(config: Config) -> Memory:
     """Of the contact sheets and previews."""
     frames = FrameStore(config.data / "frames", config.render)
     files = [*(config.data / name for name in ("plan.parquet", "manifest.parquet", "inputs.json")), frames.root / TABLE]
-    settings = [_settings(config.demos), _settings(config.plan), _settings(config.replay)]
+    settings = [settings_of(config.demos), settings_of(config.plan), settings_of(config.replay)]
     made_by = fingerprint("pictures", *settings, _contents(files, config.data)) if frames.untouched() else None
     return Memory(config.data, "summary", made_by, ["sheets", "previews"])
 
@@ -108,7 +113,7 @@ def of_report(config: Config) -> Memory:
     names = ("plan.parquet", "manifest.parquet", "leakage.json", "inputs.json")
     pictures = [file for name in ("sheets", "previews") for file in _files(config.data / name)]
     files = [*(config.data / name for name in names), frames.root / TABLE, *pictures]
-    settings = [_settings(config, {"compute"}), checksum(SEEN)]
+    settings = [settings_of(config, {"compute", "folder"}), checksum(SEEN)]
     made_by = fingerprint("pictures", *settings, _contents(files, config.data)) if frames.untouched() else None
     return Memory(config.data, "report", made_by, ["report.html"])
 
@@ -117,9 +122,12 @@ def _contents(files: Sequence[Path], data: Path) -> Mapping[str, str]:
     return {file.relative_to(data).as_posix(): checksum(file) for file in files if file.exists()}
 
 
-def _settings(section: BaseModel, but: Set[str] = frozenset()) -> object:
+def settings_of(section: BaseModel, but: Set[str] = frozenset()) -> dict[str, Any]:
     """JSON-serialisable; of a path the name alone, as ``inputs.json`` tells what lies there."""
-    return json.loads(json.dumps(section.model_dump(exclude=set(but)), default=lambda path: PurePath(path).name))
+    # By the names that the fields had when they were first written.
+    dumped = section.model_dump(exclude=set(but), by_alias=True)
+    listed: dict[str, Any] = json.loads(json.dumps(dumped, default=lambda path: PurePath(path).name))
+    return listed
 
 
 def _files(path: Path) -> list[Path]:

@@ -1,13 +1,12 @@
-"""The user's own files that a configuration names: demonstrations, a bank of rewrites, folders of textures and objects.
+"""What DVC cannot read off a configuration: what it leaves to defaults, and what lies in the files that it names.
 
-DVC cannot know them, as they are named in the configuration. So a stage lists them each time, and the plan depends on
-the list: a changed file is noticed, and the same list runs nothing again.
+Those are demonstrations, a bank of rewrites, folders of textures and objects. A stage writes out the configuration and
+lists these files each time, and other stages depend on that: a changed file is noticed, and where both are the same
+nothing runs again.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,7 +14,8 @@ from typing import Any
 from pydantic import BaseModel
 
 from pipeline.config import Config
-from pipeline.files import replaced
+from pipeline.files import checksum
+from pipeline.run.finished import settings_of
 
 HASHED_BYTES = 16_000_000
 """Files up to this size are listed by their content; larger ones by size and time of change, as hashing takes long."""
@@ -29,14 +29,17 @@ def listing(config: Config) -> dict[str, list[str | int]]:
     """
     return {
         (PurePosixPath(field) / file.relative_to(path)).as_posix(): _state(file)
-        for field, path in _paths(dict(config))
+        for field, path in _paths({name: section for name, section in config if name != "folder"})
         for file in sorted(_files(path))
     }
 
 
-def write(listed: Mapping[str, list[str | int]], path: Path) -> None:
-    with replaced(path) as temporary:
-        temporary.write_text(json.dumps(listed, indent=0) + "\n")
+def settings(config: Config) -> dict[str, Any]:
+    """Every section that decides what is made, with all fields; of a path the last name, as for ``listing``."""
+    sections = {
+        name: settings_of(getattr(config, name)) for name in ("demos", "plan", "replay", "filter", "render", "export")
+    }
+    return {**sections, "export": {"where": None, **sections["export"]}}
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:
@@ -68,5 +71,5 @@ def _files(path: Path) -> Iterator[Path]:
 def _state(file: Path) -> list[str | int]:
     status = file.stat()
     if status.st_size <= HASHED_BYTES:
-        return [hashlib.sha256(file.read_bytes()).hexdigest()]
+        return [checksum(file)]
     return [status.st_size, status.st_mtime_ns]

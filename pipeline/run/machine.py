@@ -6,12 +6,19 @@ files goes on only where the same versions and the same device give the same dig
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
+from pipeline import gl
+from pipeline.config import ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import read_json, write_json
 from pipeline.identity import fingerprint, made_with
+from pipeline.libero.demonstrations import StarterSource
+from pipeline.libero.tasks import find_task
 
 FILE = "machine.json"
 """File of a run's folder that says what it began with, and what trials came to."""
@@ -19,13 +26,39 @@ FILE = "machine.json"
 STORES = {"ten steps": ("trajectories", "frames"), "one frame": ("frames",)}
 """What of a trial stands for the files of which folders."""
 
+TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
+"""What is simulated and rendered to see whether this machine still gives the same numbers and the same picture."""
+
+
+@cache
+def trial() -> dict[str, str]:
+    """Digests of ten control steps and of a frame of their end, and the device that rendered it."""
+    from pipeline.physics.environment import Environment
+    from pipeline.physics.replay import replay
+    from pipeline.rendering.renderer import Renderer
+
+    demo = StarterSource().of(find_task(*TRIAL_TASK))
+    environment = Environment(demo.task)
+    short = replace(demo, actions=demo.actions[:TRIAL_STEPS])
+    trajectory = replay(environment, short, "trial", ReplayConfig(mode="open_loop", noops="keep"))
+    environment.close()
+    renderer = Renderer(trajectory.model_xml)
+    renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
+    frame = renderer.frame("agentview")
+    renderer.close()
+    return {
+        "OpenGL device": gl.choose().device,
+        "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],
+        "one frame": hashlib.sha256(frame.tobytes()).hexdigest()[:16],
+    }
+
 
 def record(folder: Path, trial: Mapping[str, str]) -> None:
     """Write what is here, unless the run was begun where the trial came to something else.
 
     Args:
         folder: of the run.
-        trial: see ``pipeline.validation.doctor.trial``.
+        trial: see ``trial``.
 
     Raises:
         PipelineError: as ``refuse_another``.

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import ValidationError
-from rich.table import Table
 
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
@@ -20,6 +18,7 @@ from pipeline.identity import VERSIONS, versions
 from pipeline.planning import plan
 from pipeline.run.outcome import Outcome
 from pipeline.tables import column, columns_of, read_table, write_table
+from pipeline.types import Quality
 
 OWN_VERSION = "pipeline_version"
 """The column for the version of this project, which is information: what is current, recipe numbers decide."""
@@ -35,7 +34,8 @@ class Result:
     reason: Annotated[
         str,
         "kept, or why not: goal_not_reached, goal_lost, too_short, simulation_unstable, too_dark, blown_out, what a "
-        "physics perturbation was refused for, not_replayed, reserve_not_needed",
+        "physics perturbation was refused for, the figure that `filter` "
+        "refuses, not_replayed, reserve_not_needed, left_out (export.where names others)",
     ]
     replay_mode: Annotated[
         str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"
@@ -73,7 +73,7 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
         places: episode id to where it lies in the datasets, for every kept episode.
         columns: those of ``places``.
     """
-    shared = {version_column(name): version for name, version in versions().items()}
+    own_versions = {version_column(name): version for name, version in versions().items()}
     table = []
     for row in run.rows:
         verdict = run.verdicts[row.episode_id]
@@ -87,7 +87,8 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
             resolved=replayed.get("resolved"),
             gl_device=rendered.device if rendered else None,
         )
-        table.append({**asdict(row), **asdict(result), **places.get(row.episode_id, {}), **shared})
+        quality = {each.name: replayed.get(each.name) for each in fields(Quality)}
+        table.append({**asdict(row), **asdict(result), **quality, **places.get(row.episode_id, {}), **own_versions})
     return pa.Table.from_pylist(table, schema=schema(columns))
 
 
@@ -97,9 +98,9 @@ def version_column(name: str) -> str:
 
 
 def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
-    """The manifest's columns: of the plan, of its result, where an episode lies in each dataset, and the versions."""
+    """The columns: of the plan, its result and quality, where an episode lies in each dataset, and the versions."""
     made_by = [column(version_column(name), pa.string(), meaning) for name, meaning in VERSIONS.items()]
-    return pa.schema([*columns_of(plan.Row), *columns_of(Result), *places, *made_by])
+    return pa.schema([*columns_of(plan.Row), *columns_of(Result), *columns_of(Quality), *places, *made_by])
 
 
 def described() -> dict[str, Any]:
@@ -153,57 +154,3 @@ def made_with(row: Mapping[str, Any]) -> dict[str, str]:
         for column, version in row.items()
         if column.endswith("_version")
     }
-
-
-def asked(manifest: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """The rows that were tried: all but the reserves that were not needed."""
-    return [row for row in manifest if row["reason"] != "reserve_not_needed"]
-
-
-def tally(manifest: Sequence[Mapping[str, Any]], column: str) -> dict[str, Counter[str]]:
-    """Axis to how often each value of a column occurs on it."""
-    found: dict[str, Counter[str]] = {}
-    for row in manifest:
-        found.setdefault(row["axis"], Counter())[row[column]] += 1
-    return found
-
-
-def counts(manifest: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, dict[str, int]]]:
-    """Axis to suite to the number of episodes planned, replayed and kept.
-
-    A reserve counts as planned once it was needed, so that ``planned - kept`` is what was lost on the way.
-    """
-    table: dict[str, dict[str, dict[str, int]]] = {}
-    for row in asked(manifest):
-        cell = table.setdefault(row["axis"], {}).setdefault(row["suite"], {"planned": 0, "replayed": 0, "kept": 0})
-        cell["planned"] += 1
-        cell["replayed"] += bool(row["steps"])
-        cell["kept"] += row["kept"]
-    return table
-
-
-def counts_table(manifest: Sequence[Mapping[str, Any]]) -> Table:
-    """``counts`` as a table for people, with a line of totals."""
-    cells = counts(manifest)
-    suites = list(dict.fromkeys(row["suite"] for row in manifest))
-    table = Table(
-        "axis", *(suite.removeprefix("libero_") for suite in suites), "all", title="planned/replayed/kept episodes"
-    )
-    for cells_of in table.columns[1:]:
-        cells_of.justify, cells_of.no_wrap = "right", True
-    for axis, by_suite in cells.items():
-        shown = [by_suite.get(suite, {}) for suite in suites]
-        # A combination's name may break behind a +.
-        table.add_row(axis.replace("+", "+ "), *map(_cell, shown), _cell(_sum(shown)))
-    columns = [_sum([by_suite.get(suite, {}) for by_suite in cells.values()]) for suite in suites]
-    table.add_section()
-    table.add_row("all", *map(_cell, columns), _cell(_sum(columns)))
-    return table
-
-
-def _sum(cells: Sequence[Mapping[str, int]]) -> dict[str, int]:
-    return {name: sum(cell.get(name, 0) for cell in cells) for name in ("planned", "replayed", "kept")}
-
-
-def _cell(cell: Mapping[str, int]) -> str:
-    return "/".join(map(str, cell.values())) or "-"

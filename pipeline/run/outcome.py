@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import Config
+from pipeline.config import Config, FilterConfig
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
@@ -16,6 +16,9 @@ from pipeline.seeding import digest
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
+
+LEFT_OUT = "left_out"
+"""The reason why an episode that reached its goal is in no dataset: ``export.where`` does not name it."""
 
 
 @dataclass(frozen=True)
@@ -40,21 +43,26 @@ class Outcome:
         ids = [row.episode_id for row in self.rows if self.verdicts[row.episode_id].kept]
         return sorted(ids, key=lambda episode_id: digest("order", episode_id))
 
+    @cached_property
+    def row_of(self) -> dict[str, plan.Row]:
+        """Episode id to its row of the plan."""
+        return {row.episode_id: row for row in self.rows}
+
     def contents(self) -> dict[str, str]:
         """Kept episode id to a short name of its content: equal names, equal bytes in a dataset."""
-        rows = {row.episode_id: row for row in self.rows}
-        return {
-            episode_id: digest(asdict(rows[episode_id]), *self._made_by(rows[episode_id]))[:16]
-            for episode_id in self.kept
-        }
-
-    def _made_by(self, row: plan.Row) -> tuple[object, ...]:
-        frames = self.frames[row.trajectory_id]
-        return frames.made_by, frames.device, frames.replay_mode
+        named = {}
+        for episode_id in self.kept:
+            row = self.row_of[episode_id]
+            frames = self.frames[row.trajectory_id]
+            named[episode_id] = digest(asdict(row), frames.made_by, frames.device, frames.replay_mode)[:16]
+        return named
 
 
 def replayed(
-    rows: Sequence[plan.Row], folder: Path, rejected: Mapping[str, str] | None = None
+    rows: Sequence[plan.Row],
+    folder: Path,
+    rejected: Mapping[str, str] | None = None,
+    limits: FilterConfig = FilterConfig(),  # noqa: B008 - frozen
 ) -> dict[str, dict[str, Any]]:
     """Trajectory id to its row in the table of replays.
 
@@ -62,14 +70,15 @@ def replayed(
         rows: the plan.
         folder: of the trajectory store.
         rejected: episode id to the reason why its frames were rejected.
+        limits: of quality.
 
     Raises:
         PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
     """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
-    needed = plan.pending(rows, verdicts_of(trajectories), rejected)
-    # What takes the place of refused frames, only the stage render replays.
+    needed = plan.pending(rows, verdicts_of(trajectories, limits), rejected)
+    # What takes the place of rejected frames, only the stage render replays.
     _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
 
@@ -91,7 +100,7 @@ def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[st
 
 
 def read(config: Config) -> Outcome:
-    """What became of every row of a run, after the render stage.
+    """What became of every row of a run, after the render stage, and what of it ``export.where`` leaves out.
 
     Raises:
         PipelineError: when a trajectory or a frame that the plan needs is not there, or can no longer be read.
@@ -100,8 +109,12 @@ def read(config: Config) -> Outcome:
     store = FrameStore(config.data / "frames", config.render)
     frames = shown_of(store.rows())
     rejected = rejections(rows, frames)
-    trajectories = replayed(rows, config.data / "trajectories", rejected)
-    judged = plan.select(rows, verdicts_of(trajectories), rejected)
+    trajectories = replayed(rows, config.data / "trajectories", rejected, config.filter)
+    judged = plan.select(rows, verdicts_of(trajectories, config.filter), rejected)
+    if where := config.export.where:
+        for row in rows:
+            if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
+                judged[row.episode_id] = Verdict(False, LEFT_OUT)
     missing = dict.fromkeys(
         store.folder(row.trajectory_id)
         for row in rows

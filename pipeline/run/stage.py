@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import yaml
+
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import exit_status
@@ -19,6 +21,9 @@ from pipeline.identity import REMAKE
 
 OWNER = "configuration.json"
 """File of a run's folder that says which configuration file the folder belongs to."""
+
+PARAMS = Path("params.yaml")
+"""Says which run `dvc repro` makes, and in which folder."""
 
 LOCK = ".lock"
 """Empty file of a run's folder that a stage holds while it runs."""
@@ -53,6 +58,7 @@ def claimed(file: Path) -> Config:
         PipelineError: when the configuration is not valid, or the folder belongs to another file.
     """
     config = load(file)
+    _refuse_other_folder(config, file)
     config.data.mkdir(parents=True, exist_ok=True)
     mark = config.data / OWNER
     if not mark.exists():
@@ -97,6 +103,18 @@ def owned(file: Path) -> Config:
     if (config.data / OWNER).exists():
         _refuse_foreign(config, file)
     return config
+
+
+def _refuse_other_folder(config: Config, file: Path) -> None:
+    """DVC knows the folder from params.yaml alone, and would look for a stage's files there."""
+    chosen = yaml.safe_load(PARAMS.read_text()) if PARAMS.is_file() else None
+    if isinstance(chosen, dict) and chosen.get("run") == file.stem and chosen.get("data") != config.folder.as_posix():
+        raise PipelineError(
+            f"says `data: {chosen.get('data')}`, and {file} says `folder: {config.folder}`",
+            where=PARAMS,
+            expected="the same folder in both",
+            remedy=f"python -m pipeline run {file}, which writes it into {PARAMS}",
+        )
 
 
 def _refuse_foreign(config: Config, file: Path) -> None:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import h5py
 import numpy as np
@@ -20,22 +20,13 @@ from numpy.typing import NDArray
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.identity import fingerprint, made_with
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
-from pipeline.types import Geometry, Rendered
+from pipeline.types import Geometry, Quality, Rendered
 
 _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 """The schema's parts that say what files of a store hold."""
-
-_COLUMNS = {
-    "device": pa.string(),
-    "replay_mode": pa.string(),
-    "steps": pa.int64(),
-    "streams": pa.list_(pa.string()),
-    "rejected": pa.string(),
-}
 
 
 @dataclass(frozen=True)
@@ -67,12 +58,28 @@ class FrameStore(Store):
         config: how frames are encoded; what was encoded otherwise counts as missing.
     """
 
+    step, stage, pattern = "encoding", "render", "*/*.h5"
+    columns: ClassVar = {
+        "device": pa.string(),
+        "replay_mode": pa.string(),
+        "steps": pa.int64(),
+        "streams": pa.list_(pa.string()),
+        "rejected": pa.string(),
+    }
+
     def __init__(self, root: Path, config: RenderConfig):
         shown = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        settings = config.model_dump(mode="json")
-        made_by = fingerprint("encoding", settings, shown)
-        here = {**made_with("encoding"), "episode schema": digest(shown)[:8]}
-        super().__init__(root, made_by, here, settings, "render", _COLUMNS, _describe, files="*/*.h5")
+        super().__init__(root, config.model_dump(mode="json"), {"episode schema": shown})
+
+    @staticmethod
+    def describe(file: SealedFile) -> dict[str, Any]:
+        return {
+            "device": file.attributes["device"],
+            "replay_mode": file.attributes["replay_mode"],
+            "steps": file.length("action"),
+            "streams": file.groups("streams"),
+            "rejected": file.attributes["rejected"],
+        }
 
     def folder(self, trajectory_id: str) -> Path:
         return self.root / trajectory_id
@@ -90,6 +97,7 @@ class FrameStore(Store):
             "replay_mode": rendered.replay_mode,
             "instances": list(rendered.instances),
             "rejected": json.dumps(dict(rendered.rejected), sort_keys=True),
+            "quality": asdict(rendered.quality) if rendered.quality else None,
         }
         with self.created(file_name(trajectory_id, {*rendered.streams, *rendered.rejected}), attributes) as file:
             for name in ("state", "joint_state", "action"):
@@ -134,7 +142,7 @@ class FrameStore(Store):
                 where=self.folder(trajectory_id),
                 remedy="run the render stage again",
             )
-        return joined(parts)
+        return merged(parts)
 
     def stored(self, trajectory_id: str, streams: Mapping[str, str], device: str) -> list[Rendered]:
         """What files hold of the named streams of a trajectory, each stream once; a damaged file counts as missing.
@@ -149,8 +157,9 @@ class FrameStore(Store):
         for name in self._files_of(trajectory_id):
             try:
                 with self.opened(name) as file:
-                    row = _describe(file)
-                    here = missing & stream_ids(row) if row["device"] == device else set()
+                    row = self.describe(file)
+                    told = {*row["streams"], *json.loads(row["rejected"])}
+                    here = missing & told if row["device"] == device else set()
                     if here:
                         frames = here & set(row["streams"])
                         part = _rendered(file, frames, {streams[stream] for stream in frames})
@@ -191,11 +200,6 @@ def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
     return f"{trajectory_id}/{digest(*sorted(streams))[:16]}"
 
 
-def stream_ids(row: Mapping[str, Any]) -> set[str]:
-    """The streams that a row of the table accounts for: rendered, or rejected."""
-    return {*row["streams"], *json.loads(row["rejected"])}
-
-
 def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
     """Trajectory id to what its files hold, from their rows of the table."""
     shown: dict[str, Shown] = {}
@@ -207,7 +211,7 @@ def shown_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Shown]:
     return shown
 
 
-def joined(parts: Sequence[Rendered]) -> Rendered:
+def merged(parts: Sequence[Rendered]) -> Rendered:
     """Streams of one trajectory that were rendered or stored apart; one part at least.
 
     What all streams share comes from a part that was rendered, where there is one: who stored that a worker was lost
@@ -233,6 +237,7 @@ def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[s
         geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
         object_poses=file.array("object_poses") if "object_poses" in file else None,
         instances=file.attributes["instances"],
+        quality=Quality(**quality) if (quality := file.attributes["quality"]) else None,
     )
 
 
@@ -251,13 +256,3 @@ def _frames(file: SealedFile, stream: str) -> list[bytes]:
     packed = file.array(f"{stream}/bytes").tobytes()
     ends = file.array(f"{stream}/ends").tolist()
     return [packed[start:end] for start, end in zip([0, *ends[:-1]], ends, strict=True)]
-
-
-def _describe(file: SealedFile) -> dict[str, Any]:
-    return {
-        "device": file.attributes["device"],
-        "replay_mode": file.attributes["replay_mode"],
-        "steps": file.length("action"),
-        "streams": file.groups("streams"),
-        "rejected": file.attributes["rejected"],
-    }

@@ -11,11 +11,13 @@ table; any other file is opened and read. For people, the table's metadata says 
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import h5py
 import pyarrow as pa
@@ -23,7 +25,8 @@ import pyarrow.parquet as pq
 
 from pipeline.errors import PipelineError
 from pipeline.files import keep_below, replaced
-from pipeline.identity import differences
+from pipeline.identity import Step, differences, fingerprint, made_with
+from pipeline.seeding import digest
 from pipeline.stores.sealed_file import BrokenSealError, SealedFile, sealed, unsealed
 from pipeline.tables import read_table, write_table
 
@@ -33,39 +36,37 @@ _MADE_WITH = b"made_with"
 """The table's metadata that has, as JSON, a fingerprint to what files of it were made with."""
 
 
-class Store:
+class Store(ABC):
     """The files of one stage.
 
     Args:
         root: the folder.
-        made_by: the fingerprint (``pipeline.identity``) of files that are current; others count as missing.
-        made_with: what it is made of, in words.
-        settings: and the user's settings in it, JSON-serialisable.
-        stage: which stage makes them, for messages.
-        columns: of the table, beside ``file``, ``made_by`` and ``bytes``.
-        describe: reads those columns from an open file.
-        files: how they lie below ``root``, as a pattern.
+        settings: JSON-serialisable, those of the user that the bytes depend on; files with others count as missing.
+        form: what else of this project they depend on, by its name for people.
     """
 
-    def __init__(
-        self,
-        root: Path,
-        made_by: str,
-        made_with: Mapping[str, str],
-        settings: object,
-        stage: str,
-        columns: Mapping[str, pa.DataType],
-        describe: Callable[[SealedFile], dict[str, Any]],
-        files: str = "*.h5",
-    ):
+    step: ClassVar[Step]
+    """What makes the files, in ``pipeline/identity.py``."""
+    stage: ClassVar[str]
+    """Which stage makes them anew, for messages."""
+    columns: ClassVar[Mapping[str, pa.DataType]]
+    """Of the table, beside ``file``, ``made_by`` and ``bytes``."""
+    pattern: ClassVar[str] = "*.h5"
+    """How the files lie below ``root``."""
+
+    def __init__(self, root: Path, settings: object = None, form: Mapping[str, object] = MappingProxyType({})):
         self.root = root
-        self.made_by = made_by
-        self._made_with: dict[str, Any] = {"made_with": dict(made_with), "settings": settings}
-        self._stage = stage
-        self._describe = describe
-        self._files = files
+        parts = [settings, *form.values()] if settings is not None else []
+        self.made_by = fingerprint(self.step, *parts)
+        here = {**made_with(self.step), **{name: digest(value)[:8] for name, value in form.items()}}
+        self._made_with: dict[str, Any] = {"made_with": here, "settings": settings}
         common = {"file": pa.string(), "made_by": pa.string(), "bytes": pa.int64()}
-        self._schema = pa.schema(list((common | dict(columns)).items()))
+        self._schema = pa.schema(list((common | dict(self.columns)).items()))
+
+    @staticmethod
+    @abstractmethod
+    def describe(file: SealedFile) -> dict[str, Any]:
+        """A file's values of ``columns``."""
 
     def path(self, name: str) -> Path:
         """Where a file lies; its name may have folders in it, and has no suffix."""
@@ -73,7 +74,7 @@ class Store:
 
     def names(self) -> list[str]:
         """Of all files, current or not."""
-        return sorted(path.relative_to(self.root).with_suffix("").as_posix() for path in self.root.glob(self._files))
+        return sorted(path.relative_to(self.root).with_suffix("").as_posix() for path in self.root.glob(self.pattern))
 
     @contextmanager
     def created(self, name: str, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
@@ -96,7 +97,7 @@ class Store:
         Raises:
             PipelineError: when it is missing, damaged, or not current.
         """
-        path, remedy = self.path(name), f"run the {self._stage} stage again"
+        path, remedy = self.path(name), f"run the {self.stage} stage again"
         if not path.exists():
             raise PipelineError("missing", where=path, remedy=remedy)
         try:
@@ -145,8 +146,12 @@ class Store:
 
     def row(self, name: str) -> dict[str, Any] | None:
         """One row, read from the file; None when that is missing, damaged or not current."""
-        path = self.path(name)
-        return self._read(name, path.stat().st_size) if path.exists() else None
+        try:
+            with self.opened(name) as file:
+                described = self.describe(file)
+        except PipelineError:
+            return None
+        return {"file": name, "made_by": self.made_by, "bytes": self.path(name).stat().st_size, **described}
 
     def _table(self) -> tuple[dict[str, dict[str, Any]], int]:
         """The rows that were written last, and when; none when the table is missing or damaged."""
@@ -157,19 +162,11 @@ class Store:
         except PipelineError:
             return {}, 0
 
-    def _read(self, name: str, size: int) -> dict[str, Any] | None:
-        try:
-            with self.opened(name) as file:
-                described = self._describe(file)
-        except PipelineError:
-            return None
-        return {"file": name, "made_by": self.made_by, "bytes": size, **described}
-
     def untouched(self) -> bool:
         """Whether the table tells of every file that is there, and none has changed since."""
         return self._rows()[1]
 
-    def settle(self) -> None:
+    def notice_changes(self) -> None:
         """Where files are gone or have changed since the table was written, have it tell so."""
         if (self.root / TABLE).exists() and self._believed()[1]:
             self.refresh()

@@ -4,38 +4,50 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
 
 from pipeline.catalogue.scene_files import located, portable
-from pipeline.identity import fingerprint, made_with
+from pipeline.config import FilterConfig
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
-from pipeline.types import Scene, Trajectory, Verdict
-
-_COLUMNS = {
-    "kept": pa.bool_(),
-    "reason": pa.string(),
-    "mode": pa.string(),
-    "steps": pa.int64(),
-    "resolved": pa.string(),
-}
+from pipeline.tables import columns_of
+from pipeline.types import Quality, Scene, Trajectory, Verdict
 
 
 class TrajectoryStore(Store):
     """Trajectories under one folder.
 
     The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (how the actions came about), ``steps``
-    (how many were executed) and ``resolved`` (JSON of what physics perturbations did in the scene).
+    (how many were executed), ``resolved`` (JSON of what physics perturbations did in the scene), and those of
+    ``Quality``.
 
     A file holds no path of the machine, so that it is the same, and can be read, wherever the packages are installed.
     """
 
-    def __init__(self, root: Path):
-        super().__init__(root, fingerprint("physics"), made_with("physics"), None, "render", _COLUMNS, _describe)
+    step, stage = "physics", "render"
+    columns: ClassVar = {
+        "kept": pa.bool_(),
+        "reason": pa.string(),
+        "mode": pa.string(),
+        "steps": pa.int64(),
+        "resolved": pa.string(),
+        **{each.name: each.type for each in columns_of(Quality)},
+    }
+
+    @staticmethod
+    def describe(file: SealedFile) -> dict[str, Any]:
+        return {
+            "kept": file.attributes["kept"],
+            "reason": file.attributes["reason"],
+            "mode": file.attributes["mode"],
+            "steps": file.length("actions"),
+            "resolved": file.attributes["resolved"],
+            **(file.attributes["quality"] or {}),
+        }
 
     def save(self, trajectory: Trajectory) -> None:
         attributes = {
@@ -43,6 +55,7 @@ class TrajectoryStore(Store):
             "kept": bool(trajectory.verdict.kept),
             "reason": trajectory.verdict.reason,
             "resolved": trajectory.resolved,
+            "quality": asdict(trajectory.quality) if trajectory.quality else None,
             "gripper": trajectory.scene.gripper,
             "posture_rad": trajectory.scene.posture_rad,
         }
@@ -76,19 +89,15 @@ class TrajectoryStore(Store):
                 actions=file.array("actions"),
                 site_alpha=file.array("site_alpha"),
                 verdict=Verdict(file.attributes["kept"], file.attributes["reason"]),
+                quality=Quality(**quality) if (quality := file.attributes["quality"]) else None,
             )
 
 
-def verdicts_of(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Verdict]:
-    """Trajectory id to verdict, from the rows of the table."""
-    return {trajectory_id: Verdict(row["kept"], row["reason"]) for trajectory_id, row in rows.items()}
+def verdicts_of(rows: Mapping[str, Mapping[str, Any]], limits: FilterConfig) -> dict[str, Verdict]:
+    """Trajectory id to verdict, from the rows of the table and the limits of quality."""
+    return {trajectory_id: _verdict(row, limits) for trajectory_id, row in rows.items()}
 
 
-def _describe(file: SealedFile) -> dict[str, Any]:
-    return {
-        "kept": file.attributes["kept"],
-        "reason": file.attributes["reason"],
-        "mode": file.attributes["mode"],
-        "steps": file.length("actions"),
-        "resolved": file.attributes["resolved"],
-    }
+def _verdict(row: Mapping[str, Any], limits: FilterConfig) -> Verdict:
+    fault = limits.fault(row) if row["kept"] else None
+    return Verdict(False, fault) if fault else Verdict(row["kept"], row["reason"])

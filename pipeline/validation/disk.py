@@ -52,7 +52,8 @@ def needed_mb(config: Config) -> dict[str, float]:
     frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
     map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
     poses_kb = POSES_KB if "object_poses" in extras else 0.0
-    shown_kb = VIDEO_KB if config.export.lerobot.frames == "video" else views * frame_kb + MOTION_KB
+    lerobot = config.export.lerobot
+    shown_kb = VIDEO_KB if lerobot and lerobot.frames == "video" else views * frame_kb + MOTION_KB
     needed_kb = {
         "trajectories": (twins + own.trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
         "frames": (views * twin_steps + own.frames * mean_steps) * frame_kb
@@ -61,7 +62,8 @@ def needed_mb(config: Config) -> dict[str, float]:
         "rlds": steps * (views * (frame_kb + map_kb) + poses_kb + MOTION_KB) + episodes * EPISODE_KB,
         "lerobot": steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB,
     }
-    return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
+    left_out = {"rlds", "lerobot"} - set(config.export.formats)
+    return {folder: kb / 1e3 for folder, kb in needed_kb.items() if folder not in left_out} | {"sheets": RUN_MB}
 
 
 class _Own(NamedTuple):

@@ -8,8 +8,7 @@ import hashlib
 import shutil
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, PackagePath, distribution, requires, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -22,12 +21,12 @@ from rich.text import Text
 
 from pipeline import gl
 from pipeline.catalogue import object_sources, sweethome3d, texture_sources, wheels
-from pipeline.config import ComputeConfig, Config, DemosConfig, ReplayConfig
+from pipeline.config import ComputeConfig, Config, DemosConfig
 from pipeline.errors import PipelineError
-from pipeline.libero.demonstrations import HDF5Source, StarterSource
-from pipeline.libero.tasks import find_task, select_tasks
+from pipeline.libero.demonstrations import HDF5Source
+from pipeline.libero.tasks import select_tasks
 from pipeline.planning import plan
-from pipeline.run.machine import refuse_another
+from pipeline.run import machine
 from pipeline.run.remake import outdated
 from pipeline.testset import benchmark
 from pipeline.validation.disk import RUN_MB, needed_mb
@@ -39,10 +38,6 @@ STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
 WORKER_GB = 3.5
 """Memory of one worker process; in the default run, one took 1.3 GB in replay, 2.5 in render, and 3.4 at the most in
 validate and summary."""
-
-TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
-"""What is simulated and rendered to see whether this machine still gives the same numbers and the same picture."""
-
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -115,7 +110,7 @@ def run(config: Config, *, tried: bool = False) -> int:
 def _same(data: Path) -> Diagnosis:
     """Whether a run that was begun elsewhere would go on here with the same."""
     try:
-        refuse_another(data, trial())
+        machine.refuse_another(data, machine.trial())
     except PipelineError as error:
         return Diagnosis("same machine", "fail", error.what, error.remedy or "")
     return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or nothing was made yet")
@@ -129,29 +124,6 @@ def _finished(config: Config) -> Diagnosis:
         return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
     told = "; ".join(f"{number} {what}" for what, number in found.items())
     return Diagnosis("finished work", "warn", f"outdated: {told}", "go on where it was made, or `REMAKE=1 dvc repro`")
-
-
-@cache
-def trial() -> dict[str, str]:
-    """Digests of ten control steps and of a frame of their end, and the device that rendered it."""
-    from pipeline.physics.environment import Environment
-    from pipeline.physics.replay import replay
-    from pipeline.rendering.renderer import Renderer
-
-    demo = StarterSource().of(find_task(*TRIAL_TASK))
-    environment = Environment(demo.task)
-    short = replace(demo, actions=demo.actions[:TRIAL_STEPS])
-    trajectory = replay(environment, short, "trial", ReplayConfig(mode="open_loop", noops="keep"))
-    environment.close()
-    renderer = Renderer(trajectory.model_xml)
-    renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
-    frame = renderer.frame("agentview")
-    renderer.close()
-    return {
-        "OpenGL device": gl.choose().device,
-        "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],
-        "one frame": hashlib.sha256(frame.tobytes()).hexdigest()[:16],
-    }
 
 
 def _workers_here(compute: ComputeConfig) -> int | None:

@@ -11,7 +11,7 @@ from pipeline import seeding
 from pipeline.axes.language import distance
 from pipeline.axes.noise import NoiseAxis
 from pipeline.episode_schema import SCHEMA
-from pipeline.validation.doctor import trial
+from pipeline.run.machine import trial
 
 
 def compile_all() -> None:

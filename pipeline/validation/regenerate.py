@@ -1,6 +1,6 @@
 """Rebuild one episode from its row of the manifest and the demonstration, and say where it differs from the dataset's.
 
-`python -m pipeline regenerate EPISODE_ID --manifest data/<run>/manifest.parquet --out FOLDER`
+`python -m pipeline regenerate EPISODE_ID CONFIG --out FOLDER`
 """
 
 from __future__ import annotations
@@ -24,14 +24,13 @@ from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, record_at
 from pipeline.identity import versions
-from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import export
-from pipeline.run.render import RenderJob
-from pipeline.run.replay import ReplayJob
+from pipeline.run.render_job import RenderJob
+from pipeline.run.replay_job import ReplayJob
 from pipeline.stores.frame_store import FrameStore, shown_of
 from pipeline.types import Verdict
 
@@ -121,34 +120,26 @@ def _rebuild(
             where=row["demo_id"],
             expected=f"content with the hash {row['demo_sha256']}",
         )
-    plan_file, trajectories, frames = out / "plan.parquet", out / "trajectories", out / "frames"
-    plan.write([plan.Row(**{column.name: row[column.name] for column in fields(plan.Row)})], plan_file)
+    trajectories, frames = out / "trajectories", out / "frames"
+    planned, planned_twin = (
+        plan.Row(**{column.name: each[column.name] for column in fields(plan.Row)}) for each in (row, twin)
+    )
+    plan.write([planned], out / "plan.parquet")
 
-    def replay(planned: Row) -> Verdict:
-        job = ReplayJob(
-            trajectory_id=planned["trajectory_id"],
-            demo_id=planned["demo_id"],
-            demo_sha256=planned["demo_sha256"],
-            perturbations=planned["perturbations"],
-            twin=twin["trajectory_id"],
-            demos=demos,
-            config=settings.replay,
-            folder=trajectories,
-        )
-        return job()
+    def replay(each: plan.Row) -> Verdict:
+        return ReplayJob(each, planned_twin.trajectory_id, demos, settings.replay, trajectories)()
 
-    trajectory_id, streams = row["trajectory_id"], tuple(streams_of(row["perturbations"]).values())
-    if settings.replay.mode != "open_loop" and twin["trajectory_id"] != trajectory_id:
+    if settings.replay.mode != "open_loop" and planned_twin.trajectory_id != planned.trajectory_id:
         # Tracking follows what the twin did.
-        replay(twin)
-    verdict = replay(row)
+        replay(planned_twin)
+    verdict = replay(planned)
     if not verdict.kept:
         return None, verdict.reason
-    task = find_task(row["suite"], row["task"])
-    RenderJob(trajectory_id, task, streams, row["steps"], trajectories, frames, settings.render, gl.choose().device)()
-    if rejected := shown_of(FrameStore(frames, settings.render).rows())[trajectory_id].rejected:
+    streams = tuple(streams_of(planned.perturbations).values())
+    RenderJob(planned, streams, trajectories, frames, settings.render, gl.choose().device)()
+    if rejected := shown_of(FrameStore(frames, settings.render).rows())[planned.trajectory_id].rejected:
         return None, next(iter(rejected.values()))
-    load = EpisodeLoader(plan_file, frames, settings.render)
+    load = EpisodeLoader(out, settings.render)
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)
     export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")

@@ -12,7 +12,8 @@ from pipeline.files import read_json
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Fault
 from pipeline.planning import plan
-from pipeline.run import manifest
+from pipeline.run import outcome
+from pipeline.run.counts import by_axis_and_suite
 
 
 def counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
@@ -24,11 +25,12 @@ def counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
     for row in rows:
         quotas[row["axis"], row["suite"], row["task"]].append(row)
     for (axis, suite, task), members in quotas.items():
-        wanted, kept = sum(row["wanted"] for row in members), sum(row["kept"] for row in members)
+        wanted = sum(row["wanted"] for row in members)
+        kept = sum(row["kept"] or row["reason"] == outcome.LEFT_OUT for row in members)
         left = any(row["reason"] in ("reserve_not_needed", "not_replayed") for row in members)
         if kept > wanted or (kept < wanted and left):
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
-    if read_json(data / "counts.json") != manifest.counts(rows):
+    if read_json(data / "counts.json") != by_axis_and_suite(rows):
         yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
 
 

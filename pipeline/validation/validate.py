@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.clients import oft
-from pipeline.compute.pool import Run
+from pipeline.compute.pool import Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json, scratch
@@ -53,7 +53,7 @@ class Results:
             self.note(check, other.findings[check], checked)
 
 
-def validate(config: Config, run: Run) -> dict[str, Any]:
+def validate(config: Config, workers: Workers) -> dict[str, Any]:
     """Check a finished run; memory holds one episode in each worker, and the manifest.
 
     Returns:
@@ -71,14 +71,14 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
     with scratch(data / ".work" / "validate") as cache:
         opened = []
         for one in formats_of(data, config.export, config.render.extras):
-            for faults in run(Written.faults, one.written(), f"{one.title} checksums"):
+            for faults in workers(Written.faults, one.written(), f"{one.title} checksums"):
                 total.note("checksums", faults)
             if any(fault.dataset == one.name for fault in total.findings["checksums"]):
                 # What damaged files seem to hold is of no interest, and may be anything.
                 continue
             try:
                 # In a worker, which reads the episodes with the same packages later.
-                (found,) = run(partial(_as_a_whole, kept, cache), [one], f"{one.title} as a whole")
+                (found,) = workers(partial(_as_a_whole, kept, cache), [one], f"{one.title} as a whole")
             except PipelineError as error:
                 total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
                 continue
@@ -89,15 +89,16 @@ def validate(config: Config, run: Run) -> dict[str, Any]:
         again = frozenset(witnesses(rows))
         job = EpisodesJob(config, data, opened, cache, again)
         try:
-            for results in run(job, _slices(kept, again, opened), "validate"):
+            for results in workers(job, _slices(kept, again, opened), "validate"):
                 total.add(results)
         finally:
             scene_of_process().close()
-    if not any(fault.dataset == "rlds" for check in ("readable", "checksums") for fault in total.findings[check]):
+    damaged = {fault.dataset for check in ("readable", "checksums") for fault in total.findings[check]}
+    if config.export.rlds and "rlds" not in damaged:
         # OFT's reader stops at what is damaged.
         sets = oft.datasets(data / "rlds")
         statistics = read_json(data / "dataset_statistics.json")
-        trained = run(partial(run_checks.openvla_oft, statistics), sets, "read as OpenVLA-OFT")
+        trained = workers(partial(run_checks.openvla_oft, statistics), sets, "read as OpenVLA-OFT")
         total.note("openvla_oft", [finding for found in trained for finding in found], len(sets))
     return {
         check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
@@ -163,7 +164,7 @@ class EpisodesJob:
         results.note("readable", unreadable)
         language = self.config.plan.axes.language
         try:
-            made = EpisodeLoader(self.data / "plan.parquet", self.data / "frames", self.config.render)(episode_id)
+            made = EpisodeLoader(self.data, self.config.render)(episode_id)
             trajectory = TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"])
         except PipelineError as error:
             results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])

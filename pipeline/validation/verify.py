@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.compute.pool import Run
+from pipeline.compute.pool import Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.formats.read_back import Written
@@ -16,7 +16,7 @@ from pipeline.stores.store import Store
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 
-def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:
+def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
     """Read every stored file of a run: trajectories, frames and both datasets.
 
     Returns:
@@ -29,14 +29,14 @@ def verify(config: Config, run: Run) -> dict[str, dict[str, Any]]:
         "frames": FrameStore(config.data / "frames", config.render),
     }
     for name, store in stores.items():
-        results[name] = _result(run(_Reader(store), store.names(), name))
+        results[name] = _result(workers(_Reader(store), store.names(), name))
     for one in formats_of(config.data, config.export, config.render.extras):
         try:
             files = one.written()
         except PipelineError as error:
             results[one.name] = {"checked": 0, "damaged": [str(error)]}
             continue
-        faults = run(Written.faults, files, one.title)
+        faults = workers(Written.faults, files, one.title)
         results[one.name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
     return results
 

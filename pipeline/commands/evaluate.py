@@ -1,4 +1,4 @@
-"""The commands ``evaluate`` and ``analyse``. Each prints one line of JSON last."""
+"""Policies: ``evaluate`` and ``analyse``. Each prints one line of JSON last."""
 
 from __future__ import annotations
 
@@ -7,31 +7,27 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline import gl
-from pipeline.arguments import positive
-from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig
-from pipeline.errors import PipelineError
-from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.tasks import write_tasks
+from pipeline.commands.base import add, add_config, add_group, owned, plan_of, positive
 from pipeline.files import write_json
+
+TITLE = "evaluate policies"
 
 
 def add_commands(commands: Any) -> None:
-    """Add ``evaluate`` and ``analyse`` to the commands of a parser."""
-    _add_evaluate(commands)
-    _add_analyse(commands)
-
-
-def _add_evaluate(commands: Any) -> None:
-    command = commands.add_parser(
-        "evaluate",
-        help="run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes",
-        description="Writes one file for each episode, and summary.json with success rates and their 95 % intervals. "
-        "Run again after a kill, it goes on. The policy is a model server of vla-eval (started by you), or a "
-        "checkpoint of lerobot on disk.",
-        argument_default=argparse.SUPPRESS,  # of what is left out, the defaults are those of the models' fields
+    add(commands, evaluate, _evaluate_arguments)
+    kinds = add_group(
+        commands, "analyse", "report, coverage, gap, construct, grade, leakage: what results and runs show"
     )
+    add(kinds, report, _report_arguments)
+    add(kinds, coverage, add_config)
+    add(kinds, gap, _gap_arguments)
+    add(kinds, construct, _construct_arguments)
+    add(kinds, grade, _grade_arguments)
+    add(kinds, leakage, _leakage_arguments)
+
+
+def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
+    command.argument_default = argparse.SUPPRESS  # of what is left out, the defaults are those of the models' fields
     add = command.add_argument
     add("out", type=Path, metavar="DIR", help="folder of the results")
     acting = command.add_mutually_exclusive_group(required=True)
@@ -69,7 +65,6 @@ def _add_evaluate(commands: Any) -> None:
     )
     add("--workers", type=positive, default=0, metavar="N", help="processes (default: one for each core)")
     add("--videos", choices=("none", "failures", "all"), help="of which episodes to keep a video (default: none)")
-    command.set_defaults(run=_evaluate)
 
 
 def _add_selection(command: argparse.ArgumentParser) -> None:
@@ -105,7 +100,13 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
 def _add_settings(command: argparse.ArgumentParser) -> None:
     """Fields of ``Settings``, but the seed, which is the selection's."""
     add = command.add_argument
-    add("--plan", type=Path, metavar="FILE", help="draw held-out draws anew that overlap with this training plan")
+    add(
+        "--trained-on",
+        dest="plan",
+        type=plan_of,
+        metavar="CONFIG",
+        help="draw held-out draws anew that overlap with the plan of this run, whose data the policy was trained on",
+    )
     add(
         "--prompt",
         choices=("clean", "benchmark", "blank"),
@@ -131,10 +132,17 @@ def _add_settings(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
-    # The simulator takes seconds to import, which the other commands can do without.
+def evaluate(arguments: argparse.Namespace) -> int:
+    """run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes
+
+    Writes one file for each episode, and summary.json with success rates and their 95 % intervals. Run again after a
+    kill, it goes on. The policy is a model server of vla-eval (started by you), or a checkpoint of lerobot on disk.
+    """
     from dask.system import CPU_COUNT
 
+    from pipeline import gl
+    from pipeline.compute.pool import runner
+    from pipeline.config import ComputeConfig
     from pipeline.evaluation.evaluate import evaluate
     from pipeline.evaluation.policies import PolicyConfig
     from pipeline.evaluation.rollout import Evaluation
@@ -151,52 +159,61 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     evaluation = Evaluation(settings, config, config.identity(), arguments.out, **given("videos", "archive"))
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
-    with runner(compute, arguments.out, gl.Shared) as run:
+    with runner(compute, arguments.out, gl.WorkerSetup) as run:
         found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
     return 0
 
 
-def _add_analyse(commands: Any) -> None:
-    top = commands.add_parser("analyse", help="compositional gap, difficulty, a benchmark of your own, leakage")
-    kinds = top.add_subparsers(dest="analysis", required=True, metavar="ANALYSIS")
-
-    command = kinds.add_parser(
-        "gap",
-        help="compositional gap of the pairs that were run with --source pairs: gap.json and gap.png in their folder",
+def _report_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="folder of results")
+    command.add_argument(
+        "--out",
+        type=Path,
+        default=Path("report.html"),
+        metavar="FILE",
+        help="page to write, with a JSON file of the same name beside it (default: report.html)",
     )
+
+
+def report(arguments: argparse.Namespace) -> int:
+    """write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures
+
+    Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
+    Two different results of one episode are an error. The last line is JSON.
+    """
+    from pipeline.evaluation.results import read
+    from pipeline.report import evaluation_report
+
+    print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
+    return 0
+
+
+def coverage(arguments: argparse.Namespace) -> int:
+    """set what a policy sees in a finished run beside what it sees in the benchmark's test tasks
+
+    First looks, how far the hand and the targets are moved, where objects are added, how much of a view changes, grey
+    levels and words, axis by axis. The last line is JSON: number, tenth, fiftieth and ninetieth percentile of each.
+    """
+    from rich.console import Console
+
+    from pipeline.report import seen
+    from pipeline.testset import benchmark
+
+    measures = seen.measure(owned(arguments), benchmark.load())
+    Console().print(seen.table(measures))
+    print(json.dumps({f"{one.axis}: {one.what}": {"tests": one.tested, "run": one.ours} for one in measures}))
+    return 0
+
+
+def _gap_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
-    command.set_defaults(run=_gap)
-
-    command = kinds.add_parser(
-        "construct",
-        help="draw 14,000 candidates of held-out draws, filter and balance them to a benchmark",
-        description="The file is for `evaluate --tasks-from`. Which scenes refuse their draw is known once candidates "
-        "were run: give those results, and these tasks are left out.",
-    )
-    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks to write")
-    command.add_argument("--size", type=int, metavar="N", help="tasks of the benchmark (default: 10,000)")
-    command.add_argument("--results", type=Path, nargs="+", default=(), metavar="DIR", help="results of candidates")
-    command.add_argument("--plan", type=Path, metavar="FILE", help="leave out what overlaps with this training plan")
-    command.add_argument("--seed", type=int, default=0, help="of all draws (default: 0)")
-    command.set_defaults(run=_construct)
-
-    command = kinds.add_parser("grade", help="levels of difficulty, 1 to 5, by how many of several models solve a task")
-    command.add_argument("results", type=Path, nargs="+", metavar="DIR", help="results of one model each")
-    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks with their difficulty")
-    command.set_defaults(run=_grade)
-
-    command = kinds.add_parser(
-        "leakage",
-        help="how close the held-out draws of results come to a training plan; ends with 1 where they overlap",
-    )
-    command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
-    command.add_argument("--plan", type=Path, required=True, metavar="FILE", help="data/<run>/plan.parquet")
-    command.set_defaults(run=_leakage)
 
 
-def _gap(arguments: argparse.Namespace) -> int:
+def gap(arguments: argparse.Namespace) -> int:
+    """compositional gap of the pairs that were run with --source pairs: gap.json and gap.png in their folder"""
     from pipeline.evaluation import composition
+    from pipeline.evaluation.results import EpisodeFiles
 
     measured = composition.pairs(EpisodeFiles(arguments.results).some_rows())
     composition.heatmap(measured, arguments.results / "gap.png")
@@ -206,9 +223,29 @@ def _gap(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _construct(arguments: argparse.Namespace) -> int:
-    # The draws need LIBERO, which takes seconds to import.
+def _construct_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks to write")
+    command.add_argument("--size", type=int, metavar="N", help="tasks of the benchmark (default: 10,000)")
+    command.add_argument("--results", type=Path, nargs="+", default=(), metavar="DIR", help="results of candidates")
+    command.add_argument(
+        "--trained-on",
+        dest="plan",
+        type=plan_of,
+        metavar="CONFIG",
+        help="leave out what overlaps with the plan of this run",
+    )
+    command.add_argument("--seed", type=int, default=0, help="of all draws (default: 0)")
+
+
+def construct(arguments: argparse.Namespace) -> int:
+    """draw 14,000 candidates of held-out draws, filter and balance them to a benchmark
+
+    The file is for `evaluate --tasks-from`. Which scenes refuse their draw is known once candidates were run: give
+    those results, and these tasks are left out.
+    """
     from pipeline.evaluation import construction, own_draws
+    from pipeline.evaluation.results import EpisodeFiles
+    from pipeline.evaluation.tasks import write_tasks
 
     chosen, counts = construction.construct(
         construction.candidates(arguments.seed),
@@ -222,8 +259,17 @@ def _construct(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _grade(arguments: argparse.Namespace) -> int:
+def _grade_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("results", type=Path, nargs="+", metavar="DIR", help="results of one model each")
+    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks with their difficulty")
+
+
+def grade(arguments: argparse.Namespace) -> int:
+    """levels of difficulty, 1 to 5, by how many of several models solve a task"""
+    from pipeline.errors import PipelineError
     from pipeline.evaluation import construction
+    from pipeline.evaluation.results import EpisodeFiles
+    from pipeline.evaluation.tasks import write_tasks
 
     results = [list(EpisodeFiles(folder).some_rows()) for folder in arguments.results]
     seed, *others = sorted({row["seed"] for rows in results for row in rows})
@@ -236,9 +282,17 @@ def _grade(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _leakage(arguments: argparse.Namespace) -> int:
+def _leakage_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
+    add_config(command)
+
+
+def leakage(arguments: argparse.Namespace) -> int:
+    """how close the held-out draws of results come to the plan of a run; ends with 1 where they overlap"""
     from pipeline.axes import from_json
+    from pipeline.errors import PipelineError
     from pipeline.evaluation import own_draws
+    from pipeline.evaluation.results import EpisodeFiles
     from pipeline.libero.tasks import find_task
 
     drawn = [
@@ -249,6 +303,6 @@ def _leakage(arguments: argparse.Namespace) -> int:
     ]
     if not drawn:
         raise PipelineError("there are no held-out draws", where=arguments.results, remedy="evaluate --source own")
-    findings = own_draws.compare(drawn, own_draws.planned(arguments.plan))
+    findings = own_draws.compare(drawn, own_draws.planned(owned(arguments).data / "plan.parquet"))
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

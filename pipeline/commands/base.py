@@ -1,0 +1,134 @@
+"""How a command is added, and how a run is named: by its configuration, or else the one that ``params.yaml`` names."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.config import Config
+
+PARAMS = Path("params.yaml")
+
+Fill = Callable[[argparse.ArgumentParser], None]
+
+
+class LazyParser(argparse.ArgumentParser):
+    """Gets its arguments when it is first asked to parse, as what they may be can take long to import.
+
+    Attributes:
+        summary: what the command does, in a line.
+        fill: adds the arguments.
+    """
+
+    summary: str = ""
+    fill: Fill | None = None
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        fill, self.fill = self.fill, None
+        if fill is not None:
+            fill(self)
+        return super().parse_known_args(args, namespace)
+
+
+def add(commands: Any, run: Callable[[argparse.Namespace], int], fill: Fill, name: str | None = None) -> LazyParser:
+    """Add a command.
+
+    Args:
+        commands: what ``add_subparsers`` returned.
+        run: does it; the first line of its docstring says what, and the rest more.
+        fill: adds its arguments.
+        name: as it is called; the function's when left out.
+    """
+    described, _, details = (run.__doc__ or "").partition("\n\n")
+    description = f"{described[:1].upper()}{described[1:]}.\n\n{_unindented(details)}".strip()
+    formatter = argparse.RawDescriptionHelpFormatter
+    command: LazyParser = commands.add_parser(
+        name or run.__name__, help=described, description=description, formatter_class=formatter
+    )
+    command.set_defaults(run=run)
+    command.summary, command.fill = described, fill
+    return command
+
+
+def add_group(commands: Any, name: str, summary: str) -> Any:
+    """Add a command that has commands of its own; what ``add`` adds them to."""
+    group = commands.add_parser(name, help=summary, description=f"{summary[:1].upper()}{summary[1:]}.")
+    group.summary = summary
+    return group.add_subparsers(required=True, metavar="VERB")
+
+
+def _unindented(text: str) -> str:
+    return "\n".join(line.strip() for line in text.splitlines())
+
+
+def positive(text: str) -> int:
+    """Type of an argument that is a number from 1 on."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is less than 1")
+    return number
+
+
+def add_config(command: argparse.ArgumentParser) -> None:
+    """The run that a command is about, its last argument."""
+    command.add_argument(
+        "config",
+        type=Path,
+        nargs="?",
+        metavar="CONFIG",
+        help="file of the run's configuration, such as configs/starter.yaml (default: the one that params.yaml names)",
+    )
+
+
+def config_file(arguments: argparse.Namespace) -> Path:
+    """The configuration that a command was given, or the one that ``dvc repro`` would run here.
+
+    Raises:
+        PipelineError: when neither is there.
+    """
+    if arguments.config is not None:
+        return Path(arguments.config)
+    import yaml
+
+    try:
+        return Path("configs") / f"{yaml.safe_load(PARAMS.read_text())['run']}.yaml"
+    except (OSError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise PipelineError(
+            f"no configuration was named, and there is none to take instead ({error})",
+            where=PARAMS,
+            remedy="name one, such as configs/starter.yaml, or call this in the folder of the project",
+        ) from error
+
+
+def loaded(arguments: argparse.Namespace) -> Config:
+    """Load the configuration that a command was given, whose run may be one of another file of that name.
+
+    Raises:
+        PipelineError: as ``config.load``.
+    """
+    from pipeline.config import load
+
+    return load(config_file(arguments))
+
+
+def owned(arguments: argparse.Namespace) -> Config:
+    """Load the configuration whose run a command reads.
+
+    Raises:
+        PipelineError: as ``run.stage.owned``.
+    """
+    from pipeline.run import stage
+
+    return stage.owned(config_file(arguments))
+
+
+def plan_of(text: str) -> Path:
+    """Type of an argument that names a configuration and stands for its run's plan."""
+    from pipeline.run import stage
+
+    return stage.owned(Path(text)).data / "plan.parquet"

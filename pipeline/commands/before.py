@@ -1,0 +1,128 @@
+"""Before a run: what there is, what an axis does, and whether the machine is fit."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.commands.base import add, add_config, loaded, positive
+
+TITLE = "before a run"
+
+
+def add_commands(commands: Any) -> None:
+    add(commands, doctor, add_config)
+    add(commands, axes, lambda command: None)
+    add(commands, tasks, _tasks_arguments)
+    add(commands, preview, _preview_arguments)
+    add(commands, sources, add_config)
+    add(commands, rewrite, _rewrite_arguments)
+
+
+def doctor(arguments: argparse.Namespace) -> int:
+    """check versions, OpenGL, disk, memory and demonstrations for a configuration; changes nothing"""
+    from pipeline.validation import doctor
+
+    return doctor.run(loaded(arguments))
+
+
+def axes(arguments: argparse.Namespace) -> int:
+    """list the axes of perturbation, their components and what of an episode each makes anew"""
+    from rich.console import Console
+    from rich.table import Table
+
+    from pipeline.axes import Axes, components_of, kind_of
+
+    table = Table("axis", "components", "made again", "changes", box=None)
+    for axis in Axes.model_fields:
+        kind = kind_of(axis)
+        views = " and ".join(sorted(kind.views)) or "instruction"
+        table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
+    Console(highlight=False).print(table)
+    print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` draws what an axis does.")
+    return 0
+
+
+def _tasks_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "patterns", nargs="*", default=["*"], metavar="PATTERN", help="as in demos.tasks, such as 'libero_goal/*'"
+    )
+
+
+def tasks(arguments: argparse.Namespace) -> int:
+    """list LIBERO's tasks, as demos.tasks names them, with their instructions"""
+    from pipeline.libero.tasks import select_tasks
+
+    for task in select_tasks(arguments.patterns):
+        print(f"{task.suite}/{task.name}\t{task.instruction}")
+    return 0
+
+
+def _preview_arguments(command: argparse.ArgumentParser) -> None:
+    from pipeline.axes import Axes
+
+    names = ", ".join(Axes.model_fields)
+    command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
+    command.add_argument("axis", choices=Axes.model_fields, metavar="AXIS", help=f"any of {names}")
+    add_config(command)
+    command.add_argument("--out", type=Path, default=Path("sheet.png"), help="picture to write (default: sheet.png)")
+
+
+def preview(arguments: argparse.Namespace) -> int:
+    """draw what an axis does to a task: its first frame, and eleven draws over the components and levels
+
+    Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default ranges.
+    """
+    from pipeline.files import replaced
+    from pipeline.libero.tasks import select_tasks
+    from pipeline.report import preview
+    from pipeline.testset import benchmark
+
+    config = loaded(arguments)
+    chosen = select_tasks([arguments.task])
+    stage = preview.staged(chosen, config)
+    with replaced(arguments.out) as temporary:
+        preview.draw(stage, arguments.axis, config, benchmark.load()).save(temporary, format="PNG")
+        of = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
+        print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")
+    return 0
+
+
+def sources(arguments: argparse.Namespace) -> int:
+    """fetch and convert the textures and objects that a configuration names, as its plan would, and count them"""
+    from pipeline.publish import attribution
+
+    print(json.dumps(attribution.counts(loaded(arguments).plan.axes)))
+    return 0
+
+
+def _rewrite_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("bddl_file", type=Path, metavar="BDDL_FILE", help="the task, <suite>/<task>.bddl")
+    command.add_argument("--out", type=Path, required=True, help="bank to extend or to begin, such as bank.yaml")
+    command.add_argument(
+        "--per-class", type=positive, default=9, metavar="N", help="rewrites of each class wanted (default: 9)"
+    )
+    command.add_argument(
+        "--endpoint",
+        required=True,
+        metavar="URL",
+        help="what /chat/completions is appended to: http://localhost:8000/v1",
+    )
+    command.add_argument("--model", required=True, metavar="NAME", help="name of the model at the endpoint")
+
+
+def rewrite(arguments: argparse.Namespace) -> int:
+    """have a language model reword a task's instruction, lint what it says, and add it to a bank of rewrites
+
+    Asks an OpenAI-compatible endpoint for rewrites of each class (distraction, common sense, reasoning chain,
+    paraphrase) until the bank has enough of each. The same lint as of the shipped bank decides what is let in. Run
+    again, it goes on where it was stopped. A key is read from OPENAI_API_KEY.
+    """
+    from pipeline.rewriting.language_model import LanguageModel
+    from pipeline.rewriting.rewrite import extend
+
+    extend(arguments.bddl_file, arguments.out, arguments.per_class, LanguageModel(arguments.endpoint, arguments.model))
+    print(f"{arguments.out} holds {arguments.per_class} rewrites of each class for {arguments.bddl_file.stem}")
+    return 0

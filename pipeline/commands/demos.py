@@ -1,0 +1,110 @@
+"""Demonstrations: ``demos fetch``, ``demos expand`` and ``demos check``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from pipeline.commands.base import add, add_group, positive
+
+TITLE = "get demonstrations"
+
+
+def add_commands(commands: Any) -> None:
+    verbs = add_group(
+        commands, "demos", "fetch, expand, check: get LIBERO's, make more from few, look at a folder of them"
+    )
+    add(verbs, fetch, _fetch_arguments)
+    add(verbs, expand, _expand_arguments)
+    add(verbs, check, _check_arguments)
+
+
+def _fetch_arguments(command: argparse.ArgumentParser) -> None:
+    from pipeline.libero.tasks import SUITES
+
+    command.add_argument("out", type=Path, metavar="DIR", help="folder to use as demos.root afterwards")
+    command.add_argument("suites", nargs="+", choices=SUITES, metavar="SUITE", help=f"any of {', '.join(SUITES)}")
+    command.add_argument("--endpoint", metavar="URL", help="address of a mirror of the hub")
+
+
+def fetch(arguments: argparse.Namespace) -> int:
+    """download LIBERO's demonstrations (HDF5) from the hub, or go on with a download that was cut short"""
+    from pipeline.libero.fetch import fetch
+
+    files = fetch(arguments.out, arguments.suites, arguments.endpoint)
+    print(f"{len(files)} files are in {arguments.out}: write `demos: {{root: {arguments.out}}}` into a configuration")
+    return 0
+
+
+def _expand_arguments(command: argparse.ArgumentParser) -> None:
+    from pipeline.config import DemosConfig
+
+    command.add_argument("out", type=Path, metavar="DIR", help="folder to use as demos.root afterwards")
+    command.add_argument(
+        "--per-task", type=positive, default=10, metavar="N", help="demonstrations of each task (default: 10)"
+    )
+    command.add_argument(
+        "--tasks",
+        nargs="+",
+        default=DemosConfig().tasks,
+        metavar="PATTERN",
+        help="patterns of <suite>/<task> (default: the four suites)",
+    )
+    command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
+
+
+def expand(arguments: argparse.Namespace) -> int:
+    """make many demonstrations of each task from the starter set's one, where the hub cannot be reached
+
+    Replays each human demonstration from other starts of the arm, with the target elsewhere, and writes those that
+    reach the goal in LIBERO's own HDF5 layout (states, actions and scenes; no images). They are marked as expanded in
+    the files and in every dataset made from them.
+    """
+    from pipeline.compute.pool import runner
+    from pipeline.config import ComputeConfig, DemosConfig
+    from pipeline.run.expand import candidates, expand
+    from pipeline.testset import benchmark
+
+    demos = DemosConfig(tasks=tuple(arguments.tasks))
+    rows = candidates(demos, arguments.per_task, arguments.seed, benchmark.load())
+    with runner(ComputeConfig(), arguments.out) as workers:
+        made = expand(arguments.out, demos, rows, arguments.per_task, workers)
+    print(
+        f"{made.written} demonstrations in {len(made.files)} files: write `demos: {{root: {arguments.out}}}` into a "
+        "configuration"
+    )
+    print(json.dumps({"written": made.written, "dropped": dict(made.dropped.most_common()), "short": made.short}))
+    return 0
+
+
+def _check_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("folder", type=Path, metavar="DIR", help="folder with <suite>/<task>_demo.hdf5")
+    command.add_argument(
+        "--replay",
+        type=int,
+        default=2,
+        metavar="N",
+        help="so many demonstrations of each file are replayed (default: 2; 0 for none)",
+    )
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """open every file of a folder of demonstrations (HDF5), replay two of each, and name file and fault
+
+    Every demonstration is read and checked. Of each file two are also replayed as a run would, open-loop and, where
+    that misses the goal, tracked. A miss is a fault where all of a file miss, and else is listed. The last line is
+    JSON. Ends with 1 where there is a fault.
+    """
+    from pipeline.compute.pool import runner
+    from pipeline.config import ComputeConfig
+    from pipeline.validation.demonstrations import check
+
+    with runner(ComputeConfig(), arguments.folder) as run:
+        found = check(arguments.folder, arguments.replay, run)
+    for fault in found.faults:
+        print(fault)
+    print(json.dumps(asdict(found)))
+    return int(bool(found.faults))

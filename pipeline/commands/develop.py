@@ -1,0 +1,42 @@
+"""For contributors."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.commands.base import add
+
+TITLE = "for contributors"
+SCHEMAS = Path(__file__).parents[2] / "schemas"
+
+
+def add_commands(commands: Any) -> None:
+    add(commands, schema, lambda command: None)
+
+
+def schemas() -> dict[str, dict[str, Any]]:
+    """The files of ``schemas/`` that are written from the code."""
+    from pipeline.run import manifest
+
+    return {"config.schema.json": config_schema(), "manifest.json": manifest.described()}
+
+
+def config_schema() -> dict[str, Any]:
+    """JSON Schema of the files in ``configs/``."""
+    from pipeline.config import Config
+
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
+
+
+def schema(arguments: argparse.Namespace) -> int:
+    """write the files of schemas/ that follow from the code"""
+    from pipeline.files import replaced
+
+    for name, content in schemas().items():
+        with replaced(SCHEMAS / name) as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n")
+        print(f"wrote {SCHEMAS / name}")
+    return 0

@@ -1,0 +1,114 @@
+"""A finished run: ``check``, ``regenerate`` and ``push``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.commands.base import add, add_config, owned
+
+TITLE = "a finished run"
+
+
+def add_commands(commands: Any) -> None:
+    add(commands, check, add_config)
+    add(commands, regenerate, _regenerate_arguments)
+    add(commands, push, _push_arguments)
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """read all that a run stored, compare it with its checksums, and read its RLDS as OpenVLA-OFT does
+
+    Says which files are not what was written, and what OpenVLA-OFT would train on and what would mislead it. The last
+    line is JSON. Ends with 1 where something is off: delete a damaged file, and the run makes it anew. (The stage
+    validate, which is a part of every run, compares the content of the datasets with each other and with the plan.)
+    """
+    from pipeline.clients import oft_check
+    from pipeline.compute.pool import runner
+    from pipeline.validation.verify import verify
+
+    config = owned(arguments)
+    with runner(config.compute, config.data) as run:
+        stored = verify(config, run)
+    damaged = [what for found in stored.values() for what in found["damaged"]]
+    trained: dict[str, Any] = {}
+    # OpenVLA-OFT's reader stops at what is damaged.
+    if config.export.rlds and not stored["rlds"]["damaged"]:
+        trained = oft_check.check_run(config.data)
+    misleading = [f"{name}: {what}" for name, found in trained.items() for what in found["violations"]]
+    for what in (*damaged, *misleading):
+        print(what)
+    print(json.dumps({**stored, "openvla_oft": trained}))
+    return int(bool(damaged or misleading))
+
+
+def _regenerate_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument("episode_id", metavar="EPISODE_ID", help="as in the manifest and in both datasets")
+    add_config(command)
+    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for what is rebuilt")
+    command.add_argument(
+        "--manifest", type=Path, metavar="FILE", help="of a dataset from elsewhere, in place of a configuration"
+    )
+    command.add_argument(
+        "--demos", type=Path, metavar="DIR", help="with --manifest: the HDF5 demonstrations that it was made from"
+    )
+
+
+def regenerate(arguments: argparse.Namespace) -> int:
+    """rebuild one episode from the manifest and its demonstration, and say whether it is the dataset's, byte for byte
+
+    Replays, renders and serialises one kept episode again. The last line is JSON: whether it equals the record in the
+    RLDS set beside the manifest, which columns differ, and which versions and OpenGL device are not those of the
+    manifest. Ends with 1 when it is not identical.
+    """
+    from pipeline.validation.regenerate import regenerate
+
+    manifest, demos = arguments.manifest, arguments.demos
+    if manifest is None:
+        config = owned(arguments)
+        manifest, demos = config.data / "manifest.parquet", config.demos.root
+    found = regenerate(arguments.episode_id, manifest, arguments.out, demos)
+    print(json.dumps(found))
+    return int(found["identical"] is False or found["reason"] != "kept")
+
+
+def _push_arguments(command: argparse.ArgumentParser) -> None:
+    from pipeline.formats.registry import FORMATS
+
+    names = [kind.name for kind in FORMATS]
+    command.add_argument("format", choices=names, metavar="FORMAT", help=" or ".join(names))
+    command.add_argument("repository", metavar="REPOSITORY", help="owner/name on the hub")
+    add_config(command)
+    command.add_argument("--really", action="store_true", help="send it")
+    command.add_argument("--private", action="store_true", help="make a new repository private")
+    command.add_argument("--endpoint", metavar="URL", help="address of the hub, when not the usual one")
+
+
+def push(arguments: argparse.Namespace) -> int:
+    """upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go
+
+    Sends one of the datasets of a finished and validated run: its files, the card, the manifest and the recipe, in
+    one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`.
+    """
+    from pipeline.errors import PipelineError
+    from pipeline.formats.registry import formats_of
+
+    config = owned(arguments)
+    if arguments.format not in config.export.formats:
+        raise PipelineError(
+            f"the run has no {arguments.format}",
+            where=f"export.{arguments.format}",
+            expected=" or ".join(config.export.formats),
+        )
+    from pipeline.publish import push
+
+    formats = {one.name: one for one in formats_of(config.data, config.export, config.render.extras)}
+    upload = push.prepare(formats[arguments.format])
+    print(upload.summary())
+    if not arguments.really:
+        print(f"nothing was sent: with --really this goes to {arguments.repository}")
+        return 0
+    print(push.send(upload, arguments.repository, private=arguments.private, endpoint=arguments.endpoint))
+    return 0

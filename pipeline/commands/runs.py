@@ -1,0 +1,78 @@
+"""Making datasets: ``run``, ``status`` and ``clean``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from pipeline.commands.base import add, add_config, config_file, owned
+
+TITLE = "make datasets"
+
+
+def add_commands(commands: Any) -> None:
+    add(commands, run, add_config)
+    add(commands, status, add_config)
+    add(commands, clean, _clean_arguments)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """make the datasets of a configuration, or what of them is not made yet, and say where they are
+
+    Writes into params.yaml that this configuration is the one to run, and calls `dvc repro`. Stopped at any time, it
+    goes on where it was when it is called again.
+    """
+    from pipeline.run import repro
+
+    return repro.run(config_file(arguments))
+
+
+def status(arguments: argparse.Namespace) -> int:
+    """say how many episodes are wanted and kept, what would run and why, and what disk it takes; changes nothing"""
+    from rich.console import Console
+
+    from pipeline.validation import status
+
+    config = owned(arguments)
+    console = Console(soft_wrap=True, highlight=False)
+    for part in status.told(config):
+        console.print(part)
+    return 0
+
+
+def _clean_arguments(command: argparse.ArgumentParser) -> None:
+    from pipeline.run import cleaning
+
+    add_config(command)
+    command.add_argument(
+        "--only", nargs="+", choices=cleaning.PARTS, metavar="PART", help=f"any of {', '.join(cleaning.PARTS)}"
+    )
+    command.add_argument("--yes", action="store_true", help="do not ask")
+
+
+def clean(arguments: argparse.Namespace) -> int:
+    """delete what can be made again of a run, after it was listed with its sizes and you said yes
+
+    Other files in the run's folder stay. Demonstrations, configurations and downloads are not touched.
+    """
+    from pipeline.errors import PipelineError
+    from pipeline.run import cleaning
+
+    config = owned(arguments)
+    found = cleaning.found(config.data, arguments.only or tuple(cleaning.PARTS))
+    if not found:
+        print(f"{config.data} has nothing of this")
+        return 0
+    for part, size_mb in found.items():
+        print(f"{size_mb:10.1f} MB  {part:<13} made again by {cleaning.PARTS[part].made_by}")
+    print(f"{sum(found.values()):10.1f} MB  in all, of {config.data}")
+    if not arguments.yes:
+        if not sys.stdin.isatty():
+            raise PipelineError("nothing was deleted, as nobody can be asked here", remedy="add --yes")
+        if input("Delete all of this? [y/N] ").strip().lower() not in ("y", "yes"):
+            print("nothing was deleted")
+            return 0
+    cleaning.delete(config.data, list(found))
+    print("deleted")
+    return 0

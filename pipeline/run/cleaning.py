@@ -1,0 +1,65 @@
+"""What a run's folder holds that can be made again: found with its sizes, and deleted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import NamedTuple
+
+from pipeline.files import remove
+from pipeline.run.finished import FOLDER
+from pipeline.run.stage import locked
+
+
+class Part(NamedTuple):
+    """Files and folders of a run's folder that belong together.
+
+    Attributes:
+        names: of them.
+        made_by: the stages that make them, in words.
+    """
+
+    names: tuple[str, ...]
+    made_by: str
+
+
+PARTS = {
+    "unfinished": Part((".work",), "nothing: what stopped stages left"),
+    "pictures": Part(("sheets", "previews", "report.html"), "summary and report"),
+    "uploads": Part(("card", "finetune"), "card and recipe"),
+    "rlds": Part(("rlds", "rlds.json"), "export_rlds, from the frames"),
+    "lerobot": Part(("lerobot", "lerobot.json"), "export_lerobot, from the frames"),
+    "frames": Part(("frames",), "render, from the trajectories: most of a run's time"),
+    "trajectories": Part(("trajectories", "replay.json"), "replay, from the demonstrations"),
+    "tables": Part(
+        (
+            *("plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "leakage.json"),
+            *("validation.json", "inputs.json", "settings.json", FOLDER),
+        ),
+        "plan, manifest, validate and others",
+    ),
+}
+"""Least to make again first."""
+
+
+def found(data: Path, parts: Iterable[str]) -> dict[str, float]:
+    """Of some parts, those that are there, to their megabytes."""
+    there = {part: [path for name in PARTS[part].names if (path := data / name).exists()] for part in parts}
+    return {part: sum(map(_size_mb, paths)) for part, paths in there.items() if paths}
+
+
+def delete(data: Path, parts: Iterable[str]) -> None:
+    """Delete parts of a run's folder.
+
+    Raises:
+        PipelineError: when a stage of the run is running.
+    """
+    with locked(data):
+        for part in parts:
+            for name in PARTS[part].names:
+                remove(data / name)
+
+
+def _size_mb(path: Path) -> float:
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.lstat().st_size for file in files if file.is_file()) / 1e6

@@ -1,0 +1,79 @@
+"""The numbers of a run: how many of its episodes were planned, replayed and kept.
+
+Every number of ``counts.json``, of the stage ``summary``, the report and the card is counted here, from the manifest.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Rows = Sequence[Mapping[str, Any]]
+"""Rows of the manifest."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Of some rows. A reserve is planned once it was needed, so that ``planned - kept`` is what was lost on the way."""
+
+    planned: int
+    replayed: int
+    kept: int
+
+    @classmethod
+    def of(cls, rows: Rows, **values: str) -> Counts:
+        """Of the rows that have these values, such as ``axis="camera"``."""
+        found = [row for row in tried(rows) if all(row[name] == value for name, value in values.items())]
+        return cls(len(found), sum(bool(row["steps"]) for row in found), sum(row["kept"] for row in found))
+
+    def __str__(self) -> str:
+        return f"{self.planned}/{self.replayed}/{self.kept}" if self.planned else "-"
+
+
+def tried(rows: Rows) -> list[Mapping[str, Any]]:
+    """All rows but the reserves that were not needed."""
+    return [row for row in rows if row["reason"] != "reserve_not_needed"]
+
+
+def named(rows: Rows, column: str) -> list[str]:
+    """The values of a column, each once, in the order in which they come."""
+    return list(dict.fromkeys(row[column] for row in rows))
+
+
+def tally(rows: Rows, column: str) -> dict[str, Counter[str]]:
+    """Axis to how often each value of a column occurs on it."""
+    found: dict[str, Counter[str]] = {}
+    for row in rows:
+        found.setdefault(row["axis"], Counter())[row[column]] += 1
+    return found
+
+
+def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:
+    """``counts.json``: axis to suite to the number of episodes planned, replayed and kept."""
+    table: dict[str, dict[str, dict[str, int]]] = {}
+    for axis, suite in dict.fromkeys((row["axis"], row["suite"]) for row in tried(rows)):
+        table.setdefault(axis, {})[suite] = asdict(Counts.of(rows, axis=axis, suite=suite))
+    return table
+
+
+def shown(rows: Rows) -> Table:
+    """The same as a table for people, with totals."""
+    from rich.table import Table
+
+    suites, axes = named(rows, "suite"), named(tried(rows), "axis")
+    heads = [suite.removeprefix("libero_") for suite in suites]
+    table = Table("axis", *heads, "all", title="planned/replayed/kept episodes")
+    for column in table.columns[1:]:
+        column.justify, column.no_wrap = "right", True
+    for axis in axes:
+        cells = [Counts.of(rows, axis=axis, suite=suite) for suite in suites]
+        # A combination's name may break behind a +.
+        table.add_row(axis.replace("+", "+ "), *map(str, cells), str(Counts.of(rows, axis=axis)))
+    table.add_section()
+    table.add_row("all", *(str(Counts.of(rows, suite=suite)) for suite in suites), str(Counts.of(rows)))
+    return table

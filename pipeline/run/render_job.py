@@ -1,0 +1,95 @@
+"""One file of frames as a worker makes it: it reads the trajectory, has it rendered, and stores what was encoded."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline import gl
+from pipeline.compute.pool import LOST
+from pipeline.config import RenderConfig
+from pipeline.errors import PipelineError
+from pipeline.libero.tasks import find_task
+from pipeline.planning.plan import Row
+from pipeline.planning.streams import Stream
+from pipeline.rendering.last_scene import scene_of_process
+from pipeline.rendering.render import render
+from pipeline.stores.frame_store import FrameStore, merged
+from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.types import Rendered, Trajectory
+
+
+@dataclass(frozen=True)
+class RenderJob:
+    """Streams of one trajectory to render into one file, as they are sent to a worker.
+
+    Attributes:
+        row: a row of the plan that has this trajectory.
+        streams: what to render.
+        trajectories, frames: folders of the stores.
+        config: how frames are encoded.
+        device: what renders the run, as OpenGL names it.
+    """
+
+    row: Row
+    streams: tuple[Stream, ...]
+    trajectories: Path
+    frames: Path
+    config: RenderConfig
+    device: str
+
+    def __call__(self) -> None:
+        """Store the streams in one file: those that other files of the trajectory hold are copied, others rendered.
+
+        Raises:
+            PipelineError: when another device renders here: its pixels differ, and the run would never use them.
+        """
+        device = gl.choose().device
+        if device != self.device:
+            raise PipelineError(
+                f"this worker renders with {device}, the run with {self.device}",
+                where=f"worker on {platform.node()}",
+                expected="one device for all frames of a run, as devices differ by some grey levels",
+                remedy="start the stage and every worker on machines that render alike (MUJOCO_GL picks the back end)",
+            )
+        trajectory = self._trajectory()
+        parts, missing = self._stored()
+        if missing:
+            task = find_task(self.row.suite, self.row.task)
+            parts = [*parts, render(trajectory, task, missing, self.config, scene_of_process())]
+        self._save(parts)
+
+    def frames_at_most(self) -> int:
+        return self.row.demo_steps * len(self.streams)
+
+    def limit_s(self) -> float:
+        """So long it may take before it counts as hanging: about twenty times what a frame takes without a GPU."""
+        return 1800.0 + 2.0 * self.frames_at_most()
+
+    def lost(self) -> None:
+        """Store that no worker survived the streams, unless one stored them before it was lost.
+
+        They are not tried again while the file is there.
+        """
+        trajectory = self._trajectory()
+        action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
+        state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)
+        parts, missing = self._stored()
+        rejected = {stream.stream_id: LOST for stream in missing}
+        self._save([*parts, Rendered(trajectory.mode, state, joint_state, action, rejected=rejected)])
+
+    def _trajectory(self) -> Trajectory:
+        return TrajectoryStore(self.trajectories).load(self.row.trajectory_id)
+
+    def _stored(self) -> tuple[list[Rendered], list[Stream]]:
+        """What files hold of the streams, and those that none holds."""
+        wanted = {stream.stream_id: stream.geometry.stream_id for stream in self.streams}
+        parts = FrameStore(self.frames, self.config).stored(self.row.trajectory_id, wanted, self.device)
+        held = {stream_id for part in parts for stream_id in (*part.streams, *part.rejected)}
+        return parts, [stream for stream in self.streams if stream.stream_id not in held]
+
+    def _save(self, parts: list[Rendered]) -> None:
+        FrameStore(self.frames, self.config).save(self.row.trajectory_id, merged(parts), self.device)

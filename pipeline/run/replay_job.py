@@ -1,0 +1,111 @@
+"""One replay as a worker does it: read the demonstration, have physics replay and judge it, store the trajectory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.axes import PhysicsPerturbation, from_json, of_layer
+from pipeline.compute.pool import LOST
+from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.errors import PipelineError
+from pipeline.files import Edition, edition
+from pipeline.physics.environment import Environment, shared
+from pipeline.physics.quality import measure
+from pipeline.physics.reference import Reference
+from pipeline.physics.replay import replay
+from pipeline.planning.plan import Row
+from pipeline.scenes.noops import kept_actions
+from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.types import Demo, Scene, Trajectory, Verdict
+
+
+@dataclass(frozen=True)
+class ReplayJob:
+    """One trajectory's replay, as it is sent to a worker.
+
+    Attributes:
+        row: a row of the plan that has this trajectory.
+        twin: trajectory of the same demonstration without perturbations, which tracking follows.
+        demos, config: sections of the run's configuration.
+        folder: of the trajectory store.
+    """
+
+    row: Row
+    twin: str
+    demos: DemosConfig
+    config: ReplayConfig
+    folder: Path
+
+    def __call__(self) -> Verdict:
+        """Replay, judge and store; returns the verdict.
+
+        Raises:
+            PipelineError: when the demonstration is not there, or another than the plan was drawn for.
+        """
+        demo = self.demos.open().load(self.row.demo_id)
+        if demo.sha256 != self.row.demo_sha256:
+            raise PipelineError(
+                "the demonstration has changed since the plan",
+                where=(self.demos.root or Path()) / demo.source,
+                expected=f"content with the hash {self.row.demo_sha256}",
+                remedy="put the file back, or run the plan stage again, which draws for what is there now",
+            )
+        physics = of_layer(from_json(self.row.perturbations), PhysicsPerturbation)
+        environment = shared(demo.task)
+        reference = partial(self._reference, environment, demo)
+        trajectory = replay(environment, demo, self.row.trajectory_id, self.config, physics, reference)
+        if trajectory.verdict.kept:
+            trajectory = replace(trajectory, quality=measure(trajectory, demo.task))
+        TrajectoryStore(self.folder).save(trajectory)
+        return trajectory.verdict
+
+    def _reference(self, environment: Environment, demo: Demo) -> Reference | None:
+        """What tracking follows: the twin where it reached its goal, else the recording."""
+        if self.twin != self.row.trajectory_id:
+            twin = TrajectoryStore(self.folder).path(self.twin)
+            if (followed := _twin(edition(twin))) is not None:
+                return followed
+        if demo.states is None:
+            # The way the hand went when it was recorded, before anything settled.
+            unsettled = self.config.model_copy(update={"mode": "open_loop", "settle_steps": 0})
+            return _followed(replay(environment, demo, self.row.trajectory_id, unsettled))
+        mask = kept_actions(demo.actions, self.config.noops)
+        # The state after the last action is not recorded: as if the hand rested.
+        states = np.vstack([demo.states[mask], demo.states[-1:]])
+        model_xml = demo.model_xml or environment.place_fixtures(self.config.fixture_seed)
+        return Reference.of(model_xml, states, demo.actions[mask])
+
+    def limit_s(self) -> float:
+        """So long it may take before it counts as hanging; the longest take about a minute."""
+        return 1800.0
+
+    def lost(self) -> Verdict:
+        """Store that no worker survived this replay, or finished it; it is not tried again while the file is there."""
+        trajectory = Trajectory(
+            trajectory_id=self.row.trajectory_id,
+            mode="open_loop",
+            scene=Scene("", np.zeros(1), {"fault": "workers ended in it, or it took too long"}),
+            states=np.zeros((1, 1)),
+            actions=np.empty((0, 7)),
+            site_alpha=np.empty((1, 0), np.float32),
+            verdict=Verdict(False, LOST),
+        )
+        TrajectoryStore(self.folder).save(trajectory)
+        return trajectory.verdict
+
+
+@lru_cache(maxsize=1)
+def _twin(file: Edition) -> Reference | None:
+    """What a twin did, if it reached its goal."""
+    return _followed(TrajectoryStore(file.path.parent).load(file.path.stem))
+
+
+def _followed(trajectory: Trajectory) -> Reference | None:
+    """What a replay did, if it reached its goal."""
+    if not trajectory.verdict.kept:
+        return None
+    return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)

@@ -1,0 +1,69 @@
+"""What the stage ``replay`` does: the trajectories that a plan needs and the store lacks are replayed by workers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.compute.pool import Expendable, Workers
+from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
+from pipeline.planning.plan import Row, pending
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.types import Verdict
+
+NO_LIMITS = FilterConfig()
+
+
+@dataclass(frozen=True)
+class Replays:
+    """How the trajectories of a run are made.
+
+    Attributes:
+        demos, config: sections of the run's configuration.
+        folder: of the trajectory store.
+        workers: do the work.
+        limits: the section ``filter``.
+    """
+
+    demos: DemosConfig
+    config: ReplayConfig
+    folder: Path
+    workers: Workers
+    limits: FilterConfig = NO_LIMITS
+
+    def of(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
+        """Have what a plan needs in the store; reserves only where a candidate failed.
+
+        The twins come first, because tracking follows them.
+
+        Args:
+            rows: the plan.
+            rejected: episode id to the reason why its frames were rejected, as far as frames were made.
+
+        Returns:
+            Trajectory id to verdict, for every trajectory that was needed.
+        """
+        store = TrajectoryStore(self.folder)
+        stored = verdicts_of(store.refresh(), self.limits)
+        twins = [row for row in rows if row.role == "twin"]
+        verdicts: dict[str, Verdict] = {}
+        for group in (twins, rows):
+            while needed := pending(group, verdicts, rejected):
+                missing = [trajectory_id for trajectory_id in needed if trajectory_id not in stored]
+                if missing:
+                    self._replay(missing, rows)
+                    stored = verdicts_of(store.refresh(), self.limits)
+                verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed}
+        return verdicts
+
+    def _replay(self, missing: Sequence[str], rows: Sequence[Row]) -> None:
+        # A stage that has nothing to do loads no simulator.
+        from pipeline.run.replay_job import ReplayJob
+
+        row_of = {row.trajectory_id: row for row in rows}
+        twin_of = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
+        # Ordered by demonstration: a worker builds a task's environment and reads a twin once.
+        in_turn = sorted(map(row_of.__getitem__, missing), key=lambda row: row.demo_id)
+        jobs = [ReplayJob(row, twin_of[row.demo_id], self.demos, self.config, self.folder) for row in in_turn]
+        self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")

@@ -1,0 +1,106 @@
+"""``dvc repro`` of one configuration: what names it for DVC, what stands in DVC's way, and where the results are."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import yaml
+
+from pipeline.config import Config, load
+from pipeline.errors import PipelineError
+from pipeline.exit_status import Terminated
+from pipeline.files import remove, replaced
+from pipeline.formats.registry import formats_of
+from pipeline.run.stage import PARAMS
+
+DVC = (sys.executable, "-m", "dvc")
+HEADER = """\
+# The run that `dvc repro` makes: the name of a file in configs/, and its field `folder`. `run CONFIG` writes both.
+"""
+
+
+def run(file: Path) -> int:
+    """Run all stages that have something to do; the exit status.
+
+    Raises:
+        PipelineError: when DVC would not find the configuration.
+    """
+    config = load(file)
+    _refuse_elsewhere(file, config)
+    choose(config)
+    _mend()
+    status = _repro()
+    if status == 0:
+        print()
+        places = {name: path for name, path in made(config).items() if path.exists()}
+        width = max(map(len, places))
+        for name, path in places.items():
+            print(f"{name:>{width}}  {path}")
+    return status
+
+
+def made(config: Config) -> dict[str, Path]:
+    """What a run makes that a person opens."""
+    data = config.data
+    return {
+        **{one.title: one.root for one in formats_of(data, config.export, config.render.extras)},
+        "manifest": data / "manifest.parquet",
+        "report": data / "report.html",
+        "fine-tuning": data / "finetune",
+        "dataset cards": data / "card",
+        "sheets": data / "sheets",
+        "previews": data / "previews",
+    }
+
+
+def choose(config: Config) -> None:
+    """Have ``dvc repro`` run this configuration from now on."""
+    text = HEADER + yaml.safe_dump({"run": config.name, "data": config.folder.as_posix()}, sort_keys=False)
+    if not PARAMS.exists() or PARAMS.read_text() != text:
+        with replaced(PARAMS) as temporary:
+            temporary.write_text(text)
+        print(f"{PARAMS} names {config.name} from now on", flush=True)
+
+
+def _refuse_elsewhere(file: Path, config: Config) -> None:
+    if not Path("dvc.yaml").is_file():
+        raise PipelineError("there is no dvc.yaml here", where=Path.cwd(), remedy="call this in the project's folder")
+    expected = Path("configs") / f"{config.name}.yaml"
+    if file.resolve() != expected.resolve():
+        raise PipelineError(
+            f"DVC looks for the run {config.name!r} in {expected}",
+            where=file,
+            remedy=f"move the file to {expected}, or change its `name:`",
+        )
+
+
+def _mend() -> None:
+    """DVC writes two lock files in place, and refuses to start where it was killed meanwhile.
+
+    What is finished, a run knows by itself.
+    """
+    if subprocess.run([*DVC, "stage", "list"], capture_output=True, check=False).returncode:
+        remove(Path("dvc.lock"))
+    running = Path(".dvc/tmp/rwlock")
+    try:
+        if running.exists():
+            json.loads(running.read_text())
+    except ValueError:
+        remove(running)
+
+
+def _repro() -> int:
+    """Its exit status. What ends this process ends DVC, its stage and their workers in order."""
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"  # The stages call `python`.
+    with subprocess.Popen([*DVC, "repro"], env={**os.environ, "PATH": path}, process_group=0) as process:
+        try:
+            return process.wait()
+        except KeyboardInterrupt as stopped:
+            os.killpg(process.pid, signal.SIGTERM if isinstance(stopped, Terminated) else signal.SIGINT)
+            process.wait()
+            raise

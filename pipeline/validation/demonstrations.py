@@ -1,0 +1,141 @@
+"""Whether a folder of demonstrations can be used: every file is read, and some of each file are replayed."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pipeline.compute.pool import LOST, Expendable, Workers
+from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.errors import PipelineError
+from pipeline.libero.demonstrations import DemoEntry, HDF5Source
+from pipeline.libero.tasks import SUITES, find_task
+from pipeline.planning.plan import twins
+from pipeline.run.replay_job import ReplayJob
+from pipeline.types import Task
+
+LAYOUT = f"<suite>/<task>_demo.hdf5, with a suite of {', '.join(SUITES)}"
+MISSES = ("goal_not_reached", "goal_lost")
+"""What also happens to good demonstrations: see the README on how often a replay reaches its goal."""
+
+
+@dataclass
+class Found:
+    """What a check came to.
+
+    Attributes:
+        files, demonstrations, replayed: how many there are.
+        faults: each names its file, its demonstration where it is about one, and what to do.
+        missed: demonstrations whose replay misses the goal, though another of their file does not.
+    """
+
+    files: int = 0
+    demonstrations: int = 0
+    replayed: int = 0
+    faults: list[str] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
+
+
+def check(root: Path, replays: int, run: Workers) -> Found:
+    """Read every HDF5 file below a folder, and replay some demonstrations of each in the mode ``auto``.
+
+    A replay that misses its goal is a fault where all of its file do: of good demonstrations a few miss.
+
+    Args:
+        root: folder with ``<suite>/<task>_demo.hdf5``.
+        replays: how many of each file.
+        run: spreads the work; one call for each file.
+
+    Raises:
+        PipelineError: when there is no file.
+    """
+    files = sorted(file for file in root.rglob("*.hdf5") if not file.relative_to(root).parts[0].startswith("."))
+    if not files:
+        raise PipelineError("there is no HDF5 file", where=root, expected=LAYOUT)
+    found, jobs = Found(len(files)), []
+    for file in files:
+        try:
+            jobs.append(_FileJob(root, _task_of(file, root), replays))
+        except PipelineError as error:
+            found.faults.append(str(error))
+    work = Expendable(_FileJob.__call__, _FileJob.limit_s, _FileJob.lost)
+    first_with: dict[str, DemoEntry] = {}
+    for result in run(work, jobs, "files"):
+        found.demonstrations += len(result.entries)
+        found.replayed += result.replayed
+        found.faults += result.faults
+        found.missed += result.missed
+        for entry in result.entries:
+            first = first_with.setdefault(entry.sha256, entry)
+            if first.demo_id != entry.demo_id:
+                found.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: delete one of the two")
+    return found
+
+
+def _task_of(file: Path, root: Path) -> Task:
+    suite, *name = file.relative_to(root).parts
+    if suite not in SUITES or len(name) != 1 or not name[0].endswith("_demo.hdf5"):
+        raise PipelineError("is not where a run looks", where=file, expected=LAYOUT, remedy="move or rename it")
+    try:
+        return find_task(suite, name[0].removesuffix("_demo.hdf5"))
+    except PipelineError as error:
+        raise PipelineError(error.what, where=file, expected=error.expected, remedy="move or rename it") from error
+
+
+@dataclass(frozen=True)
+class _Result:
+    entries: tuple[DemoEntry, ...] = ()
+    replayed: int = 0
+    faults: tuple[str, ...] = ()
+    missed: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _FileJob:
+    """The check of one file.
+
+    Attributes:
+        root: folder of all.
+        task: the file's.
+        replays: how many demonstrations to replay.
+    """
+
+    root: Path
+    task: Task
+    replays: int
+
+    def __call__(self) -> _Result:
+        index = HDF5Source(self.root).index([self.task])
+        # Of the other files of the suite, their own check tells.
+        own = f"{self.task.suite}/{self.task.name}"
+        faults = [str(problem.error) for problem in index.problems if f"{problem.name}/".startswith(f"{own}/")]
+        # The first, the last and others evenly between them.
+        count = min(self.replays, len(index.entries))
+        chosen = [index.entries[round(k * (len(index.entries) - 1) / max(count - 1, 1))] for k in range(count)]
+        reasons = self._replayed(chosen)
+        all_miss = all(reason in MISSES for reason in reasons.values())
+        missed = [] if all_miss else [entry.demo_id for entry, reason in reasons.items() if reason in MISSES]
+        for entry, reason in reasons.items():
+            if reason != "kept" and entry.demo_id not in missed:
+                where = f"{self.root / entry.source.split()[0]} data/{entry.key}"
+                what = "misses its goal, as do all that were replayed of this file" if all_miss else "not replayed"
+                expected = "a demonstration recorded with this LIBERO version, or with its model_file"
+                faults.append(str(PipelineError(f"{what} ({reason})", where=where, expected=expected)))
+        return _Result(tuple(index.entries), count, tuple(faults), tuple(missed))
+
+    def _replayed(self, entries: list[DemoEntry]) -> dict[DemoEntry, str]:
+        """What each came to, as the manifest says it."""
+        demos, replay = DemosConfig(root=self.root), ReplayConfig()
+        with tempfile.TemporaryDirectory() as folder:
+            jobs = [ReplayJob(row, row.trajectory_id, demos, replay, Path(folder)) for row in twins(entries, 0, replay)]
+            return {entry: job().reason for entry, job in zip(entries, jobs, strict=True)}
+
+    def limit_s(self) -> float:
+        """So long it may take before it counts as hanging; a replay takes about a minute at most."""
+        return 1800.0 + 600.0 * self.replays
+
+    def lost(self) -> _Result:
+        return _Result(
+            faults=(f"{self.root / self.task.suite / self.task.name}_demo.hdf5: {LOST}, no worker reads it",)
+        )

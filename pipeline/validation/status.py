@@ -1,0 +1,149 @@
+"""Where a run stands: what is kept of what is wanted, what would run and why, and the disk. Nothing is changed."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rich.table import Table
+
+from pipeline.config import Config
+from pipeline.errors import PipelineError
+from pipeline.files import read_json
+from pipeline.formats.registry import formats_of
+from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
+from pipeline.run import cleaning, export, finished, inputs, outcome
+from pipeline.run.remake import outdated
+from pipeline.stores.frame_store import FrameStore, Shown, shown_of
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.types import Verdict
+from pipeline.validation.disk import needed_mb
+
+
+def told(config: Config) -> Iterator[str | Table]:
+    """A run's state in a few paragraphs and tables."""
+    yield f"run {config.name}, in {config.data}"
+    try:
+        rows = plan.read(config.data / "plan.parquet")
+    except PipelineError:
+        rows = []
+    verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), config.filter)
+    frames = shown_of(FrameStore(config.data / "frames", config.render).rows())
+    rejected = outcome.rejections(rows, frames)
+    yield _counts(config, rows, plan.select(rows, verdicts, rejected), frames)
+    steps = dict(_steps(config, rows, verdicts, frames, rejected))
+    yield "would run:" if steps else "nothing would run: all of this configuration is made"
+    yield from (f"  {step}: {why}" for step, why in steps.items())
+    yield _disk(config)
+
+
+def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]) -> Table:
+    table = Table("axis", "wanted", "planned", "reach their goal", "rendered", title="episodes")
+    for column in table.columns[1:]:
+        column.justify = "right"
+    total: Counter[str] = Counter()
+    for axis in ("clean", *config.plan.episodes):
+        of_axis = [row for row in rows if row.axis == axis]
+        kept = [row for row in of_axis if judged[row.episode_id].kept]
+        planned = sum(row.wanted for row in of_axis)
+        cells = {
+            "wanted": config.plan.episodes.get(axis, planned),
+            "planned": planned,
+            "kept": len(kept),
+            "rendered": sum(_rendered(row, frames) for row in kept),
+        }
+        total.update(cells)
+        table.add_row(axis.replace("+", "+ "), *map(str, cells.values()))
+    table.add_section()
+    table.add_row("all", *(str(total[name]) for name in ("wanted", "planned", "kept", "rendered")))
+    return table
+
+
+def _rendered(row: plan.Row, frames: Mapping[str, Shown]) -> bool:
+    needed = {stream.stream_id for stream in streams_of(row.perturbations).values()}
+    return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams
+
+
+def _steps(
+    config: Config,
+    rows: list[plan.Row],
+    verdicts: Mapping[str, Verdict],
+    frames: Mapping[str, Shown],
+    rejected: Mapping[str, str],
+) -> Iterator[tuple[str, str]]:
+    """Each stage that would make something, and why."""
+    changed = _changed(config)
+    of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
+    if not rows or of_plan:
+        yield "plan", f"another configuration: {', '.join(of_plan)}" if rows else "there is no plan yet"
+        if not rows:
+            return
+    made_anew = outdated(rows, config)
+    if needed := plan.pending(rows, verdicts, rejected):
+        yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
+    judged = plan.select(rows, verdicts, rejected)
+    if missing := [row for row in rows if judged[row.episode_id].kept and not _rendered(row, frames)]:
+        yield "render", f"the frames of {len(missing)} episodes are not there" + _of(made_anew, "files of frames")
+    if needed or missing or of_plan:
+        yield "exports and all that follows", "their episodes are not all there" if needed or missing else "a new plan"
+        return
+    yield from _follow(config)
+
+
+def _follow(config: Config) -> Iterator[tuple[str, str]]:
+    """The stages after the frames."""
+    episodes = export.kept_episodes(config)
+    stale = False
+    for one in formats_of(config.data, config.export, config.render.extras):
+        if not export.untouched(one):
+            yield f"export_{one.name}", "there is no dataset, or files of it have changed"
+        elif one.record().identity != export.identity(one, episodes):
+            why = next(iter(export.outdated(one, episodes)), "files of other episodes or options")
+            yield f"export_{one.name}", f"the dataset has {why}"
+        else:
+            continue
+        stale = True
+    if stale:
+        yield "manifest and all that follows", "the datasets are not those"
+        return
+    memories = {"validate": finished.of_validate, "summary": finished.of_summary, "report": finished.of_report}
+    for stage, memory in memories.items():
+        if not memory(config).holds():
+            yield stage, "not made from these files"
+
+
+def _changed(config: Config) -> list[str]:
+    """The fields of the configuration that are not what the run was last called with."""
+    try:
+        before = read_json(config.data / "settings.json")
+    except PipelineError:
+        return []
+    return list(_differences(before, inputs.settings(config)))
+
+
+def _differences(before: Any, now: Any, field: str = "") -> Iterator[str]:
+    if isinstance(before, dict) and isinstance(now, dict):
+        for name in dict.fromkeys([*before, *now]):
+            yield from _differences(before.get(name), now.get(name), f"{field}.{name}".removeprefix("."))
+    elif before != now:
+        yield field
+
+
+def _of(made_anew: Counter[str], what: str) -> str:
+    """Why finished work does not count, where some does not."""
+    reasons = "; ".join(f"{number} {reason}" for reason, number in made_anew.items() if reason.startswith(what))
+    return f" (would be made anew: {reasons})" if reasons else ""
+
+
+def _disk(config: Config) -> str:
+    used = cleaning.found(config.data, cleaning.PARTS)
+    folder = next(folder for folder in (config.data.absolute(), *config.data.absolute().parents) if folder.exists())
+    free_gb = shutil.disk_usage(folder).free / 1e9
+    listed = ", ".join(f"{part} {size_mb / 1e3:.2f}" for part, size_mb in used.items() if size_mb >= 10)
+    return (
+        f"disk: {sum(used.values()) / 1e3:.2f} GB used{f' ({listed})' if listed else ''}, about "
+        f"{sum(needed_mb(config).values()) / 1e3:.1f} GB when all is made, {free_gb:.1f} GB free"
+    )

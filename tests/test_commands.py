@@ -1,0 +1,234 @@
+"""What a user types: every command explains itself at once, and those around a run do what they say."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from conftest import IN_SCRIPTS, REPOSITORY, dvc, in_a_clone, rot, tiny_config
+
+from pipeline.__main__ import main, parser
+from pipeline.libero.tasks import SUITES, tasks
+from pipeline.run import manifest
+
+VERBS = {
+    "demos": ("fetch", "expand", "check"),
+    "analyse": ("report", "coverage", "gap", "construct", "grade", "leakage"),
+}
+COMMANDS = [
+    *([name] for name in ("run", "status", "clean", "doctor", "axes", "tasks", "preview", "sources", "rewrite")),
+    *([name] for name in ("check", "regenerate", "push", "evaluate", "schema")),
+    *([group, verb] for group, verbs in VERBS.items() for verb in verbs),
+]
+HELP = """
+import sys
+from pipeline.__main__ import parser
+told = parser().format_help()
+print(sorted({"numpy", "pydantic", "yaml", "rich", "h5py"}.intersection(sys.modules)))
+"""
+
+
+def call(folder: Path, *arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pipeline", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False, env=IN_SCRIPTS, **options)
+
+
+def test_help_imports_nothing_that_takes_long() -> None:
+    done = subprocess.run([sys.executable, "-c", HELP], cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_every_command_is_listed_and_explains_itself(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert command[0] in parser().format_help()
+    with pytest.raises(SystemExit) as ended:
+        parser().parse_args([*command, "--help"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out.startswith(f"usage: python -m pipeline {' '.join(command)} ")
+
+
+def test_lists(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["pipeline", "tasks"])
+    assert main() == 0
+    listed = [line.split("\t") for line in capsys.readouterr().out.splitlines()]
+    assert listed == [[f"{task.suite}/{task.name}", task.instruction] for suite in SUITES for task in tasks(suite)]
+    monkeypatch.setattr(sys, "argv", ["pipeline", "axes"])
+    assert main() == 0
+    assert {"camera", "language", "robot"} <= set(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize("params", [None, "stages: {}\n", "run: [\n"])
+def test_a_run_that_nothing_names_is_asked_for(
+    params: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if params is not None:
+        Path("params.yaml").write_text(params)
+    monkeypatch.setattr(sys, "argv", ["pipeline", "status"])
+    assert main() == 1
+    told = capsys.readouterr().err
+    assert told.startswith("error: params.yaml: no configuration was named")
+    assert "try: name one, such as configs/starter.yaml" in told
+
+
+def test_a_reader_that_has_enough_is_no_error() -> None:
+    command = f"{sys.executable} -m pipeline tasks | head -n 1"
+    done = subprocess.run(["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert (done.stdout.count("\n"), done.stderr) == (1, "")
+
+
+def test_run_refuses_what_dvc_would_not_find(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("name: mine\nplan:\n  episodes: {camera: 4}\n")
+    assert "there is no dvc.yaml here" in call(tmp_path, "run", str(file)).stderr
+    params = (REPOSITORY / "params.yaml").read_text()
+    done = call(REPOSITORY, "run", str(file))
+    assert done.returncode == 1
+    assert "move the file to configs/mine.yaml" in done.stderr
+    assert (REPOSITORY / "params.yaml").read_text() == params
+
+
+@pytest.fixture
+def clone(finished: Path, tmp_path: Path) -> Path:
+    """A copy of the finished run that may change."""
+    return Path(shutil.copytree(finished.parent.parent, tmp_path / "clone", symlinks=True))
+
+
+def configured(clone: Path, **sections: Any) -> None:
+    file = clone / "configs" / "tiny.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | sections))
+
+
+def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
+    def would_run() -> list[str]:
+        done = call(clone, "status", "configs/tiny.yaml")
+        assert done.returncode == 0, done.stderr
+        lines = [line.strip() for line in done.stdout.splitlines()]
+        assert any(line.startswith("disk: ") and "GB free" in line for line in lines)
+        if "nothing would run: all of this configuration is made" in lines:
+            return []
+        return [line.partition(":")[0] for line in lines[lines.index("would run:") + 1 :] if ": " in line][:-1]
+
+    before = {file: file.stat().st_mtime_ns for file in clone.rglob("*")}
+    told = call(clone, "status").stdout
+    assert would_run() == []
+    assert {file: file.stat().st_mtime_ns for file in clone.rglob("*")} == before
+    # Three episodes of camera are wanted, planned and kept.
+    assert [cell.strip() for cell in next(x for x in told.splitlines() if "camera" in x).split("│")[1:-1]] == [
+        *("camera", "3", "3", "3", "3"),
+    ]
+    configured(clone, export={"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 2}})
+    assert would_run() == ["export_rlds", "manifest and all that follows"]
+    configured(clone, export=tiny_config(clone)["export"])
+    shutil.rmtree(next((clone / "data/tiny/frames").glob("*/")))
+    assert would_run() == ["render", "exports and all that follows"]
+    next((clone / "data/tiny/trajectories").glob("*.h5")).unlink()
+    assert would_run() == ["replay", "render", "exports and all that follows"]
+    configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
+    assert "plan: another configuration: plan.seed" in call(clone, "status").stdout
+    (clone / "data/tiny/plan.parquet").unlink()
+    assert would_run() == ["plan"]
+
+
+def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
+    data = clone / "data" / "tiny"
+    (data / "notes.txt").write_text("mine")
+    files = set(data.rglob("*"))
+    asked = call(clone, "clean", stdin=subprocess.DEVNULL)
+    assert asked.returncode == 1
+    assert "add --yes" in asked.stderr
+    assert "made again by export_rlds" in asked.stdout
+    assert set(data.rglob("*")) == files
+    done = call(clone, "clean", "configs/tiny.yaml", "--only", "rlds", "--yes")
+    assert done.returncode == 0, done.stderr
+    gone = files - set(data.rglob("*")) - {data / ".lock"}
+    assert gone == {data / "rlds.json", data / "rlds", *(file for file in files if data / "rlds" in file.parents)}
+    assert call(clone, "clean", "--yes").returncode == 0
+    left = {file.name for file in data.iterdir()}
+    assert left == {"notes.txt", "configuration.json", "machine.json", ".lock"}
+    assert "has nothing of this" in call(clone, "clean").stdout
+
+
+def test_run_elsewhere_with_a_subset_in_one_format(clone: Path, tmp_path: Path) -> None:
+    """All stages run on finished frames in a folder on another disk, as ablations do."""
+    elsewhere = tmp_path / "elsewhere"
+    shutil.move(clone / "data" / "tiny", elsewhere / "tiny")
+    (clone / "params.yaml").write_text("run: other\ndata: data\n")
+    frames = {file: file.read_bytes() for file in (elsewhere / "tiny/frames").rglob("*.h5")}
+    lerobot = (elsewhere / "tiny/lerobot.json").read_bytes()
+    where = {"axis": ["clean", "camera"], "suite": ["libero_goal"]}
+    export = {"rlds": {"name": "libero_tiny"}, "lerobot": None, "where": where}
+    configured(clone, folder=str(elsewhere), export=export)
+
+    done = call(clone, "run", "configs/tiny.yaml")
+    assert done.returncode == 0, done.stdout + done.stderr
+    listed = done.stdout.rpartition("\n\n")[2].splitlines()
+    places = dict(line.strip().split("  ") for line in listed)
+    assert places["RLDS"] == str(elsewhere / "tiny" / "rlds")
+    assert Path(places["report"]).is_file()
+    assert "LeRobot" not in places
+    assert yaml.safe_load((clone / "params.yaml").read_text()) == {"run": "tiny", "data": str(elsewhere)}
+
+    rows = manifest.read(elsewhere / "tiny/manifest.parquet")
+    written = [row for row in rows if row["kept"]]
+    assert {(row["axis"], row["suite"]) for row in written} == {("clean", "libero_goal"), ("camera", "libero_goal")}
+    left_out = [row for row in rows if row["reason"] == "left_out"]
+    assert {row["axis"] for row in left_out} == {"clean", "camera", "noise", "language"}
+    assert all(row["rlds_shard"] is None for row in left_out)
+    assert all(row["lerobot_episode_index"] is None for row in rows)
+    assert [folder.name for folder in (elsewhere / "tiny/rlds").iterdir()] == ["libero_tiny_goal"]
+    assert {file: file.read_bytes() for file in frames} == frames
+    assert (elsewhere / "tiny/lerobot.json").read_bytes() == lerobot, "finished work stays until it is cleaned"
+    recipe = yaml.safe_load((elsewhere / "tiny/finetune/finetune.yaml").read_text())
+    assert list(recipe["clients"]) == ["openvla_oft"]
+    assert [folder.name for folder in (elsewhere / "tiny/card").iterdir()] == ["rlds"]
+    assert "nothing would run" in call(clone, "status").stdout
+
+    found = call(clone, "check")
+    assert found.returncode == 0, found.stdout + found.stderr
+    assert json.loads(found.stdout.splitlines()[-1])["openvla_oft"]["libero_tiny_goal"]["episodes"] == len(written)
+    pushed = call(clone, "push", "lerobot", "me/tiny")
+    assert "the run has no lerobot" in pushed.stderr
+    rot(next((elsewhere / "tiny/trajectories").glob("*.h5")))
+    assert call(clone, "check").returncode == 1
+
+    (clone / "params.yaml").write_text("run: tiny\ndata: data\n")
+    mistaken = dvc(clone, "repro")
+    assert mistaken.returncode != 0
+    assert "python -m pipeline run configs/tiny.yaml" in mistaken.stdout + mistaken.stderr
+
+
+@pytest.mark.slow
+def test_run_goes_on_after_it_was_stopped(short_demos: Path, tmp_path: Path) -> None:
+    clone = tmp_path / "clone"
+    in_a_clone(tiny_config(short_demos) | {"plan": {"episodes": {"language": 2}}}, clone)
+    command = [sys.executable, "-m", "pipeline", "run"]
+    running = subprocess.Popen(
+        command, cwd=clone, env=IN_SCRIPTS, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    plan = clone / "data" / "tiny" / "plan.parquet"
+    while not plan.exists() and running.poll() is None:
+        time.sleep(0.05)
+    running.send_signal(signal.SIGTERM)
+    told, _ = running.communicate(timeout=60)
+    assert running.returncode == 143, told
+    assert [process for process in Path("/proc").glob("[0-9]*") if _in(clone, process)] == [], "none goes on unseen"
+    (clone / "dvc.lock").write_text("stages:\n  plan: [")
+    done = call(clone, "run")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (clone / "data/tiny/report.html").is_file()
+
+
+def _in(folder: Path, process: Path) -> bool:
+    try:
+        return (process / "cwd").readlink() == folder
+    except OSError:  # It has ended, or is another user's.
+        return False

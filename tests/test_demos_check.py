@@ -1,0 +1,105 @@
+"""`demos check`: good files pass, and of others file, demonstration and fault are named."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from conftest import BOWL, STOVE
+
+from pipeline.compute.pool import loop
+from pipeline.errors import PipelineError
+from pipeline.libero import hdf5
+from pipeline.types import Task, Trajectory
+from pipeline.validation.demonstrations import Found, check
+
+
+@pytest.fixture(scope="module")
+def good(whole: dict[Task, Trajectory], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two files of one whole demonstration each, as they were replayed, and another as long that only waits."""
+    root = tmp_path_factory.mktemp("demos")
+    for task in (STOVE, BOWL):
+        trajectory = whole[task]
+        states = trajectory.states[:-1]
+        recording = hdf5.Recording(trajectory.actions, states, states[:, :9], trajectory.model_xml, {})
+        waits = np.tile([0.01, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0], (len(states), 1))
+        resting = replace(recording, actions=waits, states=np.repeat(states[:1], len(states), axis=0))
+        hdf5.write(root / task.suite / f"{task.name}_demo.hdf5", task, [recording, resting])
+    return root
+
+
+@pytest.fixture
+def root(good: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(good, tmp_path / "demos"))
+
+
+def file_of(root: Path, task: Task) -> Path:
+    return root / task.suite / f"{task.name}_demo.hdf5"
+
+
+def checked(root: Path, replays: int = 0) -> Found:
+    return check(root, replays, loop)
+
+
+def test_good_files_pass_and_a_miss_beside_a_success_is_listed(good: Path) -> None:
+    waiting = [f"{task.suite}/{task.name}/demo_1" for task in (BOWL, STOVE)]
+    assert checked(good, replays=2) == Found(files=2, demonstrations=4, replayed=4, missed=waiting)
+    assert checked(good, replays=1) == Found(files=2, demonstrations=4, replayed=2)
+
+
+def test_a_file_of_which_all_miss_is_a_fault(root: Path) -> None:
+    with h5py.File(file_of(root, STOVE), "r+") as file:
+        del file["data/demo_0"]
+    file_of(root, BOWL).unlink()
+    (fault,) = checked(root, replays=2).faults
+    assert fault.startswith(f"{file_of(root, STOVE)} data/demo_1: misses its goal, as do all")
+    assert "(goal_not_reached)" in fault
+
+
+def test_a_scene_of_another_task_cannot_be_replayed(root: Path, whole: dict[Task, Trajectory]) -> None:
+    with h5py.File(file_of(root, STOVE), "r+") as file:
+        states = file["data/demo_0/states"][:, :-2]
+        del file["data/demo_0/states"], file["data/demo_0"].attrs["init_state"]
+        file["data/demo_0/states"] = states
+    (fault,) = checked(root, replays=2).faults
+    assert fault.startswith(f"{file_of(root, STOVE)} data/demo_0: not replayed (state_mismatch)")
+
+
+def test_damage_copies_and_strange_names_are_named(root: Path) -> None:
+    stove, bowl = file_of(root, STOVE), file_of(root, BOWL)
+    with h5py.File(bowl, "r+") as file:
+        file.copy("data/demo_0", file["data"], "demo_7")
+        file["data/demo_1/actions"][0, 0] = np.nan
+    whole = stove.read_bytes()
+    stove.write_bytes(whole[: len(whole) // 2])
+    shutil.copy(bowl, root / STOVE.suite / "turn_of_the_stove_demo.hdf5")
+    shutil.copy(bowl, root / "loose.hdf5")
+    (root / ".cache").mkdir()
+    shutil.copy(stove, root / ".cache" / "half.hdf5")
+    found = checked(root)
+    assert (found.files, found.demonstrations) == (4, 1)
+    told = "\n".join(found.faults)
+    assert len(found.faults) == 5, told
+    assert f"{stove}: not readable as HDF5" in told
+    assert f"{bowl} data/demo_1: actions or states hold NaN" in told
+    assert f"{bowl} data/demo_7: holds the same actions, states and model as {BOWL.suite}/{BOWL.name}/demo_0" in told
+    assert "turn_of_the_stove_demo.hdf5: libero_goal has no task 'turn_of_the_stove'" in told
+    assert f"{root / 'loose.hdf5'}: is not where a run looks" in told
+
+
+def test_two_files_with_one_demonstration_are_named(root: Path) -> None:
+    shutil.copy(file_of(root, BOWL), file_of(root, STOVE))
+    with h5py.File(file_of(root, STOVE), "r+") as file:
+        file["data"].attrs["bddl_file_name"] = f"x/{STOVE.name}.bddl"
+    faults = checked(root).faults
+    assert len(faults) == 2
+    assert faults[0].startswith(f"{STOVE.suite}/{STOVE.name}/demo_0: holds the same as {BOWL.suite}/{BOWL.name}/demo_0")
+
+
+def test_an_empty_folder_says_what_belongs_there(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="there is no HDF5 file"):
+        checked(tmp_path)
