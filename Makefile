@@ -19,7 +19,7 @@ doctor: setup
 
 # pynput and evdev are left out: only lerobot's keyboard teleoperation needs them, and evdev takes a compiler.
 lock: setup
-	UV_CUSTOM_COMPILE_COMMAND="make lock" .venv/bin/uv pip compile --quiet --python-version 3.11 \
+	UV_CUSTOM_COMPILE_COMMAND="make lock" .venv/bin/uv pip compile --quiet --universal --python-version 3.11 \
 		pyproject.toml --group dev --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate \
 		--no-emit-package pynput --no-emit-package evdev -o requirements.lock
 

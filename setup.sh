@@ -7,22 +7,46 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")"
 
 UV_VERSION=0.13.8
+# Those of the lock, in the order in which they are looked for.
+PYTHONS=(3.11 3.12 3.13)
 VERB=${1:-}
 
 fail() { printf 'setup.sh: %s\n' "$@" >&2; exit 1; }
 
-is_python311() { "$1" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; }
+version_of() { "$1" -c 'import sys; print(*sys.version_info[:2], sep=".")' 2>/dev/null || true; }
 
 find_python() {
-    local candidate
-    for candidate in python3.11 python3; do
-        # A pyenv shim is on PATH even for versions that are not there, so ask it instead of looking for it.
-        if is_python311 "$candidate"; then
-            echo "$candidate"
+    local wanted candidate conda=${CONDA_EXE:-}
+    for wanted in "${PYTHONS[@]}"; do
+        # What is installed stays.
+        if [[ -x .venv/bin/pip && $(version_of .venv/bin/python) == "$wanted" ]]; then
+            echo .venv/bin/python
             return
         fi
     done
-    fail "found no Python 3.11, neither as python3.11 nor as python3" "  try: sudo apt-get install -y python3.11"
+    for wanted in "${PYTHONS[@]}"; do
+        # A pyenv shim is on PATH even for versions that are not there, so ask it instead of looking for it.
+        for candidate in "python$wanted" python3 python "${PYENV_ROOT:-$HOME/.pyenv}/versions/$wanted".*/bin/python \
+            "${conda%/bin/conda}"/{,envs/*/}bin/python; do
+            if [[ $(version_of "$candidate") == "$wanted" ]]; then
+                echo "$candidate"
+                return
+            fi
+        done
+    done
+    fetch_python || fail "found no Python ${PYTHONS[*]}, and uv could not fetch one" \
+        "  try: sudo apt-get install -y python3.11"
+}
+
+# By uv, which any Python 3 installs.
+fetch_python() {
+    local uv
+    if ! uv=$(command -v uv); then
+        uv=$(mktemp -d)
+        { python3 -m venv "$uv" && "$uv/bin/pip" install --quiet "uv==$UV_VERSION"; } >&2 || return 1
+        uv=$uv/bin/uv
+    fi
+    "$uv" python install "${PYTHONS[0]}" >&2 && "$uv" python find --managed-python "${PYTHONS[0]}"
 }
 
 # Looks for the libraries themselves: whoever installed them, and with or without dpkg.
@@ -36,13 +60,14 @@ missing_packages() {
     has '\blibOSMesa\.so' || echo libosmesa6
     has '\blibgthread-2\.0\.so\.0' || echo libglib2.0-0   # OpenCV
     has '\blibMagickWand-.*\.so' || echo libmagickwand-6.q16-6   # the tests' reference for the benchmark's noise
-    has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which links libpython too
-    "$PYTHON" -c 'import ctypes; ctypes.CDLL("libpython3.11.so.1.0")' 2>/dev/null || echo libpython3.11
+    has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which links libpython too; later lerobots do without
+    [[ $VERSION != 3.11 ]] || "$PYTHON" -c 'import ctypes; ctypes.CDLL("libpython3.11.so.1.0")' 2>/dev/null ||
+        echo libpython3.11
     command -v git >/dev/null || echo git
     # The tests' browser and batch system; `quick` leaves out the tests that need them.
     [[ $VERB != test ]] || command -v chromium-headless-shell >/dev/null || echo chromium-headless-shell
     [[ $VERB != test || -x /usr/sbin/slurmctld ]] || echo slurm-wlm
-    [[ -x .venv/bin/pip ]] || "$PYTHON" -c 'import ensurepip' 2>/dev/null || echo python3.11-venv
+    "$PYTHON" -c 'import ensurepip' 2>/dev/null || echo "python$VERSION-venv"
 }
 
 install_packages() {
@@ -58,8 +83,10 @@ install_packages() {
 
 install_venv() {
     local index
-    is_python311 .venv/bin/python || rm -rf .venv
-    [[ -x .venv/bin/pip ]] || "$PYTHON" -m venv .venv
+    if [[ $PYTHON != .venv/bin/python ]]; then
+        rm -rf .venv
+        "$PYTHON" -m venv .venv
+    fi
     .venv/bin/pip install --quiet "uv==$UV_VERSION"
     # uv does not read pip's configuration: hand on the mirror that is named there.
     index=${PIP_INDEX_URL:-$(.venv/bin/pip config get global.index-url 2>/dev/null || true)}
@@ -74,7 +101,10 @@ install_venv() {
 }
 
 [[ $VERB =~ ^(run|quick|test|)$ ]] || fail "unknown verb '$VERB', expected run, quick, test or none"
+# The lock has packages for nothing else.
+[[ $(uname -sm) == "Linux x86_64" ]] || fail "this machine is $(uname -sm), not Linux x86_64"
 PYTHON=$(find_python)
+VERSION=$(version_of "$PYTHON")
 packages=$(missing_packages)
 if [[ -n $packages ]]; then
     # shellcheck disable=SC2086  # one word per package

@@ -34,9 +34,8 @@ from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
 from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
-from pipeline.evaluation.policies import Server  # noqa: E402
+from pipeline.evaluation.policies import Server, Wanted, checked_actions  # noqa: E402
 from pipeline.evaluation.selection import Selection, select  # noqa: E402
-from pipeline.evaluation.settings import Wanted, checked_actions  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask  # noqa: E402
 
 TASKS = ("turn_on_the_stove", "pick_up_the_milk_and_place_it_in_the_basket")

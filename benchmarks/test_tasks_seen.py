@@ -43,7 +43,7 @@ def main() -> None:
     values: dict[str, list[float]] = defaultdict(list)
     looks: dict[tuple[str, str], Look] = {}
     shown: set[str] = set()
-    for task in (task for suite in benchmark.SUITES for task in tasks(suite)):
+    for task in (task for suite in benchmark.TESTED_SUITES for task in tasks(suite)):
         with closing(Simulator(task)) as simulator:
             simulator.start(0, libero_states(task)[0])
             look = looks[task.suite, task.name] = Look.of(simulator.model, simulator.state)
@@ -54,7 +54,7 @@ def main() -> None:
             for number, test in _robot_starts(task):
                 simulator.start(0, libero_states(task)[0], libero_plus.postures_rad()[number])
                 moved = Look.of(simulator.model, simulator.state)
-                level = libero_plus.level_of(test)
+                level = test.level
                 measured += moved.away_from(look, "controller_posture", level).items()
         for name, value in measured:
             values[name].append(value)
@@ -66,7 +66,7 @@ def _robot_starts(task: Task) -> list[tuple[int, TestTask]]:
     """The first robot test task of each level that perturbs a task, by the number of its posture."""
     chosen: dict[int, TestTask] = {}
     for test in benchmark.load().on(task, "robot"):
-        chosen.setdefault(libero_plus.level_of(test), test)
+        chosen.setdefault(test.level, test)
     return [(int(test.parameters["id"]), test) for test in chosen.values()]
 
 

@@ -46,8 +46,8 @@ benchmark's do. 5: the command and the posture are those of the recording among 
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
 lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
-3 of ``rlds``, 6 of ``lerobot``: the seed is a number, quality is told, features are described. 5 of ``lerobot``: files
-are written directly, and camera matrices stand once for each episode.
+3 of ``rlds``, 6 of ``lerobot``: the seed is a number, quality is told, features and videos are described. 5 of
+``lerobot``: files are written directly, and camera matrices stand once for each episode.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
 2 of it: joint angles are held against the replay's. 3: figures of quality too, against the manifest's.
 ``pictures``: what ``summary`` draws, and the report.
@@ -134,12 +134,17 @@ def differences(then: Mapping[str, str], now: Mapping[str, str]) -> str:
     )
 
 
-def refuse_unasked(found: Counter[str], where: Path) -> None:
+ALLOW = f"`{REMAKE}=1 dvc repro`, or --remake behind one stage's command"
+"""How a person allows it for what a stage makes."""
+
+
+def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
     """Say what is made anew, and stop unless that was asked for.
 
     Args:
         found: what and why, to the number of files.
         where: they lie.
+        allow: how to allow it, in words.
 
     Raises:
         PipelineError: when there is any, and the environment does not allow it. Nothing was changed.
@@ -154,8 +159,7 @@ def refuse_unasked(found: Counter[str], where: Path) -> None:
         f"finished work would be made anew: {told}",
         where=where,
         expected="the recipes, packages, machine code and OpenGL device that it was made with",
-        remedy="go on with the version and the machine that made it, or allow it: `REMAKE=1 dvc repro`, or --remake "
-        "behind one stage's command",
+        remedy=f"go on with the version and the machine that made it, or allow it: {allow}",
     )
 
 

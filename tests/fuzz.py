@@ -21,7 +21,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 # isort: split
 import numpy as np
 from conftest import REPOSITORY, STOVE, starter_demo
+from episode_results import result
 from PIL import Image
 from synthetic import write_rlds
 
@@ -38,8 +39,9 @@ from pipeline.axes.language import BANK_FILE, load_bank
 from pipeline.catalogue.texture_sources import from_file
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig, load
 from pipeline.errors import PipelineError
+from pipeline.evaluation.policies import checked_actions
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.settings import checked_actions
+from pipeline.evaluation.tasks import libero_task
 from pipeline.files import read_json
 from pipeline.formats.tfrecord import records
 from pipeline.libero import bddl, hdf5
@@ -246,8 +248,7 @@ def _read_record(file: Path) -> object:
 
 
 def _result() -> bytes:
-    policy = {"policy": "a", "identity": "claimed:a", "settings": {"seed": 0}}
-    return json.dumps({"episode": "a", **policy, "success": True, "steps": 12}).encode()
+    return json.dumps(asdict(result(libero_task(STOVE, 0), episode="a"))).encode()
 
 
 @cache

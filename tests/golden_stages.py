@@ -16,8 +16,8 @@ from synthetic import IDS, episode, files, write_lerobot, write_rlds
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.settings import Settings, Wanted
 from pipeline.formats.read_back import Copy, sampled
 from pipeline.images.jpeg import decode
 from pipeline.report import figures
@@ -50,7 +50,7 @@ def _written(write: Callable[[Path], Any]) -> str:
 def evaluation() -> dict[str, Any]:
     """How long episodes may last, and what one is told and observes at its start and after three steps."""
     (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
-    environment = EpisodeEnvironment(Settings())
+    environment = EpisodeEnvironment()
     environment.reset(task)
     seen = [environment.observation(Wanted(images=False))]
     for _ in range(3):

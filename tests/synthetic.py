@@ -126,8 +126,9 @@ def write_lerobot(
     frames: Any = "video",
     name: str = NAME,
     extras: Sequence[Extra] = (),
+    shards: int = 3,
 ) -> LeRobot:
-    target = LeRobot(out, LeRobotConfig(name=name, shards=3, frames=frames), extras)
+    target = LeRobot(out, LeRobotConfig(name=name, shards=shards, frames=frames), extras)
     export(target, episodes(load), run)
     return target
 

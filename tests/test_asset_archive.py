@@ -17,14 +17,14 @@ from conftest import STOVE
 from libero.libero import get_libero_path
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation import asset_archive, libero_plus
+from pipeline.evaluation import libero_plus
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.libero_plus import moved_state
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
-from pipeline.testset.benchmark import TestTask
+from pipeline.testset.benchmark import TestTask, load
 
 LIBERO = Path(get_libero_path("assets"))
 ARENAS = {
@@ -42,10 +42,10 @@ def stand_in(root: Path, tests: Iterable[TestTask]) -> Path:
     """Write what some test tasks need, under the archive's names; the folder is ``root``."""
     for test in tests:
         if test.axis == "layout":
-            for path in asset_archive.object_models(test).values():
+            for path in libero_plus.object_models(test).values():
                 write_model(root / path)
             continue
-        files = asset_archive.scene_files(test)
+        files = libero_plus.scene_files(test)
         for image in (files.floor, files.wall):
             (root / image).parent.mkdir(parents=True, exist_ok=True)
             known = LIBERO / image
@@ -91,10 +91,10 @@ def write_model(path: Path) -> None:
 @pytest.fixture(scope="module")
 def tasks() -> dict[str, TestTask]:
     """A task of each kind on the stove, and the milk's with another floor."""
-    listed = [test for test in libero_plus.by_name().values() if test.base == STOVE.name]
+    listed = [test for test in load().by_name.values() if test.base == STOVE.name]
     chosen = {axis: next(test for test in listed if test.axis == axis) for axis in AXES}
-    floors = (test for test in libero_plus.by_name().values() if test.suite == "libero_object")
-    chosen["floor"] = next(test for test in floors if test.axis == "background" and not libero_plus.runnable(test))
+    floors = (test for test in load().by_name.values() if test.suite == "libero_object")
+    chosen["floor"] = next(test for test in floors if test.axis == "background" and not libero_plus.assets_of(test))
     return chosen
 
 
@@ -123,7 +123,7 @@ def test_tasks_are_counted_by_the_files_that_are_there(
     chosen = Selection(source="libero_plus", axes=("light", "layout"), tasks=(STOVE.name,))
     found = select(chosen, archive)
     assert {tasks["light"].name, tasks["layout"].name} <= {task.name for task in found}
-    listed = [test for test in libero_plus.by_name().values() if test.base == STOVE.name]
+    listed = [test for test in load().by_name.values() if test.base == STOVE.name]
     lights = sum(test.axis == "light" for test in listed)
     assert sum(task.axis == "light" for task in found) == 1
     assert f"light {lights - 1}" in capsys.readouterr().out
@@ -134,17 +134,17 @@ def test_tasks_are_counted_by_the_files_that_are_there(
 
 
 def test_files_are_those_that_the_benchmarks_classes_name() -> None:
-    by_name = libero_plus.by_name()
+    by_name = load().by_name
     kitchen = next(test for (_, name), test in by_name.items() if name.startswith("KITCHEN") and "_tb_" in name)
-    files = asset_archive.scene_files(kitchen)
+    files = libero_plus.scene_files(kitchen)
     assert files.scene_xml.startswith("scenes/kitchenxml/kitchen_table_")
     assert (files.floor, files.wall) == ("textures/gray_ceramic_tile.png", "textures/yellow_linen_wall_texture.png")
     light = next(test for test in by_name.values() if test.axis == "light" and test.suite == "libero_object")
-    assert asset_archive.scene_files(light).scene_xml == (
+    assert libero_plus.scene_files(light).scene_xml == (
         f"scenes/lights/floor_light_sync_modified_{light.parameters['number']}.xml"
     )
     added = [test for test in by_name.values() if test.axis == "layout"]
-    paths = {path for test in added for path in asset_archive.object_models(test).values()}
+    paths = {path for test in added for path in libero_plus.object_models(test).values()}
     assert len(paths) == 13
     assert "new_objects/bag_of_yeast/ibvtik/usd/MJCF/ibvtik.xml" in paths
 
@@ -155,21 +155,21 @@ def test_results_depend_on_the_files_of_their_task_wherever_they_are(
     one = stand_in(tmp_path / "one", tasks.values())
     two = shutil.copytree(one, tmp_path / "two")
     for axis in AXES:
-        assert asset_archive.contents(tasks[axis], one) == asset_archive.contents(tasks[axis], two)
-    scene = two / asset_archive.scene_files(tasks["light"]).scene_xml
+        assert libero_plus.contents(tasks[axis], one) == libero_plus.contents(tasks[axis], two)
+    scene = two / libero_plus.scene_files(tasks["light"]).scene_xml
     scene.write_text(scene.read_text().replace(DIFFUSE, "0.9 0.9 0.9"))
-    (two / asset_archive.scene_files(tasks["background"]).wall).write_bytes(b"another image")
-    model = two / next(iter(asset_archive.object_models(tasks["layout"]).values()))
+    (two / libero_plus.scene_files(tasks["background"]).wall).write_bytes(b"another image")
+    model = two / next(iter(libero_plus.object_models(tasks["layout"]).values()))
     described = ET.parse(model)
     mesh = next(described.iterfind(".//*[@file]"))
     copied = Path(shutil.copy(mesh.attrib["file"], model.parent))
     mesh.set("file", copied.name)
     described.write(model)
-    with_copy = asset_archive.contents(tasks["layout"], two)
+    with_copy = libero_plus.contents(tasks["layout"], two)
     copied.write_bytes(b"another mesh")
-    assert asset_archive.contents(tasks["layout"], two) != with_copy, "what a file refers to counts too"
+    assert libero_plus.contents(tasks["layout"], two) != with_copy, "what a file refers to counts too"
     for axis in AXES:
-        assert asset_archive.contents(tasks[axis], one) != asset_archive.contents(tasks[axis], two), axis
+        assert libero_plus.contents(tasks[axis], one) != libero_plus.contents(tasks[axis], two), axis
 
 
 @pytest.mark.slow

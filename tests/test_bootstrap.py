@@ -8,12 +8,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import scipy.stats
+from episode_results import result
 from numpy.typing import NDArray
 
 from pipeline.evaluation import composition, statistics
 from pipeline.evaluation.composition import Pair, gap
-from pipeline.evaluation.results import Row
+from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.statistics import Interval, compare, difference, interval, mcnemar
+from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.seeding import rng
 
 SIMULATIONS = 300
@@ -158,14 +160,11 @@ def test_scipys_bootstrap_gives_the_same_interval_of_whole_base_tasks() -> None:
     assert ours.high - ours.low > np.diff(theirs.confidence_interval)[0]
 
 
-def row(name: str, success: bool, base: str = "base") -> Row:
-    return {
-        "source": "own", "suite": "libero_goal", "base": base, "name": name, "seed": 0, "axis": "light",
-        "success": success,
-    }  # fmt: skip
+def row(name: str, success: bool, base: str = "base") -> EpisodeResult:
+    return result(EvaluationTask("own", "libero_goal", base, name, "light", "colour", 1, 0), success)
 
 
-def pairs_of(both: int, first: int, second: int, neither: int) -> list[tuple[Row, Row]]:
+def pairs_of(both: int, first: int, second: int, neither: int) -> list[tuple[EpisodeResult, EpisodeResult]]:
     outcomes = [(True, True)] * both + [(True, False)] * first + [(False, True)] * second + [(False, False)] * neither
     return [(row(str(at), one), row(str(at), other)) for at, (one, other) in enumerate(outcomes)]
 

@@ -273,7 +273,8 @@ def test_a_run_goes_on_where_steps_and_frames_are_the_same(
     assert "fail  same machine" in shown
     assert "4567" in shown
     run_stage(config)  # This machine was tried, and is the same.
-    monkeypatch.setattr(platform, "uname", lambda: ("Linux", "another"))
+    another = platform.uname_result("Linux", "another", "", "", "x86_64")
+    monkeypatch.setattr(platform, "uname", lambda: another)
     with pytest.raises(PipelineError, match="this machine cannot make the run"):
         run_stage(config)
 

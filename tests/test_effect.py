@@ -13,9 +13,12 @@ from typing import Any
 import pytest
 import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
+from episode_results import result
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation import results
+from pipeline.evaluation.results import EpisodeResult
+from pipeline.evaluation.tasks import EvaluationTask
 
 EFFECT = REPOSITORY / "benchmarks" / "effect"
 sys.path.append(str(EFFECT))
@@ -70,16 +73,15 @@ def test_the_experiments_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch)
     assert experiment.dataset_name("clean") == read(EFFECT / f"{name}.yaml").dataset_name("clean")
 
 
-def result(axis: str, number: int, success: bool) -> dict[str, Any]:
-    task = {"source": "own", "suite": "libero_goal", "base": "stove", "name": f"{axis} {number}", "axis": axis}
-    return {**task, "seed": 0, "success": success}
+def light(number: int, success: bool) -> EpisodeResult:
+    return result(EvaluationTask("own", "libero_goal", "stove", f"light {number}", "light", "colour", 1, 0), success)
 
 
 def test_the_table_pairs_episodes_seed_by_seed() -> None:
     """Of ten episodes the first arm solves four, the second these and five more: p = 2 / 2**5."""
-    first = [result("light", number, number < 2) for number in range(5)]
-    second = [result("light", number, True) for number in range(4)] + [result("light", 4, False)]
-    (line,) = table({"clean": [first, first], "perturbed": [second, [*second[:4], result("light", 4, True)]]})
+    first = [light(number, number < 2) for number in range(5)]
+    second = [light(number, True) for number in range(4)] + [light(4, False)]
+    (line,) = table({"clean": [first, first], "perturbed": [second, [*second[:4], light(4, True)]]})
     assert line["arms"]["clean"]["successes"] == 4
     assert line["arms"]["perturbed"]["successes"] == 9
     assert line["p_values"] == {"perturbed": 2 / 2**5}
@@ -141,7 +143,7 @@ def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path) -> 
     (line,) = found["table"]
     assert (line["source"], line["axis"], line["arms"]["perturbed"]["episodes"]) == ("libero", "clean", 1)
     (row,) = results.read([*(tmp_path / "out" / "evaluations").iterdir()])[0].rows
-    assert (row["reason"], row["steps"], row["looks"]) == ("step_limit", 300, 8), "it looks once in its chunk"
+    assert (row.reason, row.steps, row.looks) == ("step_limit", 300, 8), "it looks once in its chunk"
     assert {*found["hours"]} == {"data", "training", "evaluation"}
 
 

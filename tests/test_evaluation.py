@@ -31,11 +31,12 @@ from pipeline.axes.noise import NoisePerturbation  # noqa: E402
 from pipeline.errors import PipelineError  # noqa: E402
 from pipeline.evaluation import libero_plus  # noqa: E402
 from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
+from pipeline.evaluation.policies import Wanted  # noqa: E402
 from pipeline.evaluation.selection import Selection, select  # noqa: E402
-from pipeline.evaluation.settings import Wanted  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, libero_states  # noqa: E402
 from pipeline.images.jpeg import to_policy  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
+from pipeline.testset.benchmark import load  # noqa: E402
 
 ACTIONS = rng("test_evaluation").uniform(-1, 1, (4, 7))
 FIRST = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))[0]
@@ -100,7 +101,7 @@ def test_a_camera_task_is_seen_from_the_axis_camera(evaluated: EpisodeEnvironmen
     moved = evaluated.observation(Wanted())["images"]
     assert evaluated._picture._opened._renderer is not None
     camera = evaluated._picture._opened._renderer.model.camera("agentview")
-    test = libero_plus.by_name()[task.suite, task.name]
+    test = load().by_name[task.suite, task.name]
     own = CameraPerturbation.model_validate({"component": test.component, "level": 1, **test.parameters})
     nominal = evaluated._opened.model.camera("agentview")
     pos_m, quat_wxyz = own.pose(nominal.pos, nominal.quat)
@@ -124,7 +125,7 @@ def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: E
     assert 0.01 < drift_rad < 0.6
     # By LIBERO's own code, with the posture in place of its own.
     env = OffScreenRenderEnv(bddl_file_name=str(STOVE.bddl_file), camera_heights=16, camera_widths=16)
-    number = int(libero_plus.by_name()[task.suite, task.name].parameters["id"])
+    number = int(load().by_name[task.suite, task.name].parameters["id"])
     env.env.robot_configs[0]["initial_qpos"] = np.array(libero_plus.postures_rad()[number])
     env.seed(0)
     env.reset()
@@ -234,6 +235,8 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
         params = {
             "selection": {"suites": ["libero_goal"], "tasks": ["turn_on*"]},
             "settings": {"initial_states": "demonstration"},
+            "out": str(tmp_path / "rows"),
+            "label": "replay",
         }
         benchmark = {"benchmark": "pipeline.evaluation.harness:PerturbedLibero", "params": params}
         # YAML holds JSON.
@@ -245,6 +248,7 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
         assert done.returncode == 0, done.stdout + done.stderr
         (result,) = (tmp_path / "theirs").rglob("*.json")
         assert json.loads(result.read_text())["tasks"][0]["episodes"][0]["metrics"]["success"]
+        assert rows(tmp_path / "rows") == {episode: row}, "and writes the same of it"
 
 
 @pytest.mark.slow

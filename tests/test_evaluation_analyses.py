@@ -5,38 +5,31 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import STOVE
+from episode_results import result
 
 from pipeline.__main__ import parser
 from pipeline.axes import AnyPerturbation, to_json
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.errors import PipelineError
-from pipeline.evaluation import composition, goals, own_draws, tasks
+from pipeline.evaluation import composition, own_draws, tasks
 from pipeline.evaluation.composition import Pair
-from pipeline.evaluation.construction import candidates, construct, difficulty
-from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw
-from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.settings import Settings, Wanted
-from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.results import EpisodeFiles, stored
+from pipeline.evaluation.selection import Selection, candidates, construct, select
+from pipeline.evaluation.statistics import difficulty
+from pipeline.evaluation.tasks import EvaluationTask, find_replacement, replacements
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
-
-BY: dict[str, Any] = {"policy": "p", "identity": "claimed:p", "settings": {"prompt": "clean"}}
-
-
-def result(task: EvaluationTask, success: bool, reason: str = "step_limit") -> dict[str, Any]:
-    """What an episode's file holds, as far as the analyses read it."""
-    row = {"success": success, "reason": "success" if success else reason, **BY}
-    return {**asdict(task), **row, "seed": 0, "episode": f"{task.source}_{task.name}"}
 
 
 def analyse(*arguments: str) -> int:
@@ -92,11 +85,11 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
         # The last trial lacks its pair, that before it was refused.
         if task.axis == "robot+noise" and task.number == 3:
             continue
-        refused = task.axis == "robot+noise" and task.number == 2
+        ended = {"reason": "refused"} if task.axis == "robot+noise" and task.number == 2 else {}
         success = task.axis == "clean" or (task.axis == "noise" and task.number == 0)
-        EpisodeFiles(tmp_path).save(result(task, success and not refused, "refused" if refused else "step_limit"))
+        EpisodeFiles(tmp_path).save(result(task, success, **ended))
     assert analyse("gap", str(tmp_path)) == 0
-    (pair,) = composition.pairs(EpisodeFiles(tmp_path).rows())
+    (pair,) = composition.pairs(stored([tmp_path]))
     assert replace(pair, interval=None) == Pair("robot", "noise", 2, neither=2, only_one=0, only_other=1, both=0)
     printed = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert printed["robot+noise"]["trials"] == 2
@@ -108,7 +101,7 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
     assert names == ["robot", "camera", "noise"]
     assert shown[0, 1] == pytest.approx(80 * 70 / 220**2), "the product stands above the diagonal"
     assert shown[1, 0] == pytest.approx(1 / 11)
-    EpisodeFiles(tmp_path).save({**result(tasks[0], True), "identity": "claimed:q", "episode": "other"})
+    EpisodeFiles(tmp_path).save(result(tasks[0], True, "q"))
     with pytest.raises(PipelineError, match="several policies"):
         analyse("gap", str(tmp_path))
 
@@ -143,7 +136,7 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     }
     assert len(set(drawn)) == len(drawn)
     refused = [task for task in drawn if task.axis == "layout"][:5]
-    chosen, counts = construct(drawn, 3, 210, [result(task, False, "refused") for task in refused])
+    chosen, counts = construct(drawn, 3, 210, [result(task, reason="refused") for task in refused])
     assert (counts["candidates"], counts["refused"], counts["overlapping"]) == (560, 5, 0)
     assert set(Counter(task.axis for task in chosen).values()) == {30}
     assert not set(refused) & set(chosen)
@@ -199,7 +192,7 @@ def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFix
     tasks = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot", "light")))
     for task in tasks:
         recorded = json.loads(to_json([draw(task, 0)]))
-        EpisodeFiles(tmp_path).save({**result(task, False), "perturbations": recorded})
+        EpisodeFiles(tmp_path).save(result(task, perturbations=recorded))
     config = tmp_path / "mine.yaml"
     config.write_text(f"name: mine\nfolder: {tmp_path}\nplan:\n  episodes: {{robot: 1}}\n")
     file = tmp_path / "mine" / "plan.parquet"
@@ -220,7 +213,7 @@ def test_language_has_no_held_out_draws_and_says_what_else_there_is() -> None:
 
 def test_goals_are_replaced_by_what_fits_and_is_named_alone() -> None:
     def asked(suite: str, name: str) -> set[str]:
-        return {one.instruction for one in goals.replacements(find_task(suite, name))}
+        return {one.instruction for one in replacements(find_task(suite, name))}
 
     assert asked("libero_goal", "put_the_bowl_on_top_of_the_cabinet") == {
         "put the cream cheese on top of the cabinet",
@@ -243,7 +236,7 @@ def test_goals_are_replaced_by_what_fits_and_is_named_alone() -> None:
 def test_a_goal_task_changes_nothing_but_its_goal() -> None:
     for task in select(Selection(source="goals")):
         base = find_task(task.suite, task.base)
-        replacement = goals.find(base, task.name)
+        replacement = find_replacement(base, task.name)
         ours, theirs = bddl.parse(replacement.bddl_text(base), task.name), bddl.read(base.bddl_file)
         assert replace(ours, goal=theirs.goal) == theirs
         assert not set(ours.goal) <= set(ours.start), "asks for something that does not hold at the start"
@@ -251,7 +244,7 @@ def test_a_goal_task_changes_nothing_but_its_goal() -> None:
         assert not any(replacement.old in fact for fact in ours.goal)
         assert replacement.instruction != base.instruction
     with pytest.raises(PipelineError, match="no goal"):
-        goals.find(base, "put_the_moon_on_the_plate_goal_a_b_state0")
+        find_replacement(base, "put_the_moon_on_the_plate_goal_a_b_state0")
 
 
 @pytest.fixture(scope="module")
@@ -299,7 +292,7 @@ def test_liberos_environment_judges_the_new_goal_and_not_the_old(evaluated: Epis
 @pytest.mark.slow
 def test_nothing_is_said_and_black_views_are_not_rendered() -> None:
     task = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))[0]
-    environment = EpisodeEnvironment(Settings(prompt="blank", black="all"))
+    environment = EpisodeEnvironment(EpisodeSettings(prompt="blank", black="all"))
     environment.reset(task)
     seen = environment.observation(Wanted())
     assert seen["task_description"] == ""
@@ -308,7 +301,7 @@ def test_nothing_is_said_and_black_views_are_not_rendered() -> None:
         "wrist": ((256, 256, 3), np.False_),
     }
     assert environment._picture._opened._renderer is None
-    environment.settings = Settings(black="agentview")
+    environment.settings = EpisodeSettings(black="agentview")
     environment.reset(task)
     images = environment.observation(Wanted())["images"]
     assert not images["agentview"].any()
@@ -336,15 +329,15 @@ def test_draws_that_a_plan_has_are_drawn_anew(tmp_path: Path) -> None:
     task = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("camera",), levels=(3,)))[0]
     file = tmp_path / "plan.parquet"
     plan.write([planned_row(task, draw(task, 0))], file)
-    settings = Settings(plan=file)
+    settings = EpisodeSettings(plan=file)
     assert settings.model_dump()["plan"] == own_draws.sha256_of(file)
-    assert "plan" not in Settings().model_dump()
+    assert "plan" not in EpisodeSettings().model_dump()
     environment = EpisodeEnvironment(settings)
     environment.reset(task)
     (used,) = environment.perturbations
     assert used == draw(task, 0, attempt=1)
     plan.write([planned_row(task, draw(task, 0, attempt=attempt)) for attempt in range(20)], tmp_path / "all.parquet")
-    environment.settings = Settings(plan=tmp_path / "all.parquet")
+    environment.settings = EpisodeSettings(plan=tmp_path / "all.parquet")
     progress = environment.reset(task)
     assert (progress.over, progress.success, progress.reason) == (True, False, "refused")
     environment.close()

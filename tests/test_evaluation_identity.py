@@ -14,25 +14,24 @@ import checkpoints
 import numpy as np
 import pytest
 from conftest import STOVE
+from episode_results import result
 from model_server import running
 
 from pipeline import identity
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment, results
-from pipeline.evaluation.checkpoint import Checkpoint
-from pipeline.evaluation.environment import EpisodeEnvironment
-from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.policies import PolicyConfig
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.evaluate import EvaluationJob, _environment, evaluate
+from pipeline.evaluation.policies import Checkpoint
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import Evaluation, EvaluationJob, _environment
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.settings import Settings
 from pipeline.evaluation.tasks import EvaluationTask
 
 STEPS = 4
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
-SETTINGS = Settings()
+SETTINGS = EpisodeSettings()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -58,11 +57,11 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return actions
 
 
-def evaluation(policy: PolicyConfig, out: Path, settings: Settings = SETTINGS) -> Evaluation:
+def evaluation(policy: PolicyConfig, out: Path, settings: EpisodeSettings = SETTINGS) -> Evaluation:
     return Evaluation(settings, policy, policy.identity(), out)
 
 
-def run(out: Path, checkpoint: Path, label: str = "", settings: Settings = SETTINGS) -> dict[str, Any]:
+def run(out: Path, checkpoint: Path, label: str = "", settings: EpisodeSettings = SETTINGS) -> dict[str, Any]:
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoint), label=label)
     return evaluate(evaluation(policy, out, settings), CHOSEN, loop)
 
@@ -102,7 +101,7 @@ def test_a_checkpoint_that_changes_where_it_is_is_evaluated_anew(
     assert second["all"]["episodes"] == 1
     assert second["policy"] != first["policy"]
     both = results.read([out])
-    assert [policy.rows[0]["looks"] for policy in sorted(both, key=lambda one: one.rows[0]["looks"])] == sorted(
+    assert [policy.rows[0].looks for policy in sorted(both, key=lambda one: one.rows[0].looks)] == sorted(
         [STEPS // checkpoints.CHUNK, looks]
     )
     assert len({policy.name for policy in both}) == 2, "the old results are another policy's"
@@ -137,13 +136,35 @@ def test_one_name_is_not_given_to_two_policies(tmp_path: Path, taken: list[float
     assert str(tmp_path / "two") in str(caught.value)
 
 
+@pytest.fixture
+def next_recipe() -> Iterator[Callable[[], None]]:
+    """Makes this the next version, whose episodes are others."""
+    with pytest.MonkeyPatch.context() as patch:
+
+        def change() -> None:
+            patch.setitem(identity.RECIPES, "evaluation", identity.RECIPES["evaluation"] + 1)
+            identity._parts.cache_clear()
+
+        yield change
+    identity._parts.cache_clear()
+
+
 @pytest.mark.slow
-def test_results_of_other_versions_are_made_again(
-    tmp_path: Path, taken: list[float], monkeypatch: pytest.MonkeyPatch
+def test_results_of_other_versions_are_made_again_where_that_is_asked_for(
+    tmp_path: Path, taken: list[float], next_recipe: Callable[[], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checkpoint, out = checkpoints.save(tmp_path / "policy", 0.1), tmp_path / "out"
     first = run(out, checkpoint)
-    monkeypatch.setitem(identity.RECIPES, "evaluation", identity.RECIPES["evaluation"] + 1)
+    (before,) = EpisodeFiles(out).rows()
+    number = identity.RECIPES["evaluation"]
+    next_recipe()
+    monkeypatch.delenv(identity.REMAKE, raising=False)
+    told = f"1 episodes, made with recipe of evaluation {number}, here {number + 1}"
+    with pytest.raises(PipelineError, match=rf"{told}(?s:.*)REMAKE=1"):
+        run(out, checkpoint)
+    assert len(taken) == STEPS, "it says so before anything is run"
+    assert EpisodeFiles(out).rows() == [before]
+    monkeypatch.setenv(identity.REMAKE, "1")
     second = run(out, checkpoint)
     assert len(taken) == 2 * STEPS
     assert second == first
@@ -173,8 +194,8 @@ def test_a_video_shows_what_the_policy_does_not_look_at(
     evaluate(replace(evaluation(PolicyConfig(kind="open_loop"), tmp_path), videos="all"), chosen, loop)
     assert "evaluate, episodes: 2/2, " in capsys.readouterr().err, "progress is counted in episodes"
     for row in EpisodeFiles(tmp_path).rows():
-        assert row["looks"] == 0
-        with av.open(str(EpisodeFiles(tmp_path).video(row["episode"]))) as video:
+        assert row.looks == 0
+        with av.open(str(EpisodeFiles(tmp_path).video(row.episode))) as video:
             assert [round(frame.time * 20) for frame in video.decode(video=0)] == [0, 8, 16, 20]
 
 
@@ -205,19 +226,22 @@ def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     assert job.episodes() == 2
     assert job.limit_s() > 3600
     assert job.lost() == [f"worker_lost ({task})" for task in tasks]
-    name = {"episode": replayed.episode(tasks[0]), "policy": "replay", "settings": {}}
-    EpisodeFiles(tmp_path).save({**name, "identity": replayed.identity, "made_by": results.made_by(False, [])})
+    episode, versions = replayed.episode(tasks[0]), replayed.versions(tasks[0])
+    EpisodeFiles(tmp_path).save(result(tasks[0], episode=episode, versions=versions))
     assert job.lost() == [f"worker_lost ({tasks[1]})"]
 
 
 def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
     """As the versions before wrote them."""
     old = {"episode": "a", "source": "libero", "policy": "policy", "settings": {}, "success": True, "reason": "success"}
-    EpisodeFiles(tmp_path).save(old)
+    file = EpisodeFiles(tmp_path).path("a")
+    file.parent.mkdir()
+    file.write_text(json.dumps(old))
     for use in (lambda: results.read([tmp_path]), lambda: run(tmp_path, checkpoints.save(tmp_path / "policy", 0.1))):
-        with pytest.raises(PipelineError, match="does not say which policy") as caught:
+        with pytest.raises(PipelineError, match="not a result as this version writes it") as caught:
             use()
         assert "a.json" in str(caught.value)
+        assert "another folder" in str(caught.value)
 
 
 def test_a_server_needs_a_label(tmp_path: Path) -> None:
@@ -237,7 +261,7 @@ def test_a_server_that_is_shown_something_else_is_not_counted_as_the_same(tmp_pa
     assert found["settings"] | {"state": False, "images": True} == found["settings"]
     assert found["policy"] == {"name": "act", "identity": "claimed:act"}
     more = CHOSEN.model_copy(update={"episodes": 2})
-    with running(*server, "true") as address, pytest.raises(PipelineError, match="seen in different ways: state"):
+    with running(*server, "true") as address, pytest.raises(PipelineError, match="several policies or settings: state"):
         evaluate(evaluation(PolicyConfig(kind="server", address=address, label="act"), tmp_path), more, loop)
     assert json.loads((tmp_path / "summary.json").read_text()) == found, "no summary of both together"
     assert {policy.name for policy in results.read([tmp_path])} == {"act, state False", "act, state True"}
@@ -246,12 +270,12 @@ def test_a_server_that_is_shown_something_else_is_not_counted_as_the_same(tmp_pa
 def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path) -> None:
     policy = PolicyConfig(kind="open_loop")
     with pytest.raises(PipelineError, match="look_every"):
-        evaluate(evaluation(policy, tmp_path, Settings(look_every=8)), CHOSEN, loop)
+        evaluate(evaluation(policy, tmp_path, EpisodeSettings(look_every=8)), CHOSEN, loop)
     plan = tmp_path / "plan.parquet"
     with pytest.raises(PipelineError, match="cannot be read"):
-        evaluate(evaluation(policy, tmp_path, Settings(plan=plan)), CHOSEN, loop)
+        evaluate(evaluation(policy, tmp_path, EpisodeSettings(plan=plan)), CHOSEN, loop)
     plan.touch()
     with pytest.raises(PipelineError, match="plan"):
-        evaluate(evaluation(policy, tmp_path, Settings(plan=plan)), CHOSEN, loop)
+        evaluate(evaluation(policy, tmp_path, EpisodeSettings(plan=plan)), CHOSEN, loop)
     with pytest.raises(PipelineError, match="seed"):
-        evaluate(evaluation(policy, tmp_path, Settings(seed=1)), CHOSEN, loop)
+        evaluate(evaluation(policy, tmp_path, EpisodeSettings(seed=1)), CHOSEN, loop)

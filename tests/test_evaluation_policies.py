@@ -15,18 +15,18 @@ from model_server import running
 
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
-from pipeline.evaluation.evaluate import evaluate
-from pipeline.evaluation.policies import PolicyConfig
+from pipeline.evaluation.environment import EpisodeSettings
+from pipeline.evaluation.evaluate import _environment, evaluate
+from pipeline.evaluation.policies import PolicyError, checked_actions
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.rollout import Evaluation, _environment
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
-from pipeline.evaluation.settings import PolicyError, Settings, checked_actions
 
 FAULTY_AND_STOVE = Selection(
     suites=("libero_object", "libero_goal"), tasks=("pick_up_the_milk*", "push_the_plate*", "turn_on*")
 )
 FAULTY_SERVER = str(REPOSITORY / "tests" / "faulty_server.py")
-RECORDED = Settings(initial_states="demonstration")
+RECORDED = EpisodeSettings(initial_states="demonstration")
 
 
 def test_answers_are_checked_before_any_is_taken() -> None:
@@ -53,8 +53,8 @@ def test_other_episodes_are_run_when_some_get_no_action(tmp_path: Path) -> None:
     for told in ("within 10 s", "pick_up_the_milk", "no such camera", "push_the_plate"):
         assert told in str(raised.value)
     (row,) = EpisodeFiles(tmp_path).rows()
-    assert row["base"] == "turn_on_the_stove"
-    assert row["success"]
+    assert row.base == "turn_on_the_stove"
+    assert row.success
     assert json.loads((tmp_path / "summary.json").read_text())["all"]["episodes"] == 1
 
 
@@ -69,4 +69,4 @@ def test_a_server_that_dies_ends_the_run(tmp_path: Path) -> None:
     assert stopped.returncode == 1
     assert "Traceback" not in stopped.stderr
     assert "run the same command again" in stopped.stderr
-    assert not any(row["base"].startswith("pick_up_the_milk") for row in EpisodeFiles(tmp_path).rows())
+    assert not any(row.base.startswith("pick_up_the_milk") for row in EpisodeFiles(tmp_path).rows())

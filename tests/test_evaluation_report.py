@@ -4,47 +4,30 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from episode_results import result
 from html_page import Page, needs_nothing_beside_itself, screenshot
 from scipy.stats import binomtest
 
+from pipeline.__main__ import parser
 from pipeline.errors import PipelineError
-from pipeline.evaluation.findings import FAILURES, paper_table
-from pipeline.evaluation.results import EpisodeFiles, Row, read
+from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import compare, mcnemar, paired
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.report import evaluation_report
-from pipeline.seeding import digest
+from pipeline.report.evaluation_findings import FAILURES, paper_table
 
 
 @pytest.fixture(scope="module")
 def subset() -> list[EvaluationTask]:
     return select(Selection(source="libero_plus", subset=60))
-
-
-def result(task: EvaluationTask, policy: str, success: bool, prompt: str = "clean", steps: int = 100) -> Row:
-    return {
-        **asdict(task),
-        "episode": digest(str(task), policy, prompt)[:16],
-        "policy": policy,
-        "identity": f"claimed:{policy}",
-        "success": success,
-        "reason": "success" if success else "step_limit",
-        "steps": steps,
-        "looks": steps // 8,
-        "seed": 0,
-        "prompt": "turn on the stove",
-        "perturbations": [],
-        "settings": {"prompt": prompt, "seed": 0},
-        "versions": {"mujoco": "3.2.7", "opengl": "llvmpipe"},
-    }
 
 
 def test_the_published_rows_are_whole_and_add_up() -> None:
@@ -58,7 +41,7 @@ def test_the_published_rows_are_whole_and_add_up() -> None:
 
 def test_an_episode_counts_for_the_test_tasks_that_it_stands_for() -> None:
     robot = {task.level: task for task in select(Selection(source="libero_plus", axes=("robot",)))}
-    line = paper_table({"mine": [result(robot[1], "mine", True), result(robot[5], "mine", False)]})["evaluated"][0]
+    line = paper_table({"mine": [result(robot[1], True, "mine"), result(robot[5], False, "mine")]})["evaluated"][0]
     # 156 tasks of level 1 and 371 of level 5: 156 / 527, and 527^2 / (156^2 + 371^2) episodes' worth.
     assert line["cells"]["robot"]["rate"] == pytest.approx(0.29602, abs=1e-5)
     assert line["cells"]["robot"]["effective"] == pytest.approx(1.71462, abs=1e-5)
@@ -70,7 +53,7 @@ def test_an_episode_counts_for_the_test_tasks_that_it_stands_for() -> None:
 
 
 def test_all_tasks_of_a_column_weigh_the_same() -> None:
-    rows = [result(task, "mine", task.level == 1) for task in select(Selection(source="libero_plus", axes=("camera",)))]
+    rows = [result(task, task.level == 1, "mine") for task in select(Selection(source="libero_plus", axes=("camera",)))]
     (line,) = paper_table({"mine": rows})["evaluated"]
     # Of level 1: 10 by distance, 6 by orientation, 117 by spherical position.
     assert line["cells"]["camera"]["rate"] == pytest.approx(133 / 1599)
@@ -79,7 +62,7 @@ def test_all_tasks_of_a_column_weigh_the_same() -> None:
 
 
 def test_a_column_says_what_it_does_not_rest_on() -> None:
-    rows = [result(task, "mine", True) for task in select(Selection(source="libero_plus", axes=("pose",)))]
+    rows = [result(task, True, "mine") for task in select(Selection(source="libero_plus", axes=("pose",)))]
     (line,) = paper_table({"mine": rows})["evaluated"]
     assert line["cells"]["layout"]["episodes"] == 696
     assert line["cells"]["layout"]["absent"] == "confounding objects (829 tasks)"
@@ -93,8 +76,8 @@ def test_mcnemars_test_is_exact() -> None:
 
 @pytest.mark.slow
 def test_policies_are_compared_on_the_episodes_that_both_ran(subset: list[EvaluationTask]) -> None:
-    first = [result(task, "first", True) for task in subset[:10]]
-    second = [result(task, "second", at % 2 == 0) for at, task in enumerate(subset[4:])]
+    first = [result(task, True, "first") for task in subset[:10]]
+    second = [result(task, at % 2 == 0, "second") for at, task in enumerate(subset[4:])]
     pairs = paired(first, second)
     assert len(pairs) == 6
     whole = compare(pairs)["all"]
@@ -103,7 +86,7 @@ def test_policies_are_compared_on_the_episodes_that_both_ran(subset: list[Evalua
     assert sum(axis["episodes"] for axis in compare(pairs)["by_axis"].values()) == 6
 
 
-def write(folder: Path, rows: list[Row]) -> Path:
+def write(folder: Path, rows: list[EpisodeResult]) -> Path:
     files = EpisodeFiles(folder)
     for row in rows:
         files.save(row)
@@ -111,18 +94,58 @@ def write(folder: Path, rows: list[Row]) -> Path:
 
 
 def test_folders_of_several_machines_are_one_result(subset: list[EvaluationTask], tmp_path: Path) -> None:
-    one = write(tmp_path / "one", [result(task, "mine", True) for task in subset[:30]])
-    other = write(tmp_path / "other", [result(task, "mine", True) for task in subset[20:]])
-    write(other, [{**result(subset[0], "mine", False, steps=0), "episode": "0", "reason": "refused"}])
+    one = write(tmp_path / "one", [result(task, True, "mine") for task in subset[:30]])
+    other = write(tmp_path / "other", [result(task, True, "mine") for task in subset[20:]])
+    write(other, [result(subset[0], False, "mine", steps=0, episode="0", reason="refused")])
     (merged,) = read([one, other])
     assert (merged.name, len(merged.rows), merged.refused) == ("mine", 60, 1)
-    polluted = write(tmp_path / "polluted", [result(subset[0], "mine", False, prompt="benchmark")])
-    assert [policy.name for policy in read([one, polluted])] == ["mine, prompt clean", "mine, prompt benchmark"]
-    different = write(tmp_path / "different", [result(subset[0], "mine", False)])
-    with pytest.raises(PipelineError, match=r"two results of libero_plus.*'success': True.*'success': False"):
+    polluted = write(tmp_path / "polluted", [result(subset[0], False, "mine", "benchmark")])
+    names = [policy.name for policy in read([one, polluted], across=["prompt"])]
+    assert names == ["mine, prompt clean", "mine, prompt benchmark"]
+    different = write(tmp_path / "different", [result(subset[0], False, "mine")])
+    with pytest.raises(PipelineError, match=r"two results of libero_plus/.*: success True and False, reason"):
         read([one, different])
     with pytest.raises(PipelineError, match="no results"):
         read([one, tmp_path / "absent"])
+
+
+@pytest.mark.parametrize(
+    ("field", "second"),
+    [("prompt", {"prompt": "benchmark"}), ("step_limit", {"step_limit": 600})],
+    ids=["prompt", "step limit"],
+)
+def test_results_under_different_prompts_or_limits_are_not_compared(
+    subset: list[EvaluationTask], tmp_path: Path, field: str, second: dict[str, Any]
+) -> None:
+    one, other = result(subset[0], True, "one"), result(subset[0], True, "other", **second)
+    folders = [write(tmp_path / "one", [one]), write(tmp_path / "other", [other])]
+    graded = ["analyse", "grade", *map(str, folders), "--out", str(tmp_path / "graded.json")]
+    page = str(tmp_path / "report.html")
+    for command in (graded, ["evaluation-report", *map(str, folders), "--out", page]):
+        arguments = parser().parse_args(command)
+        with pytest.raises(PipelineError) as caught:
+            arguments.run(arguments)
+        told = str(caught.value)
+        assert f"cannot be compared, on {subset[0].source}/{subset[0].suite}: {field} " in told
+        assert f"{getattr(one, field)} and {getattr(other, field)}" in told
+        for folder, row in zip(folders, (one, other), strict=True):
+            assert str(EpisodeFiles(folder).path(row.episode)) in told
+        assert f"--across {field}" in told
+    arguments = parser().parse_args(["evaluation-report", *map(str, folders), "--out", page, "--across", field])
+    assert arguments.run(arguments) == 0
+    # Another suite has another limit, and another source another wording.
+    elsewhere = result(EvaluationTask("libero", "libero_10", "a", "a_state0", "clean", "clean", 0, 0), policy="other")
+    assert len(read([folders[0], write(tmp_path / "elsewhere", [elsewhere])])) == 2
+
+
+def test_policies_are_paired_by_all_of_their_task(subset: list[EvaluationTask]) -> None:
+    task = subset[0]
+    first = result(task, True, "first")
+    assert paired([first], [result(task, False, "second")])
+    for other in ({"level": task.level + 1}, {"number": 7}, {"component": "another"}, {"base": "another"}):
+        assert not paired([first], [result(replace(task, **other), False, "second")]), other
+    for drawn in ({"seed": 1}, {"perturbations": [{"axis": "camera"}]}):
+        assert not paired([first], [result(task, False, "second", **drawn)]), drawn
 
 
 @pytest.fixture(scope="module")
@@ -130,8 +153,8 @@ def written(subset: list[EvaluationTask], tmp_path_factory: pytest.TempPathFacto
     """A page about two policies, one with videos."""
     folder = tmp_path_factory.mktemp("results")
     tasks = [*subset, *select(Selection(suites=("libero_goal",)))]
-    better = write(folder / "better", [result(task, "better", at % 4 > 0) for at, task in enumerate(tasks)])
-    worse = write(folder / "worse", [result(task, "worse", at % 4 == 0) for at, task in enumerate(tasks)])
+    better = write(folder / "better", [result(task, at % 4 > 0, "better") for at, task in enumerate(tasks)])
+    worse = write(folder / "worse", [result(task, at % 4 == 0, "worse") for at, task in enumerate(tasks)])
     film = mp4([np.full((256, 256, 3), grey, np.uint8) for grey in (0, 90, 200)], [0, 8, 20])
     for path in (worse / "episodes").glob("*.json"):
         EpisodeFiles(worse).save_video(path.stem, film)
@@ -182,7 +205,7 @@ def test_the_overall_rate_of_each_policy_comes_first(written: Path) -> None:
 def test_one_policy_of_few_episodes_is_not_set_beside_published_ones_as_an_equal(
     subset: list[EvaluationTask], tmp_path: Path
 ) -> None:
-    folder = write(tmp_path / "few", [result(subset[0], "alone", True)])
+    folder = write(tmp_path / "few", [result(subset[0], True, "alone")])
     evaluation_report.write(read([folder]), tmp_path / "report.html")
     html = (tmp_path / "report.html").read_text()
     words = " ".join(Page(html).text.split())
@@ -197,8 +220,8 @@ def test_one_policy_of_few_episodes_is_not_set_beside_published_ones_as_an_equal
 
 
 def test_policies_of_different_episodes_are_said_to_be(subset: list[EvaluationTask], tmp_path: Path) -> None:
-    one = write(tmp_path / "one", [result(task, "one", True) for task in subset[:20]])
-    other = write(tmp_path / "other", [result(task, "other", False) for task in subset[5:20]])
+    one = write(tmp_path / "one", [result(task, True, "one") for task in subset[:20]])
+    other = write(tmp_path / "other", [result(task, False, "other") for task in subset[5:20]])
     evaluation_report.write(read([one, other]), tmp_path / "report.html")
     words = " ".join(Page((tmp_path / "report.html").read_text()).text.split())
     assert "The policies did not run the same episodes" in words[: words.index("Beside published models")]

@@ -13,17 +13,19 @@ import numpy as np
 import pytest
 import torch
 from conftest import STOVE
+from episode_results import result
 
 from pipeline import seeding
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
-from pipeline.evaluation import libero_plus
+from pipeline.evaluation import libero_plus, tasks
 from pipeline.evaluation.libero_plus import moved_state, saved_array
 from pipeline.evaluation.own_draws import draw
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary, wilson
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
 from pipeline.libero.starts import HOME_RAD
+from pipeline.testset import benchmark
 
 
 def test_libero_has_an_episode_for_each_task_and_initial_state() -> None:
@@ -58,7 +60,7 @@ def test_tasks_are_chosen_by_axis_component_level_suite_and_name() -> None:
     assert chosen
     kinds = {(task.suite, task.component, task.level, task.base) for task in chosen}
     assert kinds == {("libero_goal", "glass", 5, "turn_on_the_stove")}
-    severities = {libero_plus.by_name()[task.suite, task.name].parameters["severity"] for task in chosen}
+    severities = {benchmark.load().by_name[task.suite, task.name].parameters["severity"] for task in chosen}
     assert severities <= {9, 10}
 
 
@@ -82,8 +84,8 @@ def test_held_out_draws_are_none_of_a_plan() -> None:
 
 
 def test_instructions_are_clean_or_the_benchmarks() -> None:
-    def told(axis: str, suite: str, prompt: libero_plus.Prompt) -> str:
-        tests = [test for test in libero_plus.by_name().values() if (test.axis, test.suite) == (axis, suite)]
+    def told(axis: str, suite: str, prompt: tasks.Prompt) -> str:
+        tests = [test for test in benchmark.load().by_name.values() if (test.axis, test.suite) == (axis, suite)]
         return libero_plus.instruction(tests[0], prompt)
 
     clean = told("camera", "libero_10", "clean")
@@ -95,10 +97,10 @@ def test_instructions_are_clean_or_the_benchmarks() -> None:
 
 
 def test_a_test_task_that_a_suite_does_not_have_is_refused() -> None:
-    (test, *_) = (test for (suite, _), test in libero_plus.by_name().items() if suite == "libero_goal")
-    assert libero_plus.find("libero_goal", test.name) is test
+    (test, *_) = (test for (suite, _), test in benchmark.load().by_name.items() if suite == "libero_goal")
+    assert benchmark.load().find("libero_goal", test.name) is test
     with pytest.raises(PipelineError, match="libero_10: LIBERO-Plus has no test task"):
-        libero_plus.find("libero_10", test.name)
+        benchmark.load().find("libero_10", test.name)
 
 
 def test_postures_are_the_benchmarks_tables() -> None:
@@ -108,7 +110,7 @@ def test_postures_are_the_benchmarks_tables() -> None:
 
 
 def test_states_of_moved_scenes_are_read_without_running_a_pickle() -> None:
-    pose = [test for test in libero_plus.by_name().values() if test.axis == "pose" and test.suite == "libero_goal"]
+    pose = [test for test in benchmark.load().by_name.values() if test.axis == "pose" and test.suite == "libero_goal"]
     state = moved_state("libero_goal", pose[0].name)
     assert np.isfinite(state).all()
     assert state.ndim == 1
@@ -130,7 +132,7 @@ def test_intervals_are_wilsons() -> None:
     assert wilson(0, 0) == (0, 1)
     rng = seeding.rng("test")
     rows = [
-        {"suite": "a", "axis": axis, "component": "c", "level": level, "success": bool(rng.integers(2))}
+        result(EvaluationTask("own", "libero_goal", "b", "n", axis, "c", level, 0), bool(rng.integers(2)))
         for axis in ("camera", "noise")
         for level in (1, 2)
     ]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.evaluation import libero_plus
 from pipeline.libero.assets import libero_folder
-from pipeline.testset.benchmark import TestTask
+from pipeline.testset.benchmark import TestTask, load
 from pipeline.types import Floats
 
 CENTRE_M = np.array([0.0, 0.0, 0.8])
@@ -82,16 +82,16 @@ def benchmark_camera(test: TestTask) -> Pose:
 
 
 def test_every_camera_is_the_benchmarks() -> None:
-    tests = [test for test in libero_plus.by_name().values() if test.axis == "camera"]
+    tests = [test for test in load().by_name.values() if test.axis == "camera"]
     assert len(tests) == 1599
     different = {}
     # And of each arena a task that changes something else.
-    others = {problem(test): test for test in libero_plus.by_name().values() if test.axis != "camera"}
+    others = {problem(test): test for test in load().by_name.values() if test.axis != "camera"}
     assert len(others) == 5
     for test in (*tests, *others.values()):
         ours, theirs = compiled(nominal(problem(test))), compiled(benchmark_camera(test))
         libero_plus.camera(test).apply(ours)
         if not (np.array_equal(ours.cam_pos, theirs.cam_pos) and np.array_equal(ours.cam_quat, theirs.cam_quat)):
             different[test.suite, test.name] = (ours.cam_pos, theirs.cam_pos, ours.cam_quat, theirs.cam_quat)
-    kinds = Counter(libero_plus.by_name()[key].component for key in different)
+    kinds = Counter(load().by_name[key].component for key in different)
     assert not different, f"{kinds} are other cameras, such as {next(iter(different.items()))}"

@@ -21,6 +21,7 @@ from model_server import running  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
+from pipeline.errors import PipelineError  # noqa: E402
 from pipeline.evaluation import environment  # noqa: E402
 from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.harness import PerturbedLibero  # noqa: E402
@@ -38,9 +39,9 @@ Run = Callable[[str, int], int]
 
 def ours(address: str, look_every: int) -> int:
     with closing(EpisodeEnvironment()) as environment, closing(Server(address, look_every=look_every)) as server:
-        row = roll_out_policy(environment, server, TASK)
-    assert row["steps"] == STEPS
-    return int(row["looks"])
+        looks = roll_out_policy(environment, server, TASK)
+        assert environment.progress.steps == STEPS
+    return looks
 
 
 def harness(address: str, look_every: int) -> int:
@@ -83,6 +84,13 @@ def short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(environment.STEP_LIMITS, STOVE.suite, STEPS)
         yield
+
+
+def test_rows_of_the_harness_need_a_folder_and_a_label(tmp_path: Path) -> None:
+    with pytest.raises(PipelineError, match="out: DIR"):
+        PerturbedLibero(label="act")
+    with pytest.raises(PipelineError, match="--label NAME"):
+        PerturbedLibero(out=str(tmp_path))
 
 
 @pytest.fixture(scope="module")

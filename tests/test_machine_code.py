@@ -105,5 +105,5 @@ for use in (lambda: TrajectoryStore(Path("none")), lambda: made_with("physics"))
 
 
 def test_the_documentation_has_the_settings_for_a_worker() -> None:
-    text = (REPOSITORY / "docs" / "scaling-out.md").read_text()
+    text = (REPOSITORY / "docs" / "cost.md").read_text()
     assert [setting for setting in SETTINGS.items() if 'export {}="{}"\n'.format(*setting) not in text] == []

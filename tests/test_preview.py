@@ -228,6 +228,40 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 
 @pytest.mark.slow
+def test_the_command_shows_all_axes_beside_the_twin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = tmp_path / "axes.jpg"
+    monkeypatch.chdir(REPOSITORY)
+    monkeypatch.setattr("sys.argv", ["pipeline", "preview", f"{BOWL.suite}/{BOWL.name}", "all", "--out", str(out)])
+    assert command_line.main() == 0
+    side = SCHEMA.frame.shape[1]
+    pitch = side + sheets.GAP_PX
+    with Image.open(out) as sheet:
+        assert sheet.format == "JPEG"
+        assert sheet.width == 5 * pitch + sheets.GAP_PX
+        row = np.asarray(sheet).astype(int)[2 * sheets.LINE_PX :][:side, sheets.GAP_PX :]
+    twin, layout, pose = (row[:, left : left + side] for left in (0, pitch, 2 * pitch))
+    assert [np.abs(tile - twin).mean() > 2 for tile in (layout, pose)] == [True, True]
+
+
+def test_an_overview_shows_the_strongest_draw_that_the_scene_takes(
+    stage: preview.Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(1, 2, 5)))
+    monkeypatch.setattr(preview, "PHYSICS_VARIANTS", 6)
+    captions: list[str] = []
+
+    def tile(picture: Image.Image, caption: str) -> sheets.Tile:
+        captions.append(caption)
+        return sheets.Tile(picture, caption)
+
+    monkeypatch.setattr(preview, "Tile", tile)
+    preview.overview(stage, STARTER, NO_TESTS)
+    assert captions[0] == f"clean twin: {BOWL.instruction}"
+    # Level 5 is refused.
+    assert captions[1:] == ["lift: lamp, level 2"] * len(Axes.model_fields)
+
+
+@pytest.mark.slow
 def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "VARIANTS", 2)
     tasks = tuple(f"{task.suite}/{task.name}" for task in (STOVE, MILK))

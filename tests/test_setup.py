@@ -10,9 +10,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from packaging.markers import Marker
 from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).parent.parent
+PYTHONS = ("3.11", "3.12", "3.13")
 LIBRARIES = (
     "libEGL.so.1",
     "libEGL_mesa.so.0",
@@ -26,14 +28,19 @@ BROWSER = "chromium-headless-shell"
 BATCH_SYSTEM = "/usr/sbin/slurmctld"
 # As the real one does, `-m venv` makes pip, and pip uv; what they are called with is kept.
 PYTHON = """
-if [[ $* == "-m venv .venv" ]]; then
-    mkdir -p .venv/bin
+if [[ $* == "-m venv "* ]]; then
+    mkdir -p $3/bin
     for tool in python pip uv ruff mypy pytest; do
-        printf '#!/bin/bash\necho %s "$@" >>calls\n' "$tool" >.venv/bin/$tool
-        chmod +x .venv/bin/$tool
+        printf '#!/bin/bash\necho %s "$@" >>calls\n' "$tool" >$3/bin/$tool
+        chmod +x $3/bin/$tool
     done
-else
+    cp "$0" $3/bin/python
+elif [[ $* == *"print(*sys.version_info"* ]]; then
+    echo {version}
+elif [[ $1 == -c ]]; then
     exec {executable} "$@"
+else
+    echo python "$@" >>calls
 fi
 """
 
@@ -46,27 +53,31 @@ class Tree:
         (root / "setup.sh").write_bytes((REPOSITORY / "setup.sh").read_bytes())
         (root / "requirements.lock").write_text("numpy==2.2.6\n")
         (root / "pyproject.toml").touch()
-        self.stub("python3.11", PYTHON.replace("{executable}", sys.executable))
+        self.python("bin/python3.11", "3.11")
+        self.stub("python3", "exit 1")
         self.libraries(*LIBRARIES)
         # The machine's commands, without the browser that is there when these tests run.
         (root / "commands").mkdir()
         for command in Path("/usr/bin").iterdir():
-            if command.name != BROWSER:
+            if command.name != BROWSER and not command.name.startswith("python"):
                 (root / "commands" / command.name).symlink_to(command)
 
-    def stub(self, name: str, script: str) -> None:
-        file = self.root / "bin" / name
-        file.parent.mkdir(exist_ok=True)
+    def python(self, path: str, version: str) -> None:
+        self.stub(path, PYTHON.replace("{executable}", sys.executable).replace("{version}", version), folder="")
+
+    def stub(self, name: str, script: str, folder: str = "bin") -> None:
+        file = self.root / folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(f"#!/bin/bash\n{script}\n")
         file.chmod(0o755)
 
     def libraries(self, *names: str) -> None:
         self.stub("ldconfig", "\n".join(f"printf '\\t{name} (libc6,x86-64) => /lib/{name}\\n'" for name in names))
 
-    def setup(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+    def setup(self, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             ["bash", self.root / "setup.sh", *arguments],
-            env={"PATH": f"{self.root / 'bin'}:{self.root / 'commands'}", "HOME": str(self.root)},
+            env={"PATH": f"{self.root / 'bin'}:{self.root / 'commands'}", "HOME": str(self.root), **environment},
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -161,12 +172,48 @@ def test_each_check_can_fail_the_verb(tree: Tree, failing: str) -> None:
     assert tree.setup("quick").returncode == 1
 
 
-def test_no_python_of_the_right_version(tree: Tree) -> None:
-    tree.stub("python3.11", "echo no such version >&2; exit 127")
-    tree.stub("python3", "exit 1")
+@pytest.mark.parametrize(
+    ("pythons", "taken"),
+    [
+        ({"bin/python3.12": "3.12", "bin/python3.11": "3.11", "bin/python3": "3.13"}, "3.11"),
+        ({"bin/python3.12": "3.12", "bin/python3": "3.13"}, "3.12"),
+        ({"bin/python3": "3.14", "bin/python": "3.13"}, "3.13"),
+        ({"bin/python3.11": "", "bin/python3": "3.10", ".pyenv/versions/3.12.1/bin/python": "3.12"}, "3.12"),
+        ({"bin/python3": "3.14", "conda/envs/work/bin/python": "3.11"}, "3.11"),
+        ({"bin/python3.11": "3.11", ".venv/bin/python": "3.13", ".venv/bin/pip": ""}, "3.13"),
+        ({"bin/python3.11": "3.11", ".venv/bin/python": "3.10", ".venv/bin/pip": ""}, "3.11"),
+    ],
+)
+def test_takes_a_python_that_is_there(tree: Tree, pythons: dict[str, str], taken: str) -> None:
+    (tree.root / "bin" / "python3.11").unlink()
+    for path, version in pythons.items():
+        tree.python(path, version)
+    tree.stub("uv", 'echo uv "$@" >>calls', folder=".venv/bin")
+    done = tree.setup(CONDA_EXE=f"{tree.root}/conda/bin/conda")
+    assert done.returncode == 0, done.stderr
+    assert f"echo {taken}\n" in (tree.root / ".venv" / "bin" / "python").read_text()
+    assert "uv pip sync --compile-bytecode --require-hashes requirements.lock" in tree.calls()
+
+
+def test_has_uv_fetch_a_python_where_none_fits(tree: Tree) -> None:
+    (tree.root / "bin" / "python3.11").unlink()
+    tree.python("bin/python3", "3.14")
+    tree.python("fetched/python", "3.11")
+    tree.stub("uv", f'echo uv "$@" >>calls; [[ $2 != find ]] || echo {tree.root}/fetched/python')
+    done = tree.setup()
+    assert done.returncode == 0, done.stderr
+    assert tree.calls()[:2] == ["uv python install 3.11", "uv python find --managed-python 3.11"]
+    assert "echo 3.11\n" in (tree.root / ".venv" / "bin" / "python").read_text()
+
+
+def test_no_python_and_none_to_fetch(tree: Tree) -> None:
+    (tree.root / "bin" / "python3.11").unlink()
+    tree.stub("uv", "echo no network >&2; exit 1")
     done = tree.setup()
     assert done.returncode != 0
-    assert "found no Python 3.11" in done.stderr
+    assert "no network" in done.stderr
+    assert "found no Python 3.11 3.12 3.13" in done.stderr
+    assert "apt-get install -y python3.11" in done.stderr
 
 
 def test_an_unknown_verb_is_refused_before_any_work(tree: Tree) -> None:
@@ -179,12 +226,16 @@ def test_an_unknown_verb_is_refused_before_any_work(tree: Tree) -> None:
 def test_the_lock_is_hashed_nameless_and_up_to_date() -> None:
     lock = (REPOSITORY / "requirements.lock").read_text()
     assert "://" not in lock
-    entries = re.findall(r"^(\S+)==(\S+) \\\n    --hash=sha256:", lock, re.MULTILINE)
+    entries = re.findall(r"^(\S+)==(\S+) ; (.+) \\\n    --hash=sha256:", lock, re.MULTILINE)
     assert len(entries) == len(re.findall(r"^\w", lock, re.MULTILINE))
-    locked = dict(entries)
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
-    for line in project["project"]["dependencies"] + project["dependency-groups"]["dev"]:
-        requirement = Requirement(line)
-        assert requirement.specifier.contains(locked[requirement.name.lower()]), f"{line}: run make lock"
+    for python in PYTHONS:
+        machine = {"python_version": python, "python_full_version": f"{python}.0", "platform_machine": "x86_64"}
+        locked = {name: version for name, version, marker in entries if Marker(marker).evaluate(machine)}
+        assert locked["pytest"], "the lock knows this Python"
+        for line in project["project"]["dependencies"] + project["dependency-groups"]["dev"]:
+            requirement = Requirement(line)
+            if requirement.marker is None or requirement.marker.evaluate(machine):
+                assert requirement.specifier.contains(locked[requirement.name.lower()]), f"{line}: run make lock"
     # It has no wheel, and a fresh machine has no compiler.
     assert "evdev" not in locked

@@ -23,7 +23,7 @@ import pytest
 import tensorflow_datasets as tfds
 import tf_readback
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.datasets.utils import dataset_to_policy_features
+from lerobot.policies.factory import dataset_to_policy_features
 from numpy.typing import NDArray
 from synthetic import (
     EXTRAS,
@@ -372,6 +372,30 @@ def test_bytes_do_not_depend_on_the_workers(written: Written, tmp_path: Path) ->
         assert [name for name, data in two.items() if str(tmp_path).encode() in data] == []
     # Export imports no simulator; TensorFlow would crash a process that renders.
     assert not {"mujoco", "robosuite", "libero", "tensorflow"} & modules
+
+
+WITHOUT_TORCH = """
+import sys, tempfile
+from pathlib import Path
+import pipeline
+from synthetic import IDS, write_lerobot, write_rlds
+
+folder = Path(tempfile.mkdtemp(dir=sys.argv[1]))
+write_lerobot(folder)
+made = write_rlds(folder)
+rows = {name: {**made.record().places[name], "episode_id": name, "suite": "synthetic", "steps": 1} for name in IDS}
+assert all(made.read(row, folder) for row in rows.values())
+list(made.check(rows, folder))
+print(sorted({"torch", "tensorflow", "lerobot"} & sys.modules.keys()))
+"""
+
+
+def test_rlds_is_made_and_checked_and_lerobot_written_without_torch(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_TORCH, str(tmp_path)], cwd=Path(__file__).parent, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout == "[]\n"
 
 
 @pytest.mark.slow

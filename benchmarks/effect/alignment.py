@@ -23,9 +23,9 @@ from arms import provenance
 
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
-from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.policies import VIEWS, Wanted
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.settings import VIEWS, Settings, Wanted
 from pipeline.formats.registry import formats_of
 from pipeline.images.jpeg import decode
 from pipeline.types import Floats
@@ -41,7 +41,7 @@ def main() -> None:
     (root,) = (one.root for one in formats_of(config.data, config.export) if one.name == "lerobot")
     columns = ["episode_index", SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key, *KEYS.values()]
     table = pq.read_table(root / "data", columns=columns)
-    environment = EpisodeEnvironment(Settings(initial_states="demonstration"))
+    environment = EpisodeEnvironment(EpisodeSettings(initial_states="demonstration"))
     measured = []
     for row in provenance(root):
         if row["axis"] == "clean":

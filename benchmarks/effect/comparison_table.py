@@ -9,13 +9,13 @@ from typing import Any
 
 from arms import provenance
 
-from pipeline.evaluation.results import Row
+from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.results import read as read_results
 from pipeline.evaluation.statistics import compare, paired, success_rate
 
 SOURCES = {"libero": "LIBERO's own tasks", "libero_plus": "LIBERO-Plus test tasks", "own": "own draws"}
 
-Results = Mapping[str, Sequence[Sequence[Row]]]
+Results = Mapping[str, Sequence[Sequence[EpisodeResult]]]
 """Arm to the rows of its policies, a policy for each seed, in the same order for all arms."""
 
 
@@ -30,11 +30,11 @@ def table(results: Results) -> list[dict[str, Any]]:
         minus the first's, with the interval of ``compare``).
     """
     first = next(iter(results))
-    present = {(row["source"], row["axis"]) for row in _all(results[first])}
+    present = {(row.source, row.axis) for row in _all(results[first])}
     lines = []
     for source, axis in sorted(present, key=lambda key: ([*SOURCES].index(key[0]), key[1])):
         of = {
-            arm: [[row for row in rows if (row["source"], row["axis"]) == (source, axis)] for rows in policies]
+            arm: [[row for row in rows if (row.source, row.axis) == (source, axis)] for rows in policies]
             for arm, policies in results.items()
         }
         compared = {
@@ -88,5 +88,5 @@ def contents(dataset: Path) -> dict[str, int]:
     return dict(Counter(row["axis"] for row in provenance(dataset)))
 
 
-def _all(policies: Sequence[Sequence[Row]]) -> list[Row]:
+def _all(policies: Sequence[Sequence[EpisodeResult]]) -> list[EpisodeResult]:
     return [row for rows in policies for row in rows]

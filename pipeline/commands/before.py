@@ -11,6 +11,9 @@ from pipeline.commands.base import add, add_config, loaded, positive
 
 TITLE = "before a run"
 
+EVERY = "all"
+"""In place of an axis: one picture of each."""
+
 
 def add_commands(commands: Any) -> None:
     add(commands, doctor, add_config)
@@ -63,16 +66,17 @@ def tasks(arguments: argparse.Namespace) -> int:
 def _preview_arguments(command: argparse.ArgumentParser) -> None:
     from pipeline.axes import Axes
 
-    names = ", ".join(Axes.model_fields)
+    axes = (*Axes.model_fields, EVERY)
     command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
-    command.add_argument("axis", choices=Axes.model_fields, metavar="AXIS", help=f"any of {names}")
+    command.add_argument("axis", choices=axes, metavar="AXIS", help=f"any of {', '.join(axes)}")
     add_config(command)
     command.add_argument("--out", type=Path, default=Path("sheet.png"), help="picture to write (default: sheet.png)")
 
 
 def preview(arguments: argparse.Namespace) -> int:
-    """draw what an axis does to a task: its first frame, and eleven draws over the components and levels
+    """render what an axis does to a task: its first frame, and eleven draws over the components and levels
 
+    With `all`, one strong draw of each axis beside the clean twin. A name that ends in .jpg gives JPEG, else PNG.
     Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default ranges.
     """
     from pipeline.files import replaced
@@ -84,7 +88,11 @@ def preview(arguments: argparse.Namespace) -> int:
     chosen = select_tasks([arguments.task])
     stage = preview.staged(chosen, config)
     with replaced(arguments.out) as temporary:
-        preview.draw(stage, arguments.axis, config, benchmark.load()).save(temporary, format="PNG")
+        if arguments.axis == EVERY:
+            picture = preview.overview(stage, config, benchmark.load())
+        else:
+            picture = preview.draw(stage, arguments.axis, config, benchmark.load())
+        picture.save(temporary, format="JPEG" if arguments.out.suffix == ".jpg" else "PNG", quality=90)
         of = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
         print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")
     return 0

@@ -98,7 +98,7 @@ def _add_selection(command: argparse.ArgumentParser) -> None:
 
 
 def _add_settings(command: argparse.ArgumentParser) -> None:
-    """Fields of ``Settings``, but the seed, which is the selection's."""
+    """Fields of ``EpisodeSettings``, but the seed, which is the selection's."""
     add = command.add_argument
     add(
         "--trained-on",
@@ -143,11 +143,10 @@ def evaluate(arguments: argparse.Namespace) -> int:
     from pipeline import gl
     from pipeline.compute.pool import runner
     from pipeline.config import ComputeConfig
+    from pipeline.evaluation.environment import EpisodeSettings
     from pipeline.evaluation.evaluate import evaluate
-    from pipeline.evaluation.policies import PolicyConfig
-    from pipeline.evaluation.rollout import Evaluation
+    from pipeline.evaluation.rollout import Evaluation, PolicyConfig
     from pipeline.evaluation.selection import Selection
-    from pipeline.evaluation.settings import Settings
 
     def given(*names: str) -> dict[str, Any]:
         return {name: value for name, value in vars(arguments).items() if name in names}
@@ -155,7 +154,7 @@ def evaluate(arguments: argparse.Namespace) -> int:
     kind, address = next(iter(given("server", "checkpoint", "replay").items()))
     policy = {"kind": address} if kind == "replay" else {"kind": kind, "address": str(address)}
     config = PolicyConfig.model_validate(policy | given("label", "timeout_s"))
-    settings = Settings.model_validate(given(*Settings.model_fields))
+    settings = EpisodeSettings.model_validate(given(*EpisodeSettings.model_fields))
     evaluation = Evaluation(settings, config, config.identity(), arguments.out, **given("videos", "archive"))
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
@@ -167,6 +166,13 @@ def evaluate(arguments: argparse.Namespace) -> int:
 
 def _report_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="folder of results")
+    command.add_argument(
+        "--across",
+        nargs="+",
+        choices=("prompt", "step_limit"),
+        default=(),
+        help="compare results that differ in this, which is refused otherwise",
+    )
     command.add_argument(
         "--out",
         type=Path,
@@ -180,12 +186,13 @@ def report(arguments: argparse.Namespace) -> int:
     """write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures
 
     Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
-    Two different results of one episode are an error. The last line is JSON.
+    Two different results of one episode are an error, and so are results under different prompts or step limits. The
+    last line is JSON.
     """
     from pipeline.evaluation.results import read
     from pipeline.report import evaluation_report
 
-    print(json.dumps(evaluation_report.write(read(arguments.folders), arguments.out)))
+    print(json.dumps(evaluation_report.write(read(arguments.folders, arguments.across), arguments.out)))
     return 0
 
 
@@ -213,9 +220,9 @@ def _gap_arguments(command: argparse.ArgumentParser) -> None:
 def gap(arguments: argparse.Namespace) -> int:
     """compositional gap of the pairs that were run with --source pairs: gap.json and gap.png in their folder"""
     from pipeline.evaluation import composition
-    from pipeline.evaluation.results import EpisodeFiles
+    from pipeline.evaluation.results import stored
 
-    measured = composition.pairs(EpisodeFiles(arguments.results).some_rows())
+    measured = composition.pairs(stored([arguments.results]))
     composition.heatmap(measured, arguments.results / "gap.png")
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
     write_json(arguments.results / "gap.json", figures)
@@ -243,15 +250,15 @@ def construct(arguments: argparse.Namespace) -> int:
     The file is for `evaluate --tasks-from`. Which scenes refuse their draw is known once candidates were run: give
     those results, and these tasks are left out.
     """
-    from pipeline.evaluation import construction, own_draws
-    from pipeline.evaluation.results import EpisodeFiles
+    from pipeline.evaluation import own_draws, selection
+    from pipeline.evaluation.results import stored
     from pipeline.evaluation.tasks import write_tasks
 
-    chosen, counts = construction.construct(
-        construction.candidates(arguments.seed),
+    chosen, counts = selection.construct(
+        selection.candidates(arguments.seed),
         arguments.seed,
-        arguments.size or construction.SIZE,
-        [row for folder in arguments.results for row in EpisodeFiles(folder).some_rows()],
+        arguments.size or selection.SIZE,
+        [row for row, _ in stored(arguments.results)],
         own_draws.planned(arguments.plan) if arguments.plan else None,
     )
     write_tasks(chosen, arguments.seed, arguments.out)
@@ -267,15 +274,15 @@ def _grade_arguments(command: argparse.ArgumentParser) -> None:
 def grade(arguments: argparse.Namespace) -> int:
     """levels of difficulty, 1 to 5, by how many of several models solve a task"""
     from pipeline.errors import PipelineError
-    from pipeline.evaluation import construction
-    from pipeline.evaluation.results import EpisodeFiles
+    from pipeline.evaluation.results import stored
+    from pipeline.evaluation.statistics import grade
     from pipeline.evaluation.tasks import write_tasks
 
-    results = [list(EpisodeFiles(folder).some_rows()) for folder in arguments.results]
-    seed, *others = sorted({row["seed"] for rows in results for row in rows})
+    results = [stored([folder]) for folder in arguments.results]
+    seed, *others = sorted({row.seed for of_model in results for row, _ in of_model})
     if others:
         raise PipelineError(f"results of seeds {[seed, *others]}", expected="one seed, and so the same draws")
-    graded = construction.grade(results)
+    graded = grade(results)
     write_tasks(graded, seed, arguments.out)
     by_level = {level: sum(task["difficulty"] == level for task in graded) for level in range(1, 6)}
     print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
@@ -292,14 +299,14 @@ def leakage(arguments: argparse.Namespace) -> int:
     from pipeline.axes import from_json
     from pipeline.errors import PipelineError
     from pipeline.evaluation import own_draws
-    from pipeline.evaluation.results import EpisodeFiles
+    from pipeline.evaluation.results import stored
     from pipeline.libero.tasks import find_task
 
     drawn = [
-        (row["name"], one, find_task(row["suite"], row["base"]))
-        for row in EpisodeFiles(arguments.results).some_rows()
-        if row["source"] == "own"
-        for one in from_json(json.dumps(row["perturbations"]))
+        (row.name, one, find_task(row.suite, row.base))
+        for row, _ in stored([arguments.results])
+        if row.source == "own"
+        for one in from_json(json.dumps(row.perturbations))
     ]
     if not drawn:
         raise PipelineError("there are no held-out draws", where=arguments.results, remedy="evaluate --source own")

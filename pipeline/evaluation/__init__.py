@@ -1,13 +1,15 @@
 """Policies run on LIBERO's tasks, LIBERO-Plus's test tasks and held-out draws of the axes.
 
-Lower modules do not know those above them:
+An episode goes from a task to an environment, in which a policy acts, to a row and a summary. Lower modules do not know
+those above them:
 
-* ``commands``: the command line. ``harness``: the same tasks for vla-eval.
-* ``evaluate``: a whole evaluation. ``rollout``: an episode of it, as a worker runs it.
-* ``policies``: what acts; ``checkpoint`` and ``reference_policies`` are two kinds of it.
+* ``commands``: the command line. ``harness``: the same tasks and rows for vla-eval.
+* ``evaluate``: all episodes that were selected, in worker processes. ``rollout``: one of them, from task to row.
+* ``selection``: the tasks that a user names, or a benchmark of one's own.
 * ``environment``: starts an episode, shows it, takes actions. ``simulator``: LIBERO's environment below it.
-* ``selection``: the tasks that a user names. ``settings``: what holds for all their episodes.
-* ``libero_plus``, ``asset_archive``, ``own_draws``, ``goals``: where tasks come from. ``tasks``: what a task is.
-* ``findings``: what a report says, the paper's table in it. ``composition``, ``construction``: the paper's analyses.
-* ``statistics``: intervals and tests. ``results``: an episode's row and the files of all.
+* ``policies``: what acts. ``reference_policies``: the demonstrations, as a check.
+* ``statistics``: rates, intervals, comparisons, difficulty. ``composition``: the compositional gap of two axes.
+* ``results``: an episode's row, the files of all, and which can be compared.
+* ``libero_plus``, ``own_draws``: where test tasks and held-out draws come from. ``tasks``: what a task is, and other
+  goals for LIBERO's.
 """

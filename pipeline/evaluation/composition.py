@@ -18,7 +18,6 @@ It is kept as the paper's figure; the interval is by bootstrap over trials.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -31,7 +30,7 @@ from scipy.stats import chi2_contingency
 
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import REFUSED, Row
+from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
 from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
 from pipeline.types import Floats
@@ -60,12 +59,12 @@ class Pair:
     @property
     def joint(self) -> float:
         """p(D_i = 1, D_j = 1 | Y = 1); NaN without successes."""
-        return float(_joint(self._sums)[0])
+        return float(_probabilities(self._sums)[0][0])
 
     @property
     def product(self) -> float:
         """p(D_i = 1 | Y = 1) p(D_j = 1 | Y = 1); NaN without successes."""
-        return float(_product(self._sums)[0])
+        return float(_probabilities(self._sums)[1][0])
 
     @property
     def gap(self) -> float:
@@ -100,40 +99,32 @@ class Pair:
 
 def gap(sums: Floats) -> Floats:
     """The gap, of (n, 4) successes without a perturbation, with the one, the other and both; NaN without successes."""
-    return _joint(sums) - _product(sums)
+    joint, product = _probabilities(sums)
+    return joint - product
 
 
-def _joint(sums: Floats) -> Floats:
-    return np.asarray(sums[:, 3] / _whole(sums), float)
-
-
-def _product(sums: Floats) -> Floats:
+def _probabilities(sums: Floats) -> tuple[Floats, Floats]:
+    """(n,) the joint probabilities, and the products of the marginal ones."""
     _, one, other, both = sums.T
-    return np.asarray((one + both) * (other + both) / _whole(sums) ** 2, float)
-
-
-def _whole(sums: Floats) -> Floats:
-    return np.where(sums.any(axis=1), sums.sum(axis=1), np.nan)
+    whole = np.where(sums.any(axis=1), sums.sum(axis=1), np.nan)
+    return np.asarray(both / whole, float), np.asarray((one + both) * (other + both) / whole**2, float)
 
 
 Start = tuple[str, str, int]
 """Suite, LIBERO task and number of the initial state, which the combinations of a trial share."""
 
 
-def pairs(rows: Iterable[Row]) -> list[Pair]:
+def pairs(found: Iterable[Stored]) -> list[Pair]:
     """Every pair of axes that the results have, of the trials of which all four combinations were run.
 
     Raises:
         PipelineError: when they are of several policies or settings, or have no complete trial.
     """
-    listed = [row for row in rows if row["source"] in ("libero", "own") and row["reason"] != REFUSED]
-    if len({json.dumps([row["identity"], row["settings"]], sort_keys=True) for row in listed}) > 1:
-        raise PipelineError(
-            "these are results of several policies or settings",
-            expected="one policy under one setting",
-            remedy="give each a folder of its own",
-        )
-    drawn = {(row["axis"], row["level"], _start(row)): bool(row["success"]) for row in listed}
+    of_pairs = [(row, files) for row, files in found if row.source in ("libero", "own") and row.reason != REFUSED]
+    one_setting(of_pairs)
+    refuse_different(of_pairs)
+    listed = [row for row, _ in of_pairs]
+    drawn = {(row.axis, row.level, _start(row)): row.success for row in listed}
     axes = _in_order(axis for joined, _, _ in drawn if joined != "clean" for axis in joined.split("+"))
     counted = [pair for one, other in combinations(axes, 2) if (pair := _pair(one, other, drawn)) is not None]
     if not counted:
@@ -164,8 +155,8 @@ def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
     return {name: number if np.isfinite(number) else None for name, number in numbers.items()}
 
 
-def _start(row: Row) -> Start:
-    return row["suite"], row["base"], row["number"]
+def _start(row: EpisodeResult) -> Start:
+    return row.suite, row.base, row.number
 
 
 def _in_order(axes: Iterable[str]) -> list[str]:

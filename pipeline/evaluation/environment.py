@@ -6,22 +6,25 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field, field_serializer
 
 from pipeline.axes import AnyPerturbation
+from pipeline.axes.base import Frozen
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.evaluation import asset_archive, goals, libero_plus, own_draws
+from pipeline.evaluation import libero_plus, own_draws
+from pipeline.evaluation.policies import VIEWS, Wanted, checked_actions
 from pipeline.evaluation.results import REFUSED
-from pipeline.evaluation.settings import VIEWS, Settings, Wanted, checked_actions
 from pipeline.evaluation.simulator import Observed, Picture, Simulator
-from pipeline.evaluation.tasks import EvaluationTask, libero_states
+from pipeline.evaluation.tasks import EvaluationTask, Prompt, find_replacement, libero_states
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
+from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
@@ -30,23 +33,57 @@ STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, 
 """Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
 
 
+class EpisodeSettings(Frozen):
+    """What holds for all episodes of an evaluation.
+
+    Attributes:
+        prompt: the wording of test tasks; ``blank`` says nothing in any task.
+        black: which views are black, to see what a policy does without them.
+        seed: of held-out draws and of noise that is random.
+        fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
+        initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
+            starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
+            Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
+        plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
+            it by the SHA-256 of its file.
+        look_every: see ``NextLook``; of model servers alone.
+    """
+
+    prompt: Prompt = "clean"
+    seed: int = 0
+    fixture_seed: int = 0
+    initial_states: Literal["libero", "demonstration"] = "libero"
+    # What came later is left out where it is not used, so that results keep their names.
+    black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
+    plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
+    look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
+
+    @field_serializer("plan")
+    def _name_by_content(self, plan: Path) -> str:
+        return own_draws.sha256_of(plan)
+
+
 @dataclass(frozen=True)
 class Progress:
     """Where an episode stands.
 
     Attributes:
         steps: actions taken, without the settling steps.
-        success: whether the goal was reached; then the episode is over.
-        over: whether it was reached, the limit was, or the simulation became unstable; or the episode cannot begin.
-        reason: ``success``, ``step_limit``, ``simulation_unstable``, ``running``, ``not_begun``, or ``refused`` where
-            the scene does not take what was drawn. Such an episode is over before its first look and says nothing of a
-            policy.
+        reason: ``running``, ``not_begun``, or why it is over: ``success``, ``step_limit``, ``simulation_unstable``, or
+            ``refused`` where the scene does not take what was drawn. Such an episode is over before its first look and
+            says nothing of a policy.
     """
 
-    steps: int
-    success: bool
-    over: bool
-    reason: str
+    steps: int = 0
+    reason: str = "not_begun"
+
+    @property
+    def success(self) -> bool:
+        return self.reason == "success"
+
+    @property
+    def over(self) -> bool:
+        return self.reason != "running"
 
 
 class EpisodeEnvironment:
@@ -58,9 +95,9 @@ class EpisodeEnvironment:
         archive: folder of LIBERO-Plus's asset archive, for test tasks of light, background and layout.
     """
 
-    def __init__(self, settings: Settings = Settings(), archive: Path | None = None):  # noqa: B008 - frozen
+    def __init__(self, settings: EpisodeSettings = EpisodeSettings(), archive: Path | None = None):  # noqa: B008
         self.settings, self._archive = settings, archive
-        self.progress = Progress(0, False, True, "not_begun")
+        self.progress = Progress()
         self._simulator: Simulator | None = None
         self._key: tuple[str, ...] = ()
         self._picture = Picture()
@@ -72,18 +109,18 @@ class EpisodeEnvironment:
             PipelineError: when the task cannot be rebuilt here.
         """
         self._picture.restore()
-        self.progress = Progress(0, False, True, "not_begun")
+        self.progress = Progress()
         self.task, self._base = task, find_task(task.suite, task.base)
-        self.limit = STEP_LIMITS[task.suite]
+        self.step_limit = STEP_LIMITS[task.suite]
         self.resolved: Mapping[str, Any] = {}
         self.perturbations: tuple[AnyPerturbation, ...] = ()
         self._seen: dict[str, Frame] = {}
         starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
         try:
             starts.get(task.source, self._start_libero)()
-            self.progress = Progress(0, False, False, "running")
+            self.progress = Progress(0, "running")
         except RefusedError:
-            self.progress = Progress(0, False, True, REFUSED)
+            self.progress = Progress(0, REFUSED)
         return self.progress
 
     def step(self, action: ArrayLike) -> Progress:
@@ -107,21 +144,18 @@ class EpisodeEnvironment:
         try:
             self._opened.step(given)
         except RefusedError as error:
-            self.progress = Progress(steps, False, True, error.reason)
+            self.progress = Progress(steps, error.reason)
             return self.progress
-        success, limit = self._opened.succeeded(), steps >= self.limit
-        reason = "success" if success else "step_limit" if limit else "running"
-        self.progress = Progress(steps, success, success or limit, reason)
+        limited = "step_limit" if steps >= self.step_limit else "running"
+        self.progress = Progress(steps, "success" if self._opened.succeeded() else limited)
         return self.progress
 
     @property
     def instruction(self) -> str:
         """What the policy is told."""
-        if self.settings.prompt == "blank":
-            return ""
         if self.task.source == "libero_plus":
             return libero_plus.instruction(self._test, self.settings.prompt)
-        return self._base.instruction
+        return "" if self.settings.prompt == "blank" else self._base.instruction
 
     @property
     def observed(self) -> Observed:
@@ -131,12 +165,10 @@ class EpisodeEnvironment:
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
         if view not in self._seen:
-            black = self.settings.black in (view, "all")
-            self._seen[view] = (
-                np.zeros(SCHEMA.frame.shape, np.uint8)
-                if black
-                else self._picture.frame(view, self.observed, self.progress.steps)
-            )
+            if self.settings.black in (view, "all"):
+                self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8)
+            else:
+                self._seen[view] = self._picture.frame(VIEWS[view], self.observed, self.progress.steps)
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
@@ -170,10 +202,10 @@ class EpisodeEnvironment:
         posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
         state = libero_states(self._base)[0]
         if test.axis in ("light", "background"):
-            self._build(self._base, test.name, asset_archive.scene(test, self._assets(test)))
+            self._build(self._base, test.name, libero_plus.scene(test, self._assets(test)))
         elif test.axis in ("pose", "layout"):
             if test.axis == "layout":
-                asset_archive.register_objects(test, self._assets(test))
+                libero_plus.register_objects(test, self._assets(test))
             self._build_from(libero_plus.bddl_text(test), test.name)
             state = libero_plus.moved_state(test.suite, test.name)
         else:
@@ -184,7 +216,7 @@ class EpisodeEnvironment:
 
     def _start_goal(self) -> None:
         """Start LIBERO's own task with another goal."""
-        replacement = goals.find(self._base, self.task.name)
+        replacement = find_replacement(self._base, self.task.name)
         self._build_from(replacement.bddl_text(self._base), f"{replacement.old} {replacement.new}")
         self._base = replace(self._base, instruction=replacement.instruction)
         self._start(*self._initial_state())
@@ -232,11 +264,11 @@ class EpisodeEnvironment:
 
     @property
     def _test(self) -> TestTask:
-        return libero_plus.find(self.task.suite, self.task.name)
+        return benchmark.load().find(self.task.suite, self.task.name)
 
     def _assets(self, test: TestTask) -> Path:
         """The folder that has the files of a light, background or layout task."""
-        assets = asset_archive.having(test, self._archive)
+        assets = libero_plus.assets_of(test, self._archive)
         if assets is None:
             raise PipelineError(
                 f"changes the {test.axis}, for which the asset archive of LIBERO-Plus is needed",

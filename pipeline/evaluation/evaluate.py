@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
+import atexit
+import ctypes
+import threading
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
+import mujoco
+
 from pipeline import gl
-from pipeline.compute.pool import Expendable, Workers
+from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import Row, refuse_shared_names
-from pipeline.evaluation.rollout import Evaluation, EvaluationJob, without_result
+from pipeline.evaluation import own_draws
+from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.policies import Policy, PolicyError
+from pipeline.evaluation.results import one_setting
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.settings import check_settings
 from pipeline.evaluation.statistics import summary
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import write_json
-from pipeline.seeding import digest
+from pipeline.images.mp4 import mp4
+from pipeline.types import Frame
 
 EPISODES_A_JOB = 10
 """At most so many episodes of one scene are one worker's job: few enough to spread, many enough to build it once."""
@@ -27,6 +38,15 @@ JOBS_A_WORKER = 4
 
 SCENE_AXES = ("pose", "layout", "light", "background")
 """The axes whose test tasks have a scene each."""
+
+FAILURES_IN_A_ROW = 3
+"""After so many episodes in a row without an action from the policy a worker stops the evaluation."""
+
+FAULTS_NAMED = 3
+"""So many episodes without a result are named in the message that counts them."""
+
+SCENE_S, STEP_S = 1800.0, 120.0
+"""No scene takes so long to build, and no step with its answer takes so long, on any machine."""
 
 
 def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers: int = 1) -> dict[str, Any]:
@@ -44,15 +64,14 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
         PipelineError: after the summary was written, when an episode has no result; before, when the policy fails in
             one episode after the other.
     """
-    settings, policy, folder = evaluation.settings, evaluation.policy, evaluation.folder
-    acting = {"policy": policy.name(evaluation.identity), "identity": evaluation.identity}
+    settings, policy = evaluation.settings, evaluation.policy
     check_settings(selection, settings)
     if settings.look_every != 1 and policy.kind != "server":
         raise PipelineError(
             f"only a server is shown one observation in {settings.look_every}", where="look_every", expected="--server"
         )
-    refuse_shared_names((row, folder) for row in (*evaluation.files.rows(), acting))
     wanted = select(selection, evaluation.archive)
+    evaluation.check(wanted)
     faults: list[str] = []
     if missing := [task for task in wanted if evaluation.result(task) is None]:
         device = gl.choose().device
@@ -65,11 +84,11 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     unsaid = [task for task in left if not any(fault.endswith(task) for fault in faults)]
     faults += [f"the plan or the archive changed while it ran {task}" for task in unsaid]
     found = summary(rows) | {
-        "policy": {"name": acting["policy"], "identity": evaluation.identity},
+        "policy": {"name": policy.name(evaluation.identity), "identity": evaluation.identity},
         "selection": selection.model_dump(mode="json"),
-        "settings": _one_setting(rows) or settings.model_dump(),
+        "settings": one_setting([(row, evaluation.files) for row in rows]) or settings.model_dump(),
     }
-    write_json(folder / "summary.json", found)
+    write_json(evaluation.folder / "summary.json", found)
     if faults:
         raise without_result(faults)
     return found
@@ -92,17 +111,142 @@ def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[Evaluat
     return jobs
 
 
-def _one_setting(rows: Iterable[Row]) -> dict[str, Any]:
-    """What holds for all rows; empty where there is none. Refuses a policy that looked at other things in some."""
-    seen = {digest(row["settings"]): row for row in rows}
-    if len(seen) > 1:
-        one, other, *_ = seen.values()
-        differing = {key: (value, other["settings"].get(key)) for key, value in one["settings"].items()}
+def check_settings(selection: Selection, settings: EpisodeSettings) -> None:
+    """Have no episode that says a setting which it does not have.
+
+    Raises:
+        PipelineError: when one would, or the plan cannot be read.
+    """
+    if settings.seed != selection.seed:
         raise PipelineError(
-            f"episodes of {one['policy']!r} were seen in different ways: "
-            + ", ".join(f"{key} {value} and {then}" for key, (value, then) in differing.items() if value != then),
-            where=f"{one['episode']} and {other['episode']}",
-            expected="one policy under one label",
-            remedy="evaluate the server as it is now under another --label into another folder",
+            f"tasks are drawn under seed {selection.seed}, what perturbs them under {settings.seed}",
+            where="seed",
+            expected="one seed for both",
         )
-    return next(iter(seen.values()))["settings"] if seen else {}
+    if settings.plan is not None:
+        own_draws.sha256_of(settings.plan)
+        if selection.file is None and selection.source not in ("own", "pairs"):
+            raise PipelineError(
+                f"{selection.source} has no held-out draws to keep clear of a plan",
+                where="plan",
+                expected="--source own",
+            )
+
+
+@dataclass(frozen=True)
+class EvaluationJob:
+    """Some episodes of one scene, as they are sent to a worker.
+
+    Attributes:
+        tasks: what to run, in order.
+        device: what renders the evaluation, as OpenGL names it.
+    """
+
+    evaluation: Evaluation
+    tasks: tuple[EvaluationTask, ...]
+    device: str
+
+    def __call__(self) -> list[str]:
+        """Run the episodes, and write each one's file when it is over.
+
+        Returns:
+            What was wrong with the policy, for each episode that has no result because of that.
+
+        Raises:
+            PipelineError: when that happens ``FAILURES_IN_A_ROW`` times.
+        """
+        device = gl.choose().device
+        if device != self.device:
+            raise PipelineError(
+                f"this worker renders with {device}, the evaluation with {self.device}",
+                expected="one device for all frames, as devices differ by some grey levels",
+            )
+        settings, archive = self.evaluation.settings, self.evaluation.archive
+        environment = _environment(settings, archive)
+        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every)
+        faults = []
+        # A worker that was lost may have left some.
+        for task in self._missing():
+            try:
+                self._run(task, environment, policy)
+            except PolicyError as error:
+                faults.append(f"{error.what} ({task})")
+                _failures.append(faults[-1])
+                if len(_failures) == FAILURES_IN_A_ROW:
+                    stopped = without_result(_failures)
+                    _failures.clear()
+                    raise stopped from error
+            else:
+                _failures.clear()
+        return faults
+
+    def episodes(self) -> int:
+        return len(self.tasks)
+
+    def limit_s(self) -> float:
+        """So long it may take before it counts as hanging: far above what scenes and answers take."""
+        step_s = max(STEP_S, self.evaluation.policy.timeout_s)
+        return sum(SCENE_S + step_s * STEP_LIMITS[task.suite] for task in self.tasks)
+
+    def lost(self) -> list[str]:
+        """What to say of its episodes where no worker survives it."""
+        return [f"{LOST} ({task})" for task in self._missing()]
+
+    def _missing(self) -> list[EvaluationTask]:
+        return [task for task in self.tasks if self.evaluation.result(task) is None]
+
+    def _run(self, task: EvaluationTask, environment: EpisodeEnvironment, policy: Policy) -> None:
+        evaluation = self.evaluation
+        film: dict[int, Frame] | None = None if evaluation.videos == "none" else {}
+        looks = roll_out_policy(environment, policy, task, film)
+        progress = environment.progress
+        if film is not None and progress.steps and (evaluation.videos == "all" or not progress.success):
+            # The policy did not look at how it ended, which is what one wants to see of a failure.
+            film[progress.steps] = environment.image("agentview")
+            # Before the episode's own file: where that exists, nothing is missing.
+            evaluation.files.save_video(evaluation.episode(task), mp4(list(film.values()), list(film)))
+        evaluation.save(environment, policy.wanted, looks, self.device)
+
+
+@lru_cache(maxsize=1)
+def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvironment:
+    """This process's environment."""
+    environment = EpisodeEnvironment(settings, archive)
+    if threading.current_thread() is threading.main_thread():
+        # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
+        gl.prepare()
+        mujoco.gl_context.GLContext(1, 1).free()
+        atexit.register(environment.close)
+    else:
+        # Only the thread that rendered may close it, and that of a worker is gone when its process ends: one reference
+        # more keeps Python from trying.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(environment))
+    return environment
+
+
+@lru_cache(maxsize=1)
+def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
+    """This process's policy, which is refused if it is not the one that the evaluation was begun with."""
+    policy = config.open(look_every)
+    # After it was loaded: files that were others before are others now.
+    if config.identity() != identity:
+        raise PipelineError(
+            "the checkpoint has changed since the evaluation began",
+            where=config.address,
+            expected="one policy for the whole evaluation, such as a folder that no training writes into",
+            remedy="run the same command again",
+        )
+    return policy
+
+
+_failures: list[str] = []
+"""Of this process's policy, since the last episode that it finished."""
+
+
+def without_result(faults: Sequence[str]) -> PipelineError:
+    """The policy failed in some episodes; the first few are named."""
+    more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
+    return PipelineError(
+        f"{len(faults)} episodes have no result: {'; '.join([*faults[:FAULTS_NAMED], *more])}",
+        remedy="mend the policy and run the same command again: finished episodes are kept",
+    )

@@ -22,11 +22,12 @@ from vla_eval.specs import (
 
 from pipeline import gl
 from pipeline.errors import PipelineError
-from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
-from pipeline.evaluation.policies import NextLook
+from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.evaluate import check_settings
+from pipeline.evaluation.policies import NextLook, Wanted, checked_actions
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.settings import Settings, Wanted, check_settings, checked_actions
 from pipeline.evaluation.tasks import EvaluationTask
 
 ACTION = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
@@ -40,13 +41,14 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     Args:
         selection: fields of ``Selection``, such as ``{"source": "libero_plus", "axes": ["camera"], "subset": 100}``.
-        settings: fields of ``Settings``, such as ``{"prompt": "benchmark"}``; the seed is the selection's.
+        settings: fields of ``EpisodeSettings``, such as ``{"prompt": "benchmark"}``; the seed is the selection's.
         look_every: a server that answers with one action from a chunk of its own is shown one observation in so many
             control steps, the number of actions that it takes from a chunk; in between the last one is sent again, and
             nothing is rendered. 1 renders every step. After a chunk that a server answers with it is always looked.
         send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
             names it. Its model servers set these.
         env_seed: as there, of LIBERO's reset.
+        out, label: folder for the rows of the policy of that name, as ``evaluate`` writes them; none by default.
         assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
         seed: as there; without an effect, since nothing here uses a global generator.
     """
@@ -69,6 +71,8 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         send_state: bool = False,
         quat_no_antipodal: bool = False,
         env_seed: int | None = None,
+        out: str | None = None,
+        label: str = "",
         assets: str | None = None,
         seed: int | None = None,
     ):
@@ -79,18 +83,31 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         if env_seed is not None:
             given = {"fixture_seed": env_seed, **given}
         self._archive = None if assets is None else Path(assets)
-        self._environment = EpisodeEnvironment(Settings.model_validate(given), self._archive)
-        check_settings(self._selection, self._environment.settings)
+        episodes = EpisodeSettings.model_validate(given)
+        self._environment = EpisodeEnvironment(episodes, self._archive)
+        check_settings(self._selection, episodes)
+        self._evaluation: Evaluation | None = None
+        if out is not None:
+            policy = PolicyConfig(kind="server", address="of the harness", label=label)
+            self._evaluation = Evaluation(episodes, policy, policy.identity(), Path(out), archive=self._archive)
+            self._device = gl.choose().device
+        elif label:
+            raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR beside it")
         self._next_look = NextLook(self._environment.settings.look_every)
         self._wanted = Wanted(send_wrist_image, send_state, not quat_no_antipodal)
 
     def get_tasks(self) -> list[dict[str, Any]]:
         """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
-        return [task.for_harness() for task in select(self._selection, self._archive)]
+        tasks = select(self._selection, self._archive)
+        if self._evaluation is not None:
+            self._evaluation.check(tasks)
+        return [task.for_harness() for task in tasks]
 
     def reset(self, task: dict[str, Any]) -> Any:
         progress = self._environment.reset(EvaluationTask.of_harness(task))
+        self._looks = 0
         if progress.over:
+            self._save()
             raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
         self._next_look.begin()
         return self._look()
@@ -112,6 +129,14 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         progress = self._environment.progress
+        if self._evaluation is not None and not progress.over:
+            raise PipelineError(
+                f"the harness ended this episode after {progress.steps} of {self._environment.step_limit} steps",
+                where="max_steps",
+                expected="episodes that end at the limit of their suite, where their results are written",
+                remedy="leave max_steps out, or out and label",
+            )
+        self._save()
         return {"success": progress.success, "reason": progress.reason}
 
     def get_metadata(self) -> dict[str, Any]:
@@ -138,9 +163,13 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         self._environment.close()
 
     def _look(self) -> dict[str, Any]:
+        self._looks += 1
         self._last = self._environment.observation(self._wanted)
-        self._next_look.looked()
         return self._last
+
+    def _save(self) -> None:
+        if self._evaluation is not None:
+            self._evaluation.save(self._environment, self._wanted, self._looks, self._device)
 
 
 class ReplayServer(ModelServer):  # type: ignore[misc]

@@ -1,19 +1,21 @@
 """LIBERO-Plus's test tasks rebuilt from their parameters, as its own code sets them up.
 
-Tasks that change the camera, the robot, the noise, the instruction or where things stand need LIBERO's assets alone.
-Light, layout (confounding objects) and background need scenes, images and models of the benchmark's asset archive: see
-``asset_archive``.
+Tasks that change the camera, the robot, the noise, the instruction or where things stand need LIBERO's assets alone,
+and so do 62 of background. The others of background, light and layout (confounding objects) need scenes, images and
+models of LIBERO-Plus's asset archive (``assets.zip``, 6.4 GB, in the dataset Sylvest/LIBERO-plus on the hub), which
+takes the place of LIBERO's assets in the benchmark. Which files a task needs is read from its code, as text.
 """
 
 from __future__ import annotations
 
 import io
-import math
 import re
+import xml.etree.ElementTree as ET
 import zipfile
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -22,21 +24,24 @@ from pipeline import seeding
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.errors import PipelineError
-from pipeline.evaluation import asset_archive
+from pipeline.evaluation.tasks import Prompt
+from pipeline.files import Edition, checksum_of, edition
+from pipeline.libero.assets import libero_assets
 from pipeline.libero.tasks import find_task
+from pipeline.physics.control_env import control_env
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
+from pipeline.testset.definitions import Reader, SceneFiles
 from pipeline.types import Floats
-
-Prompt = Literal["clean", "benchmark"]
-"""How test tasks are worded: by LIBERO's instruction, or as the benchmark's code does, which takes the name of the
-task's file for its instruction ("turn on the stove view 0 0 100 2 352 initstate 0")."""
 
 RUNNABLE = ("camera", "robot", "noise", "language", "pose")
 """The axes whose test tasks can all be rebuilt without the benchmark's asset archive: 6,983 tasks."""
 
 DECIMALS = 4
 """To which the benchmark rounds its camera after each turn."""
+
+ROTATION_RAD = {"x": (-np.pi / 2, -np.pi / 2), "y": (-np.pi, -np.pi), "z": (np.pi, np.pi)}
+"""How LIBERO's reset turns an added object: the same for all 867 models of the benchmark."""
 
 
 class TestCamera(CameraPerturbation):
@@ -80,62 +85,11 @@ def _rounded(part: Floats) -> Floats:
     return np.array([round(float(number), DECIMALS) for number in part])
 
 
-@cache
-def by_name() -> dict[tuple[str, str], TestTask]:
-    """Every test task, by its suite and its name."""
-    return {(task.suite, task.name): task for task in benchmark.load().tasks}
-
-
-def find(suite: str, name: str) -> TestTask:
-    """The test task of that name.
-
-    Raises:
-        PipelineError: when the suite has none.
-    """
-    if (suite, name) not in by_name():
-        raise PipelineError(f"LIBERO-Plus has no test task {name!r}", where=suite)
-    return by_name()[suite, name]
-
-
-def level_of(test: TestTask) -> int:
-    """Strength, 1 to 5, by the same ranges as this project's axes; 0 where the parameters do not tell.
-
-    Two severities of noise make one level. The benchmark's own ``difficulty_level`` is another thing: how many of four
-    models fail.
-    """
-    value = test.parameters
-    match test.axis, test.component:
-        case "camera", "distance":
-            strength = (float(value["distance_scale"]) - 1) / 0.2
-        case "camera", "spherical":
-            strength = abs(float(value["azimuth_deg"])) / 15
-        case "camera", _:
-            strength = max(abs(float(value["yaw_deg"])), abs(float(value["pitch_deg"]))) / 2
-        case "robot", _:
-            strength = float(value["id"]) / 100
-        case "noise", _:
-            strength = float(value["severity"]) / 2
-        case "pose", _:
-            strength = float(value["level"])
-        case _:
-            return 0
-    return min(max(math.ceil(round(strength, 6)), 1), 5)
-
-
-def runnable(test: TestTask, archive: Path | None = None) -> bool:
-    """Whether a test task can be rebuilt.
-
-    Args:
-        archive: folder of the benchmark's asset archive, where there is one.
-    """
-    return test.axis in RUNNABLE or asset_archive.having(test, archive) is not None
-
-
 def camera(test: TestTask) -> TestCamera:
     """The agent view of a test task, whatever its axis."""
     if test.axis != "camera":
         return TestCamera(component="orientation", level=1)
-    return TestCamera.model_validate({"component": test.component, "level": level_of(test), **test.parameters})
+    return TestCamera.model_validate({"component": test.component, "level": test.level, **test.parameters})
 
 
 def noise(test: TestTask, seed: int) -> NoisePerturbation:
@@ -150,7 +104,7 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
         {
             "component": test.component,
             "effect": parameters,
-            "level": level_of(test),
+            "level": test.level,
             "seed": int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53)),
         }
     )
@@ -195,10 +149,137 @@ def _packed(path: str) -> bytes:
 
 
 def instruction(test: TestTask, prompt: Prompt) -> str:
-    """What a policy is told in a test task; a language task is worded as it says under both prompts."""
+    """What a policy is told in a test task; a language task is worded as it says, unless nothing is said."""
+    if prompt == "blank":
+        return ""
     if test.axis == "language":
         return str(test.parameters["text"])
     if prompt == "clean":
         return find_task(test.suite, test.base).instruction
     # Such as KITCHEN_SCENE3_turn_on_the_stove.
     return re.sub(r"^[A-Z].*?SCENE\d+_", "", test.name).replace("_", " ")
+
+
+def assets_of(test: TestTask, archive: Path | None = None) -> Path | None:
+    """LIBERO's assets or the archive, whichever has the files that a test task names; None if neither, where it cannot
+    be rebuilt.
+
+    Args:
+        archive: folder of the unpacked archive, where there is one.
+    """
+    for folder in (libero_assets(), archive):
+        if folder is not None and all((unpacked(folder) / path).is_file() for path in _named(test)):
+            return unpacked(folder)
+    return None
+
+
+@cache
+def unpacked(folder: Path) -> Path:
+    """The folder with ``scenes``, ``textures`` and ``new_objects``.
+
+    The archive has its files below the path that they had on the machine that packed it, so ``folder`` may be any on
+    the way to them.
+
+    Raises:
+        PipelineError: when there is none.
+    """
+    root = folder
+    while not (root / "scenes").is_dir():
+        below = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+        if len(below) != 1:
+            raise PipelineError(
+                "not the unpacked asset archive of LIBERO-Plus",
+                where=root,
+                expected="a folder with scenes, textures and new_objects, or one that leads to it",
+                remedy="unpack assets.zip of the dataset Sylvest/LIBERO-plus, and name that folder",
+            )
+        (root,) = below
+    return root.resolve()
+
+
+def scene(test: TestTask, assets: Path) -> SceneFiles:
+    """The files of a light or background task; absolute paths."""
+    return SceneFiles(*(str(assets / path) for path in scene_files(test)))
+
+
+def register_objects(test: TestTask, assets: Path) -> None:
+    """Let LIBERO build scenes with the objects that a layout task adds, by the categories of its BDDL file."""
+    control_env()  # which takes care of how it is imported
+    from libero.libero.envs.base_object import OBJECTS_DICT
+
+    for category, path in object_models(test).items():
+        OBJECTS_DICT[category] = _object_class(category, assets / path)
+
+
+def contents(test: TestTask, archive: Path | None) -> list[str]:
+    """SHA-256 of each file of LIBERO's assets or the archive that a test task is made from: those that it names, then
+    those that they refer to."""
+    assets = assets_of(test, archive)
+    files = [] if assets is None else [assets / path for path in _named(test)]
+    for file in files:
+        if file.suffix == ".xml":
+            read = (file.parent / path for path in _referred(edition(file)))
+            files += [path.resolve() for path in read if path.is_file() and path.resolve() not in files]
+    return [checksum_of(edition(file)) for file in files]
+
+
+def _named(test: TestTask) -> Iterable[str]:
+    """The files that a light, background or layout task names; others name none."""
+    if test.axis == "layout":
+        return object_models(test).values()
+    return scene_files(test) if test.axis in ("light", "background") else ()
+
+
+@cache
+def _referred(file: Edition) -> tuple[str, ...]:
+    try:
+        return tuple(element.attrib["file"] for element in ET.parse(file.path).iterfind(".//*[@file]"))
+    except ET.ParseError as error:
+        raise PipelineError(f"not XML ({error})", where=file.path, remedy="unpack the archive again") from error
+
+
+def scene_files(test: TestTask) -> SceneFiles:
+    """Of a light or background task, by their paths in the archive."""
+    return _reader().scene_files(test.suite, test.name)
+
+
+def object_models(test: TestTask) -> dict[str, str]:
+    """Category to MJCF, by its path in the archive, of the objects that a layout task adds."""
+    models = _reader().object_models
+    return {category: models[category] for category in str(test.parameters["category"]).split(",")}
+
+
+@cache
+def _reader() -> Reader:
+    return Reader(zipfile.ZipFile(benchmark.fetch_testset()))
+
+
+def _object_class(category: str, file: Path) -> Any:
+    """What LIBERO makes each object of a category with."""
+    from robosuite.models.objects import MujocoXMLObject
+
+    class AddedObject(MujocoXMLObject):  # type: ignore[misc]
+        """A model of the archive as the benchmark's code loads it."""
+
+        def __init__(self, name: str = category):
+            joints = [{"type": "free", "damping": "0.0005"}]
+            super().__init__(str(file), name=name, joints=joints, obj_type="all", duplicate_collision_geoms=False)
+            self.category_name = category
+            self.object_properties: dict[str, Any] = {"vis_site_names": {}}
+            self.rotation, self.rotation_axis = ROTATION_RAD, None
+
+        def _get_object_subtree(self) -> Any:
+            """The body ``object``; robosuite expects it in another body, these models may have it at the top."""
+            if self.worldbody.find("./body/body[@name='object']") is not None:
+                return super()._get_object_subtree()
+            body = self.worldbody.find("./body[@name='object']")
+            if body is None:
+                raise PipelineError("the model has no body 'object'", where=file)
+            holder = ET.SubElement(self.worldbody, "body")
+            holder.append(body)
+            try:
+                return super()._get_object_subtree()
+            finally:
+                self.worldbody.remove(holder)
+
+    return AddedObject

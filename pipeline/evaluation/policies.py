@@ -1,20 +1,68 @@
-"""What acts: a policy behind a model server's address, or a lerobot checkpoint on disk."""
+"""What acts: the questions that a policy is asked, and policies behind a model server or in a lerobot checkpoint."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from pipeline.axes.base import Frozen
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.evaluation.checkpoint import Checkpoint, content_of
-from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.settings import Look, PolicyError, Wanted, checked_actions
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.files import checksum
+from pipeline.images.jpeg import resized
+from pipeline.seeding import digest
+from pipeline.types import Floats
+
+VIEWS = {"agentview": "image", "wrist": "wrist_image"}
+"""What policies call the views, to their names in ``schemas/episode.json``."""
+
+
+class Wanted(NamedTuple):
+    """What a policy asks to see.
+
+    Attributes:
+        wrist: the wrist's view beside the agent view.
+        state: position, axis-angle and fingers.
+        shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
+            robosuite and OpenVLA's data have it.
+        images: any view at all; without them nothing is rendered.
+    """
+
+    wrist: bool = True
+    state: bool = True
+    shortest_rotation: bool = False
+    images: bool = True
+
+
+Look = Callable[[Wanted], dict[str, Any]]
+"""Gives the observation; frames are rendered when it is called."""
+
+
+class PolicyError(PipelineError):
+    """The policy gave no action: this episode has no result, others may have one."""
+
+
+def checked_actions(answer: Any, policy: str) -> Floats:
+    """(n, 7) what a policy answered, one action or several.
+
+    Raises:
+        PolicyError: when it is anything but finite numbers of that shape.
+    """
+    expected = "(7,) or (n, 7) finite numbers: three of position, three of rotation, and the gripper"
+    try:
+        actions = np.asarray(answer, np.float64)
+    except (TypeError, ValueError) as error:
+        raise PolicyError(f"the policy's answer is not numbers ({error})", where=policy, expected=expected) from error
+    if actions.ndim not in (1, 2) or actions.shape[-1] != 7 or not actions.size:
+        raise PolicyError(f"the policy answers with shape {actions.shape}", where=policy, expected=expected)
+    if not np.isfinite(actions).all():
+        raise PolicyError("the policy answers with NaN or infinity", where=policy, expected=expected)
+    return np.atleast_2d(actions)
 
 
 class Policy(Protocol):
@@ -42,62 +90,6 @@ class Policy(Protocol):
         ...
 
 
-class PolicyConfig(Frozen):
-    """What acts.
-
-    Attributes:
-        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``open_loop`` for
-            the demonstrations' own actions, ``tracked`` for their paths, followed by feedback.
-        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations.
-        label: name in the results. A server must have one, another for each policy: nothing else tells what is behind
-            its address.
-        timeout_s: how long a server's answer may take.
-    """
-
-    kind: Literal["server", "checkpoint", "open_loop", "tracked"]
-    address: str = ""
-    label: str = ""
-    timeout_s: float = 120.0
-
-    def identity(self) -> str:
-        """What is the same for the same policy alone: ``sha256:`` and the content of a checkpoint, ``script:`` and the
-        kind of a replay, or ``claimed:`` and the label, where nobody but the user knows.
-
-        Raises:
-            PipelineError: when a server has no label, or a folder no checkpoint.
-        """
-        match self.kind:
-            case "checkpoint":
-                return f"sha256:{content_of(Path(self.address))}"
-            case "server" if not self.label:
-                raise PipelineError(
-                    "this server has no label",
-                    where=self.address,
-                    expected="--label NAME, another for each policy: an address does not tell what is behind it, and "
-                    "results of another policy there would be taken for this one's",
-                )
-            case "server":
-                return f"claimed:{self.label}"
-            case _:
-                return f"script:{self.kind}"
-
-    def name(self, identity: str) -> str:
-        """In the results: the label, or what has this identity."""
-        scripts = {"open_loop": "replay", "tracked": "tracked replay"}
-        return self.label or scripts.get(self.kind) or f"{self.address} {identity.removeprefix('sha256:')[:8]}"
-
-    def open(self, look_every: int) -> Policy:
-        match self.kind:
-            case "server":
-                return Server(self.address, self.timeout_s, look_every)
-            case "checkpoint":
-                return Checkpoint(Path(self.address))
-            case "open_loop":
-                return Replay()
-            case "tracked":
-                return TrackedReplay()
-
-
 class NextLook:
     """When a model server has to be shown the scene anew.
 
@@ -107,7 +99,8 @@ class NextLook:
     """
 
     def __init__(self, every: int):
-        self._every, self._left = every, 0
+        self._every = every
+        self.begin()
 
     def begin(self) -> None:
         """An episode begins."""
@@ -117,12 +110,9 @@ class NextLook:
     def due(self) -> bool:
         return self._left == 0
 
-    def looked(self) -> None:
-        self._left = self._every
-
     def answered(self, actions: Any) -> None:
         """Args: actions: (n, 7) or (7,), all of which are taken before the next question."""
-        self._left = self._left - 1 if np.ndim(actions) == 1 else 0
+        self._left = (self._left or self._every) - 1 if np.ndim(actions) == 1 else 0
 
 
 class Server:
@@ -162,7 +152,6 @@ class Server:
     def act(self, look: Look) -> Any:
         if self._next_look.due:
             self._seen = look(self.wanted)
-            self._next_look.looked()
         if not self._connection.is_connected:
             raise self._fault("the connection was closed")
         answer = self._run(self._connection.act(self._seen), self._connection.timeout)
@@ -216,3 +205,90 @@ class Server:
     def _fault(self, what: str) -> PolicyError:
         self._loop.run_until_complete(self._connection.close())
         return PolicyError(what, where=self.name, remedy="see the server's log")
+
+
+class Checkpoint:
+    """A policy that lerobot saved, run in this process.
+
+    It is asked for a chunk where it makes chunks, so that it looks once in ``n_action_steps``. Frames get the size of
+    those that it was trained on. Random numbers, such as a diffusion policy draws, follow from the task alone.
+
+    Args:
+        folder: with ``config.json`` and the weights, such as ``outputs/train/.../pretrained_model``.
+    """
+
+    wanted = Wanted()
+
+    def __init__(self, folder: Path):
+        # lerobot and its models take seconds to import.
+        import torch
+        from lerobot.configs.policies import PreTrainedConfig
+        from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+
+        self.name, self._torch = str(folder), torch
+        config = PreTrainedConfig.from_pretrained(folder)
+        config.pretrained_path = folder
+        if config.device is None or (config.device.startswith("cuda") and not torch.cuda.is_available()):
+            config.device = "cpu"
+        self._policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+        self._policy.eval()
+        self._before, self._after = make_pre_post_processors(
+            config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
+        )
+        cameras = {SCHEMA.views[view].lerobot_key: name for name, view in VIEWS.items()}
+        unknown = [key for key in config.image_features if key not in cameras]
+        if unknown:
+            raise PipelineError(
+                f"the policy wants the images {', '.join(unknown)}", where=folder, expected=", ".join(cameras)
+            )
+        self._cameras = {key: name for key, name in cameras.items() if key in config.image_features}
+        self._sizes_px = {key: config.image_features[key].shape[1:] for key in self._cameras}
+        chunked = getattr(config, "n_obs_steps", 1) == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
+        self._chunk = int(getattr(config, "n_action_steps", 1)) if chunked else 1
+
+    def begin(self, task: EvaluationTask) -> None:
+        # lerobot's policies draw from this generator alone.
+        self._torch.manual_seed(int(digest("policy", str(task))[:15], 16))
+        self._policy.reset()
+
+    def act(self, look: Look) -> Floats:
+        seen = look(self.wanted)
+        batch: dict[str, Any] = {}
+        for key, name in self._cameras.items():
+            frame = resized(seen["images"][name], *self._sizes_px[key])
+            batch[key] = self._torch.from_numpy(frame).permute(2, 0, 1)[None].float() / 255
+        batch["observation.state"] = self._torch.from_numpy(seen["states"])[None]
+        batch["task"] = [seen["task_description"]]
+        with self._torch.inference_mode():
+            batch = self._before(batch)
+            if self._chunk == 1:
+                actions = self._policy.select_action(batch)
+            else:
+                actions = self._policy.predict_action_chunk(batch)[0, : self._chunk]
+            actions = self._after(actions)
+        taken: Floats = np.asarray(actions.cpu().numpy(), np.float64)
+        return taken
+
+    def end(self, success: bool) -> None: ...
+
+
+BESIDE = ("train_config.json", "README.md")
+"""Files of a checkpoint that do not decide what it does."""
+
+
+def content_of(checkpoint: Path) -> str:
+    """SHA-256 of the files in a checkpoint's folder, by their names: configuration, weights, processors and whatever
+    else is there but ``BESIDE`` and hidden files. What lerobot loads from elsewhere, such as a tokenizer, is not in it.
+
+    Raises:
+        PipelineError: when it is no checkpoint.
+    """
+    if not (checkpoint / "config.json").is_file():
+        raise PipelineError("no config.json", where=checkpoint, expected="a folder that lerobot saved a policy in")
+    inside = {path.relative_to(checkpoint): path for path in checkpoint.rglob("*") if path.is_file()}
+    deciding = {
+        name.as_posix(): path
+        for name, path in inside.items()
+        if name.name not in BESIDE and not any(part.startswith(".") for part in name.parts)
+    }
+    return digest({name: checksum(path) for name, path in deciding.items()})

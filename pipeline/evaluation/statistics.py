@@ -20,6 +20,8 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,7 +29,8 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest, norm, t
 
 from pipeline import seeding
-from pipeline.evaluation.results import REFUSED, Row
+from pipeline.errors import PipelineError
+from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
 from pipeline.types import Floats
 
 GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
@@ -45,25 +48,25 @@ def wilson(successes: float, trials: float) -> tuple[float, float]:
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def summary(rows: Iterable[Row]) -> dict[str, Any]:
+def summary(rows: Iterable[EpisodeResult]) -> dict[str, Any]:
     """Success as a whole and by each of ``GROUPINGS``; a group's key joins its values by ``/``.
 
     Episodes whose scene was refused are only counted, as no policy acted in them.
     """
     every = list(rows)
-    listed = [row for row in every if row.get("reason") != REFUSED]
+    listed = [row for row in every if row.reason != REFUSED]
     grouped: dict[str, Any] = {"all": success_rate(listed), "refused": len(every) - len(listed)}
     for columns in GROUPINGS:
-        groups: dict[str, list[Row]] = defaultdict(list)
+        groups: dict[str, list[EpisodeResult]] = defaultdict(list)
         for row in listed:
-            groups["/".join(str(row[column]) for column in columns)].append(row)
+            groups["/".join(str(getattr(row, column)) for column in columns)].append(row)
         grouped["by_" + "_and_".join(columns)] = {name: success_rate(groups[name]) for name in sorted(groups)}
     return grouped
 
 
-def success_rate(rows: Sequence[Row]) -> dict[str, Any]:
+def success_rate(rows: Sequence[EpisodeResult]) -> dict[str, Any]:
     """``episodes``, ``successes``, their ``rate`` (None without episodes), and the interval's ``low`` and ``high``."""
-    successes = sum(row["success"] for row in rows)
+    successes = sum(row.success for row in rows)
     low, high = wilson(successes, len(rows))
     rate = successes / len(rows) if rows else None
     return {"episodes": len(rows), "successes": successes, "rate": rate, "low": round(low, 4), "high": round(high, 4)}
@@ -76,8 +79,6 @@ FEW = 5
 """Fewer trials of a base task say too little about how they scatter."""
 
 RESAMPLES = 10_000
-
-Name = str | int | tuple[str | int, ...]
 
 Statistic = Callable[[Floats], Floats]
 """Sums of outcomes over trials (n, outcomes) to n figures; NaN where one is not defined."""
@@ -99,12 +100,12 @@ class Interval(NamedTuple):
 
 
 def interval(
-    base_tasks: Sequence[Name], trials: Sequence[Name], outcomes: NDArray[np.generic], statistic: Statistic
+    base_tasks: Sequence[Any], trials: Sequence[Any], outcomes: NDArray[np.generic], statistic: Statistic
 ) -> Interval:
     """The interval of ``statistic``; the same whatever the order of the results.
 
     Args:
-        base_tasks: of each result; names of one kind, so that they can be sorted.
+        base_tasks: of each result; hashable names of one kind that can be sorted.
         trials: of each result; results of one trial are drawn together.
         outcomes: (results, outcomes) numbers, which are summed.
     """
@@ -156,14 +157,14 @@ def _drawn(group: Floats, draws: np.random.Generator) -> Floats:
     return np.asarray(sums * (len(group) / (len(group) - 1)), float)
 
 
-Pair = tuple[Row, Row]
+Pair = tuple[EpisodeResult, EpisodeResult]
 """Two policies' results of one episode."""
 
 
-def paired(first: Iterable[Row], second: Iterable[Row]) -> list[Pair]:
+def paired(first: Iterable[EpisodeResult], second: Iterable[EpisodeResult]) -> list[Pair]:
     """Results of the same task, initial state and draw."""
-    by_task = {_task(row): row for row in second}
-    return [(row, by_task[_task(row)]) for row in first if _task(row) in by_task]
+    of_trial = {row.trial: row for row in second}
+    return [(row, of_trial[row.trial]) for row in first if row.trial in of_trial]
 
 
 def compare(pairs: Sequence[Pair]) -> dict[str, Any]:
@@ -175,7 +176,7 @@ def compare(pairs: Sequence[Pair]) -> dict[str, Any]:
     """
     by_axis: dict[str, list[Pair]] = defaultdict(list)
     for pair in pairs:
-        by_axis[pair[0]["axis"]].append(pair)
+        by_axis[pair[0].axis].append(pair)
     return {"all": _compared(pairs), "by_axis": {axis: _compared(by_axis[axis]) for axis in sorted(by_axis)}}
 
 
@@ -193,17 +194,12 @@ def difference(sums: Floats) -> Floats:
     return np.asarray((sums[:, 1] - sums[:, 0]) / sums[:, 2], float)
 
 
-def _task(row: Row) -> tuple[Any, ...]:
-    # The seed is of what is drawn for the task: the perturbation (own), or random noise.
-    return row["source"], row["suite"], row["name"], row["seed"]
-
-
 def _compared(pairs: Sequence[Pair]) -> dict[str, Any]:
-    counts = Counter((bool(one["success"]), bool(other["success"])) for one, other in pairs)
+    counts = Counter((one.success, other.success) for one, other in pairs)
     both, only_first, only_second = counts[True, True], counts[True, False], counts[False, True]
-    outcomes = np.array([(one["success"], other["success"], 1) for one, other in pairs], float)
+    outcomes = np.array([(one.success, other.success, 1) for one, other in pairs], float)
     measured = interval(
-        [(row["suite"], row["base"]) for row, _ in pairs], [_task(row) for row, _ in pairs], outcomes, difference
+        [(row.suite, row.base) for row, _ in pairs], [row.trial for row, _ in pairs], outcomes, difference
     )
     return {
         "episodes": len(pairs),
@@ -216,3 +212,38 @@ def _compared(pairs: Sequence[Pair]) -> dict[str, Any]:
         "p_value": mcnemar(only_first, only_second),
         "difference": {"value": (only_second - only_first) / len(pairs), **measured._asdict()},
     }
+
+
+def difficulty(solved: int, models: int) -> int:
+    """Level 1 to 5 of a task that ``solved`` of some models solve.
+
+    LIBERO-Plus has four models, and 5 minus how many solve the task. For any number of models this is 5 minus four
+    times the share that solves it, rounded to the nearest, halves to the harder: with up to seven models, 1 means that
+    all solve the task and 5 that none does.
+    """
+    # ceil(4 solved / models - 1 / 2) in whole numbers.
+    return 5 + (models - 8 * solved) // (2 * models)
+
+
+def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
+    """Every task that all models ran, as JSON, with its ``difficulty`` and how many models solve it.
+
+    Args:
+        results: those of each model.
+
+    Raises:
+        PipelineError: when results of a model have several settings, models cannot be compared, or no task was run by
+            all.
+    """
+    for of_model in results:
+        one_setting(of_model)
+    refuse_different(chain(*results))
+    models = [{row.trial: row.success for row, _ in of_model if row.reason != REFUSED} for of_model in results]
+    shared = [trial for trial in models[0] if all(trial in model for model in models)]
+    if not shared:
+        raise PipelineError("no task was run by all models", remedy="evaluate all of them with the same --tasks-from")
+    graded = []
+    for trial in shared:
+        solved = sum(model[trial] for model in models)
+        graded.append({**asdict(trial[0]), "solved": solved, "difficulty": difficulty(solved, len(models))})
+    return graded

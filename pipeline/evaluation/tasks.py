@@ -1,8 +1,14 @@
-"""The tasks that policies are evaluated on: what names one, LIBERO's initial states, and lists of them."""
+"""The tasks that policies are evaluated on: what names one, LIBERO's initial states, lists of them, and other goals.
+
+LIBERO's tasks can be asked for another object of their scene, which the instruction and the BDDL goal name then. A
+policy that knows a scene by heart does what it always did there. The scene, the initial states and the predicates are
+LIBERO's own, so its environment judges the new goal.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -15,13 +21,21 @@ import numpy as np
 from pydantic import BaseModel
 
 from pipeline import seeding
+from pipeline.axes.language_words import pattern, words
+from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
+from pipeline.libero import bddl
 from pipeline.libero.assets import libero_folder
-from pipeline.libero.tasks import tasks
+from pipeline.libero.bddl import Bddl
+from pipeline.libero.tasks import SUITES, tasks
 from pipeline.types import Floats, Task
 
 Source = Literal["libero", "libero_plus", "own", "goals"]
+
+Prompt = Literal["clean", "benchmark", "blank"]
+"""What a policy is told: LIBERO's instruction; in test tasks what the benchmark's code takes for it, the name of the
+task's file ("turn on the stove view 0 0 100 2 352 initstate 0"); or nothing at all."""
 
 
 @dataclass(frozen=True, order=True)
@@ -129,3 +143,137 @@ def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, fi
     lines = ",\n".join(json.dumps(task) for task in content)
     with replaced(file) as temporary:
         temporary.write_text(f'{{"seed": {seed}, "tasks": [\n{lines}\n]}}\n')
+
+
+@dataclass(frozen=True)
+class Replacement:
+    """Another object in the place of the one that a task's goal puts somewhere.
+
+    Attributes:
+        old, new: names in the BDDL file.
+        category: of the new object.
+        instruction: LIBERO's, with the new object's words.
+    """
+
+    old: str
+    new: str
+    category: str
+    instruction: str
+
+    def name(self, task: Task, number: int) -> str:
+        """Of the evaluation task that begins in LIBERO's initial state of that number."""
+        return f"{task.name}_goal_{self.old}_{self.new}_state{number}"
+
+    def bddl_text(self, task: Task) -> str:
+        """The task's file with the new object in its goal; objects and regions stay, and so do initial states."""
+        text = task.bddl_file.read_text()
+        start = text.index("(:goal")
+        return text[:start] + re.sub(rf"\b{self.old}\b", self.new, text[start:])
+
+
+@cache
+def replacements(task: Task) -> tuple[Replacement, ...]:
+    """All that can take the place of an object that the task's goal puts somewhere.
+
+    The new object can be moved, carries nothing, is not in the goal yet and is the only one of its category, so that
+    its words mean it alone. It fits where the old one goes: one of LIBERO's 130 tasks puts an object of its category on
+    or in a thing of the same kind, or it is no larger than an object that one of them puts there.
+    """
+    known = bddl.read(task.bddl_file)
+    named = {word for fact in known.goal for word in fact}
+    carrying = {place for thing, place in known.places.items() if thing in known.objects}
+    kinds = list(known.objects.values())
+    possible = []
+    for old in known.targets:
+        if [known.objects[target] for target in known.targets].count(known.objects[old]) > 1:
+            continue  # "both moka pots" has no words for one of them
+        relation, place = next((fact[0], fact[2]) for fact in known.goal if fact[1] == old)
+        for new, category in known.objects.items():
+            free = new not in (*known.receptacles, *carrying, *named)
+            if free and kinds.count(category) == 1 and _fits(category, relation, place, known):
+                possible.append(Replacement(old, new, category, _reworded(task, old, category)))
+    return tuple(possible)
+
+
+def find_replacement(task: Task, name: str) -> Replacement:
+    """The replacement that the name of an evaluation task says; refused when the task has none of that name."""
+    named = {one.name(task, 0).rpartition("_")[0]: one for one in replacements(task)}
+    asked = name.rpartition("_")[0]
+    if asked not in named:
+        raise PipelineError(
+            f"{task.suite} has no goal {asked!r}", expected=" or ".join(named) or "a task with other objects"
+        )
+    return named[asked]
+
+
+def _fits(category: str, relation: str, place: str, known: Bddl) -> bool:
+    """Whether an object of a category can be where a goal puts another one; anywhere on the working surface it can."""
+    if place in known.regions:
+        return True
+    there = _put()[relation, _kind(place, known)]
+    return category in there or any(_no_larger(category, other, relation == "in") for other in there)
+
+
+def _no_larger(category: str, other: str, also_in_height: bool) -> bool:
+    one, two = _size_m(category), _size_m(other)
+    if one is None or two is None:
+        return False
+    return one[0] <= two[0] and one[1] <= two[1] and (one[2] <= two[2] or not also_in_height)
+
+
+@cache
+def _size_m(category: str) -> tuple[float, float, float] | None:
+    """The shorter and the longer side of an object's footprint and its height; None where its model is not known."""
+    model = next((model for model in offered("libero") if model.name == f"libero/{category}"), None)
+    if model is None:
+        return None
+    x_m, y_m, z_m = (high - low for low, high in zip(model.shape.low_m, model.shape.high_m, strict=True))
+    return min(x_m, y_m), max(x_m, y_m), z_m
+
+
+@cache
+def _put() -> dict[tuple[str, str], frozenset[str]]:
+    """Relation and kind of place to the categories that LIBERO's tasks put there."""
+    there: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for task in (task for suite in SUITES for task in tasks(suite)):
+        known = bddl.read(task.bddl_file)
+        for fact in known.goal:
+            if len(fact) == 3 and fact[1] in known.objects:
+                there[fact[0], _kind(fact[2], known)].add(known.objects[fact[1]])
+    return {place: frozenset(categories) for place, categories in there.items()}
+
+
+def _kind(place: str, known: Bddl) -> str:
+    """A place by its thing's category: ``basket_contain_region`` for ``basket_1_contain_region``."""
+    kinds = {**known.objects, **known.fixtures}
+    thing = max((name for name in kinds if f"{place}_".startswith(f"{name}_")), key=len)
+    return kinds[thing] + place.removeprefix(thing)
+
+
+def _reworded(task: Task, old: str, category: str) -> str:
+    """The instruction with the words for another category in the place of those for ``old``, and of what says which of
+    several it is: ``between the plate and the ramekin``."""
+    known = bddl.read(task.bddl_file)
+    several = list(known.objects.values()).count(known.objects[old]) > 1
+    which = r"(?:.*?(?= and (?:place|put)\b))" if several else ""
+    mention = re.compile(pattern(words().things[known.objects[old]].names).pattern + which)
+    return mention.sub(_words(task.suite, category), task.instruction, count=1)
+
+
+@cache
+def _words(suite: str, category: str) -> str:
+    """What LIBERO's instructions call a category, in this suite if they do.
+
+    Raises:
+        PipelineError: when no instruction in a scene that has it calls it by any of its names.
+    """
+    for among in ((suite,), SUITES):
+        said = [
+            task.instruction
+            for task in (task for one in among for task in tasks(one))
+            if category in bddl.read(task.bddl_file).objects.values()
+        ]
+        for name in words().things[category].names:
+            if any(re.search(rf"\b{name}\b", instruction) for instruction in said):
+                return name
+    raise PipelineError(f"LIBERO's instructions have no words for {category}", where="language_words.yaml")

@@ -14,12 +14,12 @@ from unittest import mock
 
 import av
 import datasets
+import huggingface_hub
 import huggingface_hub.constants
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from datasets.exceptions import DatasetsError
-from huggingface_hub import configure_http_backend
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 
@@ -145,12 +145,16 @@ def local_only(cache: Path) -> Iterator[None]:
         mock.patch.object(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
     ):
         datasets.disable_progress_bars()
-        # A session is kept for its thread and stays on or off the hub as it was made.
-        configure_http_backend()
+        forget_sessions()
         try:
             yield
         finally:
-            configure_http_backend()
+            forget_sessions()
+
+
+def forget_sessions() -> None:
+    """Before huggingface-hub 1, a thread keeps a session, which stays on or off the hub as it was made."""
+    getattr(huggingface_hub, "configure_http_backend", lambda: None)()
 
 
 def _rows(root: Path) -> dict[str, dict[str, Any]]:

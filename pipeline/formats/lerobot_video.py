@@ -34,6 +34,10 @@ INFO = {
     "video.is_depth_map": False,
     "video.fps": SCHEMA.fps_hz,
     "has_audio": False,
+    # What lerobot 0.6 encodes anew by, where an edit cuts a file; else it uses B-frames, and cannot merge what it made.
+    "video.g": int(OPTIONS["g"]),
+    "video.crf": int(OPTIONS["crf"]),
+    "video.preset": OPTIONS["preset"],
 }
 """What ``meta/info.json`` says of such files."""
 

@@ -22,7 +22,6 @@ from typing import Any
 
 import datasets
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
@@ -50,6 +49,15 @@ FILES_OF_A_CHUNK, PLACE = 1000, "chunk-{chunk_index:03d}/file-{file_index:03d}"
 
 DATA, EPISODES, PROVENANCE, LEVELS = "data.parquet", "episodes.parquet", "provenance.parquet", "levels.json"
 """In a piece's folder, beside ``<view>.mp4``."""
+
+INDEX = (
+    '{"index_columns": ["task"], "column_indexes": [{"name": null, "field_name": null, "pandas_type": "unicode", '
+    '"numpy_type": "str", "metadata": {"encoding": "UTF-8"}}], "columns": [{"name": "task_index", "field_name": '
+    '"task_index", "pandas_type": "int64", "numpy_type": "int64", "metadata": null}, {"name": "task", "field_name": '
+    '"task", "pandas_type": "object", "numpy_type": "str", "metadata": null}], "attributes": {}, "creator": '
+    '{"library": "pyarrow", "version": "26.0.1"}, "pandas_version": "3.1.1"}'
+)
+"""Has pandas take the texts of the tasks as index, as pandas 3.1.1 says it; what it says depends on its version."""
 
 ENTRIES = 16
 """Of a column so many entries are in memory at a time: 300 MB for 28,000 episodes."""
@@ -107,8 +115,8 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], frames: Frames, extr
     pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
     # In order, as numbers were given when a text first came. lerobot finds a task by the table's index.
     tasks = {task: number for piece in pieces for task, number in piece.tasks.items()}
-    numbered = pd.DataFrame({"task_index": list(tasks.values())}, index=pd.Index(list(tasks), name="task"))
-    numbered.to_parquet(root / "meta" / "tasks.parquet")
+    numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
+    pq.write_table(pa.table(numbered).replace_schema_metadata({"pandas": INDEX}), root / "meta" / "tasks.parquet")
     columns = features(frames, extras)
     levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
     counts = {view: np.sum([of_piece[view] for of_piece in levels], axis=0) for view in SCHEMA.views}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+import httpx
 from huggingface_hub import snapshot_download
 
 from pipeline.errors import PipelineError
@@ -19,8 +20,8 @@ REVISION = "f13aa24a3da8c43c7225569f28c562979fa0e35a"
 def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list[Path]:
     """Download whole suites to ``<out>/<suite>/<task>_demo.hdf5``: 10 files of 0.3 to 1 GB for each suite of 10 tasks.
 
-    A download that was cut short goes on where it stopped, and files that are there are not fetched again. The
-    revision is fixed.
+    A download that was cut short goes on where it stopped (since huggingface-hub 1 at the start of that file), and
+    files that are there are not fetched again. The revision is fixed.
 
     Args:
         out: the folder to use as ``demos.root`` afterwards.
@@ -48,7 +49,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
             # The files are public: no reason to show a mirror the user's token.
             token=False,
         )
-    except OSError as error:
+    except (OSError, httpx.HTTPError) as error:  # the second since huggingface-hub 1
         raise PipelineError(
             f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
         ) from error

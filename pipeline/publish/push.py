@@ -15,8 +15,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, get_token
-from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError, XetError
+import httpx
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, errors, get_token
+from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
@@ -28,6 +29,9 @@ SCRIPTS = {".py", ".yaml", ".json"}
 
 OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]{64}\.json")
 """What OpenVLA-OFT's loader writes beside the shards when it trains without ``finetune/run_openvla_oft.py``."""
+
+FAILURES = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
+"""What an upload raises. Only before huggingface-hub 1 there is a ``XetError``; only since then it speaks by httpx."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
             api.create_tag(repository, tag=upload.tag, repo_type="dataset")
-    except (OSError, RuntimeError, ValueError, XetError) as error:
+    except FAILURES as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url
 
@@ -213,7 +217,7 @@ def _explained(error: Exception, repository: str, endpoint: str) -> PipelineErro
     if status in (401, 403, 404):
         what = f"{repository} does not let you write"
         remedy = "hf auth login with a token that has the right to, and mind the owner's name"
-    elif 400 <= status < 500 or not isinstance(error, OSError | RuntimeError):
+    elif 400 <= status < 500 or not isinstance(error, OSError | RuntimeError | httpx.HTTPError):
         what, remedy = f"the upload to {repository} is refused", "mend what the hub says"
     else:
         what = f"the upload to {repository} stopped"

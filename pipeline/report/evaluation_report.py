@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation.findings import FAILURES, findings
 from pipeline.evaluation.results import Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
 from pipeline.files import replaced
 from pipeline.report import clips, figures, pages
+from pipeline.report.evaluation_findings import FAILURES, findings
 from pipeline.report.figures import Panel, Share
 from pipeline.report.yields import Cell, Table
 

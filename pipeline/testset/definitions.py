@@ -10,6 +10,7 @@ import ast
 import re
 import zipfile
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -137,6 +138,7 @@ class Reader:
         floor, wall = self._floors[settings["floor_style"]], self._walls[settings["wall_style"]]
         return SceneFiles(settings["scene_xml"], f"textures/{floor}", f"textures/{wall}")
 
+    @cached_property
     def object_models(self) -> dict[str, str]:
         """Category of an added object, as BDDL files name it, to its MJCF below the benchmark's assets."""
         listed = re.findall(

@@ -17,7 +17,7 @@ from pipeline.types import Task
 
 LAYOUT = f"<suite>/<task>_demo.hdf5, with a suite of {', '.join(SUITES)}"
 MISSES = ("goal_not_reached", "goal_lost")
-"""What also happens to good demonstrations: see the README on how often a replay reaches its goal."""
+"""What also happens to good demonstrations: see the yields in docs/axes.md."""
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """Disk that a run takes: from the lengths of its demonstrations, and from what a step was measured to take.
 
 The sizes are rounded up from four runs of one demonstration of 90 steps (``benchmarks/disk.py``, see
-``docs/scaling-out.md``). Episodes are counted as long as their demonstrations.
+``docs/cost.md``). Episodes are counted as long as their demonstrations.
 """
 
 from __future__ import annotations

@@ -6,15 +6,16 @@ import base64
 import ctypes.util
 import hashlib
 import shutil
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, PackagePath, distribution, requires, version
+from importlib.metadata import PackageNotFoundError, PackagePath, distribution, metadata, requires, version
 from importlib.util import find_spec
 from pathlib import Path
+from platform import python_version
 from typing import Literal
 
 from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -64,7 +65,6 @@ def check(
         demos: the demonstrations of the run; the starter set when left out.
     """
     return [
-        _python(),
         *_packages(),
         _tensorflow(),
         _opengl(),
@@ -131,21 +131,21 @@ def _workers_here(compute: ComputeConfig) -> int | None:
     return compute.workers if compute.cluster == "local" else 1
 
 
-def _python() -> Diagnosis:
-    found = ".".join(str(part) for part in sys.version_info[:3])
-    if sys.version_info[:2] != (3, 11):
-        return Diagnosis("Python", "fail", f"{found}, not 3.11", REINSTALL)
-    return Diagnosis("Python", "ok", found)
-
-
 def _packages() -> Iterator[Diagnosis]:
-    """The versions that pyproject.toml asks for. Both OpenCV packages own one folder: their pins keep them equal."""
+    """What pyproject.toml asks for. Both OpenCV packages own one folder: their pins keep them equal."""
     try:
-        wanted = [Requirement(line) for line in requires("pipeline") or []]
+        pythons, lines = metadata("pipeline")["Requires-Python"], requires("pipeline") or []
     except PackageNotFoundError:
         yield Diagnosis("pipeline", "fail", "not installed", REINSTALL)
         return
-    for requirement in wanted:
+    if SpecifierSet(pythons).contains(python_version()):
+        yield Diagnosis("Python", "ok", python_version())
+    else:
+        yield Diagnosis("Python", "fail", f"{python_version()}, not {pythons}", REINSTALL)
+    for requirement in map(Requirement, lines):
+        # Of other Pythons; the harness is installed although it is an extra.
+        if requirement.marker and not requirement.marker.evaluate({"extra": "evaluation"}):
+            continue
         pins = str(requirement.specifier)
         try:
             found = version(requirement.name)

@@ -12,8 +12,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.evaluation.libero_plus import level_of
-from pipeline.evaluation.results import Evaluated, Row
+from pipeline.evaluation.results import EpisodeResult, Evaluated
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary, wilson
 from pipeline.testset import benchmark
 
@@ -23,7 +22,7 @@ SOURCES = ("libero_plus", "own", "libero")
 FAILURES = 3
 """So many are shown of each policy, source and axis."""
 
-_FACTS = ("episode", "source", "suite", "name", "axis", "component", "level", "prompt", "reason", "steps", "looks")
+_FACTS = ("episode", "source", "suite", "name", "axis", "component", "level", "instruction", "reason", "steps", "looks")
 
 
 def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
@@ -37,7 +36,7 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
         ``common``: source to the number of episodes that all policies ran which ran any of it.
         ``failures``: episodes to show, and whether there is a video.
     """
-    present = {row["source"] for policy in policies for row in policy.rows}
+    present = {row.source for policy in policies for row in policy.rows}
     sources = [*(source for source in SOURCES if source in present), *sorted(present.difference(SOURCES))]
     tested = {policy.name: rows for policy in policies if (rows := policy.of("libero_plus"))}
     return {
@@ -60,34 +59,38 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
             if (pairs := paired(one.of(source), other.of(source)))
         ],
         "failures": [
-            {"policy": policy.name, "video": row["episode"] in policy.videos, **{name: row[name] for name in _FACTS}}
+            {
+                "policy": policy.name,
+                "video": row.episode in policy.videos,
+                **{name: getattr(row, name) for name in _FACTS},
+            }
             for policy in policies
             for row in _shown_failures(policy)
         ],
     }
 
 
-def _common(rows: Sequence[Sequence[Row]]) -> int:
-    return len(set.intersection(*({(row["suite"], row["name"], row["seed"]) for row in group} for group in rows)))
+def _common(rows: Sequence[Sequence[EpisodeResult]]) -> int:
+    return len(set.intersection(*({row.trial for row in group} for group in rows)))
 
 
-def _shown_failures(policy: Evaluated) -> list[Row]:
+def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
     """Of each source and axis those with a video first, then the weakest perturbations, then by name."""
-    failed = [row for row in policy.rows if not row["success"]]
-    failed.sort(key=lambda row: (row["axis"], row["episode"] not in policy.videos, row["level"], row["episode"]))
+    failed = [row for row in policy.rows if not row.success]
+    failed.sort(key=lambda row: (row.axis, row.episode not in policy.videos, row.level, row.episode))
     taken: Counter[tuple[str, str]] = Counter()
     shown = []
     for row in failed:
-        taken[row["source"], row["axis"]] += 1
-        if taken[row["source"], row["axis"]] <= FAILURES:
+        taken[row.source, row.axis] += 1
+        if taken[row.source, row.axis] <= FAILURES:
             shown.append(row)
     return shown
 
 
-def _versions(rows: Sequence[Row]) -> dict[str, list[str]]:
+def _versions(rows: Sequence[EpisodeResult]) -> dict[str, list[str]]:
     """Package, and what rendered, to its versions; several where machines differ."""
-    names = dict.fromkeys(name for row in rows for name in row["versions"])
-    return {name: sorted({row["versions"][name] for row in rows if name in row["versions"]}) for name in names}
+    names = dict.fromkeys(name for row in rows for name in row.versions)
+    return {name: sorted({row.versions[name] for row in rows if name in row.versions}) for name in names}
 
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
@@ -127,7 +130,7 @@ class Estimate:
     absent: str = ""
 
 
-def paper_table(policies: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
+def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, Any]:
     """The paper's table, policies beside the published models; JSON-serialisable.
 
     An evaluation on a balanced subset has as many easy tasks as hard ones, and the benchmark has not. So an episode
@@ -177,12 +180,12 @@ def paper_table(policies: Mapping[str, Sequence[Row]]) -> dict[str, Any]:
     }
 
 
-def _cell(rows: Sequence[Row], axes: Sequence[str]) -> Estimate | None:
+def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None:
     """A column's rate; None where it has no episode."""
     outcomes: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
-    chosen = [row for row in rows if row["axis"] in axes]
+    chosen = [row for row in rows if row.axis in axes]
     for row in chosen:
-        outcomes[row["axis"], row["component"], row["level"]].append(bool(row["success"]))
+        outcomes[row.axis, row.component, row.level].append(row.success)
     if not outcomes:
         return None
     strata = {
@@ -206,13 +209,13 @@ def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
     return sum(sizes[name] * rate for name, rate in rates.items()) / sum(sizes[name] for name in rates)
 
 
-def _absent(rows: Sequence[Row], axes: Sequence[str]) -> str:
+def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
     """Which components, suites and levels of a column have no episode; ``rows`` are those of its axes."""
-    run = {(row["axis"], row["component"]) for row in rows}
+    run = {(row.axis, row.component) for row in rows}
     components = {kind: count for kind, count in _sizes(axes, 2).items() if kind not in run}
     tests = [kind for kind in _tests() if kind[0] in {axis for axis, _ in run}]
-    suites = {suite for *_, suite in tests} - {row["suite"] for row in rows}
-    levels = {level for _, _, level, _ in tests} - {row["level"] for row in rows}
+    suites = {suite for *_, suite in tests} - {row.suite for row in rows}
+    levels = {level for _, _, level, _ in tests} - {row.level for row in rows}
     return ", ".join(
         [
             *(f"{NAMES.get(kind, kind[1])} ({count:,} tasks)" for kind, count in sorted(components.items())),
@@ -234,4 +237,4 @@ def _sizes(axes: Sequence[str], columns: int) -> Counter[Any]:
 @cache
 def _tests() -> Counter[tuple[str, str, int, str]]:
     """How many test tasks there are of each axis, component, level and suite."""
-    return Counter((test.axis, test.component, level_of(test), test.suite) for test in benchmark.load().tasks)
+    return Counter((test.axis, test.component, test.level, test.suite) for test in benchmark.load().tasks)

@@ -1,0 +1,36 @@
+"""Results of episodes that nobody ran, for what reads them."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from pipeline.evaluation.environment import STEP_LIMITS
+from pipeline.evaluation.results import EpisodeResult
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.seeding import digest
+
+
+def result(
+    task: EvaluationTask, success: bool = False, policy: str = "p", prompt: Any = "clean", **fields: Any
+) -> EpisodeResult:
+    """A result under the settings of ``evaluate``, or with other fields where they are given."""
+    limit = STEP_LIMITS[task.suite]
+    row: dict[str, Any] = {
+        **asdict(task),
+        "episode": digest(str(task), policy, prompt)[:16],
+        "prompt": prompt,
+        "instruction": "turn on the stove",
+        "step_limit": limit,
+        "seed": 0,
+        "success": success,
+        "reason": "success" if success else "step_limit",
+        "steps": 100 if success else limit,
+        "looks": 12,
+        "perturbations": [],
+        "policy": policy,
+        "identity": f"claimed:{policy}",
+        "settings": {"prompt": prompt, "seed": 0},
+        "versions": {"mujoco": "3.2.7", "OpenGL": "llvmpipe"},
+    }
+    return EpisodeResult(**{**row, **fields})

@@ -1,0 +1,74 @@
+"""lerobot, as it is installed, streams a dataset, trains on it and changes its features."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets.dataset_tools import add_features, remove_feature
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
+from safetensors.numpy import load_file
+from synthetic import IDS, NAME, episode, write_lerobot
+
+pytestmark = pytest.mark.slow
+KEYS = ("action", "observation.state", "observation.joint_state")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_lerobot(tmp_path_factory.mktemp("tools")).root
+
+
+@pytest.mark.parametrize(("frames", "files"), [("images", 3), ("video", 1)])
+def test_streams_every_step_once(tmp_path: Path, frames: str, files: int) -> None:
+    """Videos of one file alone: lerobot looks for a step's frame at the step's index in the whole dataset."""
+    root = write_lerobot(tmp_path, frames=frames, shards=files).root
+    made = [episode(episode_id) for episode_id in IDS]
+    items = sorted(StreamingLeRobotDataset(NAME, root=root), key=lambda item: int(item["index"]))
+    assert [int(item["index"]) for item in items] == list(range(sum(map(len, made))))
+    for key, name in zip(KEYS, ("action", "state", "joint_state"), strict=True):
+        expected = np.concatenate([getattr(one, name) for one in made])
+        np.testing.assert_array_equal(np.stack([item[key].numpy() for item in items]), expected)
+    dataset = LeRobotDataset(NAME, root=root, video_backend="pyav")
+    for index in (0, 17, len(dataset) - 1):
+        streamed, read = (np.asarray(one["observation.images.image"]) for one in (items[index], dataset[index]))
+        if streamed.shape[-1] == 3:  # lerobot 0.4 hands images out as they are stored
+            streamed = streamed.transpose(2, 0, 1) / 255
+        assert np.abs(streamed - read).max() <= 1.5 / 255, "torchcodec and PyAV round differently"
+
+
+def test_trains_two_steps(root: Path, tmp_path: Path) -> None:
+    small = {"chunk_size": 4, "n_action_steps": 4, "dim_model": 16, "n_heads": 2, "dim_feedforward": 16}
+    policy = {"type": "act", "device": "cpu", "push_to_hub": "false", "pretrained_backbone_weights": "null", **small}
+    command = [
+        *(sys.executable, "-m", "lerobot.scripts.lerobot_train"),
+        *(f"--dataset.repo_id={NAME}", f"--dataset.root={root}", "--dataset.video_backend=pyav"),
+        *(f"--policy.{name}={value}" for name, value in policy.items()),
+        *("--steps=2", "--save_freq=2", "--batch_size=2", "--num_workers=0", f"--output_dir={tmp_path / 'out'}"),
+    ]
+    environment = os.environ | {"HF_HUB_OFFLINE": "1"}
+    done = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    (weights,) = (tmp_path / "out" / "checkpoints").glob("*2/pretrained_model/model.safetensors")
+    assert all(np.isfinite(values).all() for values in load_file(weights).values())
+
+
+def test_adds_and_removes_a_feature(root: Path, tmp_path: Path) -> None:
+    dataset = LeRobotDataset(NAME, root=root, video_backend="pyav")
+    values = np.arange(len(dataset), dtype=np.float32)[:, None]
+    spec = {"dtype": "float32", "shape": (1,), "names": None}
+    more = add_features(dataset, {"weight": (values, spec)}, output_dir=tmp_path / "more", repo_id="more")
+    assert more.meta.features.keys() == dataset.meta.features.keys() | {"weight"}
+    fewer = remove_feature(more, "weight", output_dir=tmp_path / "fewer", repo_id="fewer")
+    assert fewer.meta.features.keys() == dataset.meta.features.keys()
+    for index in (0, len(dataset) - 1):
+        assert float(more[index]["weight"]) == index
+        for changed in (more, fewer):
+            assert changed[index]["task"] == dataset[index]["task"]
+            for key in KEYS:
+                np.testing.assert_array_equal(changed[index][key].numpy(), dataset[index][key].numpy())
