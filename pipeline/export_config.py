@@ -118,29 +118,47 @@ class Where(_Frozen):
         )
 
 
+class LeRobotV21Config(_Frozen):
+    """How LeRobot datasets of version 2.1 are written.
+
+    Attributes:
+        name: of the dataset, or what the sets' names begin with; ``libero_`` and the name of the run when left out.
+        convention: ``ipec`` for GR00T, starVLA and others: a set for each suite, as IPEC-COMMUNITY's of LIBERO, with
+            videos and a gripper of 1 open, 0 closed. ``openpi``: one set, as openpi's configuration of LIBERO reads it.
+        validation: share of each task's demonstrations whose episodes go into sets of their own, named ``..._val``.
+    """
+
+    name: Name = ""
+    convention: Literal["ipec", "openpi"]
+    validation: Share = 0.0
+
+
 class ExportConfig(_Frozen):
     """The output formats, and which of the kept episodes they get.
 
     Attributes:
         rlds, lerobot: null leaves a format out.
+        lerobot_v21: the same episodes for clients that read LeRobot's older version.
         where: a subset of the kept episodes; all of them when left out.
     """
 
     rlds: RldsConfig | None = RldsConfig()
     lerobot: LeRobotConfig | None = LeRobotConfig()
-    # Left out where it says nothing, so that what was finished before there was the field stays what it is.
+    # Left out where they say nothing, so that what was finished before they were added stays what it is.
+    lerobot_v21: LeRobotV21Config | None = Field(default=None, exclude_if=lambda options: options is None)
     where: Where | None = Field(default=None, exclude_if=lambda where: where is None)
 
     @model_validator(mode="after")
     def _some_format(self) -> ExportConfig:
         if not self.formats:
-            raise ValueError("no format is left, expected rlds or lerobot or both")
+            raise ValueError("no format is left, expected one of rlds, lerobot and lerobot_v21")
         return self
 
     @property
-    def formats(self) -> dict[str, RldsConfig | LeRobotConfig]:
+    def formats(self) -> dict[str, RldsConfig | LeRobotConfig | LeRobotV21Config]:
         """Name to options of each format that is asked for."""
-        return {name: options for name in ("rlds", "lerobot") if (options := getattr(self, name)) is not None}
+        formats = {"rlds": self.rlds, "lerobot": self.lerobot, "lerobot_v21": self.lerobot_v21}
+        return {name: options for name, options in formats.items() if options is not None}
 
     @property
     def name(self) -> str:

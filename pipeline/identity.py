@@ -26,7 +26,7 @@ from pipeline.errors import PipelineError
 from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
 
-Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "evaluation", "checks", "pictures"]
+Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "lerobot_v21", "evaluation", "checks", "pictures"]
 
 RECIPES: dict[Step, int] = {
     "physics": 6,
@@ -34,6 +34,7 @@ RECIPES: dict[Step, int] = {
     "encoding": 1,
     "rlds": 3,
     "lerobot": 6,
+    "lerobot_v21": 1,
     "evaluation": 1,
     "checks": 3,
     "pictures": 2,
@@ -46,8 +47,8 @@ benchmark's do. 5: the command and the posture are those of the recording among 
 2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
 lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
 are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
-3 of ``rlds``, 6 of ``lerobot``: the seed is a number, quality is told, features and videos are described. 5 of
-``lerobot``: files are written directly, and camera matrices stand once for each episode.
+3 of ``rlds``, 6 of ``lerobot``: the seed is a number, quality is told, features and videos are described, and there is
+a ``meta/modality.json``. 5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
 2 of it: joint angles are held against the replay's. 3: figures of quality too, against the manifest's.
 ``pictures``: what ``summary`` draws, and the report.
@@ -74,6 +75,7 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
     "encoding": ("opencv-python-headless",),
     "rlds": ("tensorflow-datasets", "protobuf", "google-crc32c", "numpy"),
     "lerobot": ("datasets", "pandas", "av", "pyarrow", "numpy", "opencv-python-headless"),
+    "lerobot_v21": ("datasets", "av", "pyarrow", "numpy", "opencv-python-headless"),
     "checks": ("tensorflow-datasets", "lerobot", "datasets", "av", "pyarrow"),
     "pictures": ("robouse",),
 }

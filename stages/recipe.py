@@ -7,12 +7,11 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    file, folder = config.data / "manifest.parquet", config.data / "finetune"
-    rlds, lerobot = config.export.rlds, config.export.lerobot
-    names = {"name": rlds.name if rlds else None, "lerobot": lerobot.name if lerobot else None}
-    recipe = build(file, manifest.read(file), **names)
-    write(recipe, config.data / "lerobot" / lerobot.name if lerobot else None, folder)
-    print(f"{folder / 'finetune.yaml'} has the recipe and a command line for each of {', '.join(recipe['clients'])}")
+    file = config.data / "manifest.parquet"
+    recipe = build(file, manifest.read(file), config.export)
+    write(recipe, config.data, config.export)
+    made = config.data / "finetune" / "finetune.yaml"
+    print(f"{made} has the recipe and a command line for each of {', '.join(recipe['clients'])}")
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from conftest import STOVE
-from synthetic import IDS, episode, files, write_lerobot, write_rlds
+from synthetic import IDS, episode, files, write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
@@ -38,6 +38,11 @@ def rlds() -> str:
 def lerobot() -> str:
     """All files of two sets; but for the videos, whose encoder may choose its code by the processor."""
     return digest(_written(write_lerobot), _written(partial(write_lerobot, frames="images")))[:16]
+
+
+def lerobot_v21() -> str:
+    """The same of a set of each convention."""
+    return digest(*(_written(partial(write_lerobot_v21, convention=each)) for each in ("ipec", "openpi")))[:16]
 
 
 def _written(write: Callable[[Path], Any]) -> str:
@@ -120,5 +125,7 @@ def pictures() -> dict[str, str]:
     }
 
 
-STEPS: dict[Any, Callable[[], Any]] = {step.__name__: step for step in (rlds, lerobot, evaluation, checks, pictures)}
+STEPS: dict[Any, Callable[[], Any]] = {
+    step.__name__: step for step in (rlds, lerobot, lerobot_v21, evaluation, checks, pictures)
+}
 """Step of ``pipeline.identity.RECIPES`` to what it makes, JSON-serialisable."""

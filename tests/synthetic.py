@@ -1,4 +1,4 @@
-"""Six small episodes that no simulator made, and both formats written from them.
+"""Six small episodes that no simulator made, and every format written from them.
 
 Nothing heavy is imported here: a process that is killed on purpose must start soon.
 """
@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 from pipeline import seeding
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
 from pipeline.types import Episode, Extra, Geometry
@@ -129,6 +130,18 @@ def write_lerobot(
     shards: int = 3,
 ) -> LeRobot:
     target = LeRobot(out, LeRobotConfig(name=name, shards=shards, frames=frames), extras)
+    export(target, episodes(load), run)
+    return target
+
+
+def write_lerobot_v21(
+    out: Path,
+    convention: Any = "ipec",
+    load: Callable[[str], Episode] = episode,
+    run: Any = loop,
+    extras: Sequence[Extra] = (),
+) -> LeRobotV21:
+    target = LeRobotV21(out, LeRobotV21Config(name=NAME, convention=convention), extras)
     export(target, episodes(load), run)
     return target
 

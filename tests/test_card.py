@@ -23,7 +23,7 @@ from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
+from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.registry import FORMATS, columns, formats_of
 from pipeline.publish import card
 from pipeline.run import manifest
@@ -93,14 +93,17 @@ def data(tmp_path: Path) -> Path:
         },
     }.items():
         (tmp_path / name).write_text(json.dumps(report))
-    for kind in ("rlds", "lerobot"):
+    for kind in ("rlds", "lerobot", "lerobot_v21"):
         record = {"identity": "", "files": {f"{NAME}/data.bin": DATA_SHA256}, "places": {}}
         (tmp_path / f"{kind}.json").write_text(json.dumps(record))
     (tmp_path / "sheets").mkdir()
     for axis in ("camera", "camera+background"):
         (tmp_path / "sheets" / f"{axis}.png").write_bytes(axis.encode())
     (tmp_path / "finetune").mkdir()
-    clients = {name: {"where": "there", "command": f"train --with {name}"} for name in ("openvla_oft", "openpi")}
+    clients = {
+        name: {"where": "there", "command": f"train --with {name}"}
+        for name in ("openvla_oft", "lerobot_act", "starvla")
+    }
     (tmp_path / "finetune" / "finetune.yaml").write_text(yaml.safe_dump({"clients": clients}))
     return tmp_path
 
@@ -110,7 +113,11 @@ def write_rows(data: Path, rows: list[dict[str, Any]]) -> None:
 
 
 def write(data: Path) -> None:
-    options = ExportConfig(rlds=RldsConfig(name=NAME, shards=1), lerobot=LeRobotConfig(name=NAME, shards=1))
+    options = ExportConfig(
+        rlds=RldsConfig(name=NAME, shards=1),
+        lerobot=LeRobotConfig(name=NAME, shards=1),
+        lerobot_v21=LeRobotV21Config(name=NAME, convention="ipec"),
+    )
     card.write(data, formats_of(data, options), NAME)
 
 
@@ -185,7 +192,11 @@ def test_pictures_are_beside_the_card_and_only_those_that_exist(data: Path) -> N
 
 @pytest.mark.parametrize(
     ("kind", "state", "client", "other"),
-    [("rlds", "`state`", "openvla_oft", "openpi"), ("lerobot", "`observation.state`", "openpi", "openvla_oft")],
+    [
+        ("rlds", "`state`", "openvla_oft", "starvla"),
+        ("lerobot", "`observation.state`", "lerobot_act", "openvla_oft"),
+        ("lerobot_v21", "`observation.state`", "starvla", "lerobot_act"),
+    ],
 )
 def test_conventions_and_commands_are_the_formats_own(
     data: Path, kind: str, state: str, client: str, other: str
@@ -196,7 +207,7 @@ def test_conventions_and_commands_are_the_formats_own(
         assert ", ".join(names) in text
     view = "`image`" if kind == "rlds" else "`observation.images.image`"
     assert f"relative to the scene's own. Changes {view}." in text
-    assert "-1 opens and +1 closes" in text
+    assert ("1 opens and 0 closes." if kind == "lerobot_v21" else "-1 opens and 1 closes, as LIBERO has it.") in text
     assert f"train --with {client}" in text
     assert f"train --with {other}" not in text
 

@@ -14,9 +14,11 @@ from typing import Any
 import pytest
 from synthetic import IDS, episode, episodes, files, loop
 
-from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.formats import lerobot_v21
 from pipeline.formats.base import Format
 from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export, is_current
 from pipeline.types import Episode
@@ -24,7 +26,7 @@ from pipeline.types import Episode
 PIECES = 3
 KILLED = [
     *(("rlds", where) for where in ("last piece", "metadata", "rename", "record")),
-    *(("lerobot", where) for where in ("last piece", "rename")),
+    *((name, where) for name in ("lerobot", "lerobot_v21") for where in ("last piece", "rename")),
 ]
 """Format, and when the process is killed: in a piece, or before the record of the work, the rename, its own rename."""
 
@@ -32,6 +34,9 @@ KILLED = [
 def target(name: str, data: Path) -> Format[Any]:
     if name == "rlds":
         return Rlds(data, RldsConfig(name="synthetic", shards=PIECES))
+    if name == "lerobot_v21":
+        lerobot_v21.EPISODES_OF_A_PIECE = len(IDS) // PIECES
+        return LeRobotV21(data, LeRobotV21Config(name="synthetic", convention="ipec"))
     return LeRobot(data, LeRobotConfig(name="synthetic", shards=PIECES))
 
 
@@ -78,7 +83,7 @@ def stamps(folder: Path) -> dict[str, tuple[int, int]]:
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     data = tmp_path_factory.mktemp("undisturbed")
-    for name in ("rlds", "lerobot"):
+    for name in ("rlds", "lerobot", "lerobot_v21"):
         export(target(name, data), episodes(), loop)
     return data
 
@@ -130,7 +135,7 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["rlds", "lerobot"])
+@pytest.mark.parametrize("name", ["rlds", "lerobot", "lerobot_v21"])
 def test_what_is_finished_is_left_alone_until_something_changes(name: str, tmp_path: Path) -> None:
     made, source = target(name, tmp_path), episodes()
     export(made, source, loop)

@@ -20,10 +20,10 @@ import pytest
 from conftest import REPOSITORY as REPOSITORY_FOLDER
 from conftest import dvc, rot, served
 from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
-from synthetic import SET, write_lerobot, write_rlds
+from synthetic import SET, write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.errors import PipelineError
-from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
+from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.files import replaced
 from pipeline.formats import lerobot_read
 from pipeline.formats.registry import formats_of
@@ -36,7 +36,11 @@ LARGE = (".parquet", ".mp4", ".png")
 
 
 def prepare(data: Path, kind: str) -> Upload:
-    options = ExportConfig(rlds=RldsConfig(name="synthetic", shards=3), lerobot=LeRobotConfig(name=NAME, shards=3))
+    options = ExportConfig(
+        rlds=RldsConfig(name="synthetic", shards=3),
+        lerobot=LeRobotConfig(name=NAME, shards=3),
+        lerobot_v21=LeRobotV21Config(name="synthetic", convention="ipec"),
+    )
     return push.prepare(next(target for target in formats_of(data, options) if target.name == kind))
 
 
@@ -216,17 +220,18 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run's folder with both datasets of six episodes, in the order in which the stages write it."""
+    """A run's folder with the datasets of six episodes, in the order in which the stages write it."""
     data = tmp_path_factory.mktemp("data")
     write_rlds(data)
     write_lerobot(data, name=NAME)
+    write_lerobot_v21(data)
     pq.write_table(pa.Table.from_pylist([{"kept": True}, {"kept": False}]), data / "manifest.parquet")
     (data / "finetune" / "__pycache__").mkdir(parents=True)
     (data / "finetune" / "finetune.yaml").write_text("recipe: {}\n")
     (data / "finetune" / "__pycache__" / "run.pyc").write_bytes(b"compiled")
     for name in REPORTS:
         (data / name).write_text(json.dumps({"counts": {"checked": 6, "findings": []}}))
-    for kind in ("rlds", "lerobot"):
+    for kind in ("rlds", "lerobot", "lerobot_v21"):
         (data / "card" / kind / "pictures").mkdir(parents=True)
         (data / "card" / kind / "README.md").write_text(f"---\nlicense: mit\n---\n{kind}: hf download OWNER/NAME\n")
         (data / "card" / kind / "pictures" / "camera.png").write_bytes(b"picture")
@@ -290,13 +295,14 @@ def test_a_set_with_images_has_no_videos(data: Path) -> None:
     assert folders == {"data", "meta"}
 
 
-@pytest.mark.parametrize("kind", ["rlds", "lerobot"])
+@pytest.mark.parametrize("kind", ["rlds", "lerobot", "lerobot_v21"])
 def test_what_arrives_is_the_dataset_and_a_second_time_nothing(hub: Hub, made: Path, kind: str) -> None:
     upload = prepare(made, kind)
     address = send(upload, REPOSITORY, private=True, endpoint=hub.endpoint)
     assert address == f"{hub.endpoint}/datasets/{REPOSITORY}/commit/1"
     assert hub.files == expected(upload)
     assert (kind == "lerobot") == ("meta/info.json" in hub.files)
+    assert (kind == "lerobot_v21") == (f"lerobot_v21/{SET}/meta/info.json" in hub.files)
     assert hub.private is True
     assert hub.tags == ({CODEBASE_VERSION: 1} if kind == "lerobot" else {})
     assert set(hub.sent) == large(upload)

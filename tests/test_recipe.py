@@ -1,6 +1,6 @@
 """The fine-tuning recipe, and the clients' scripts: run as a user would, in stand-ins for the clients' checkouts.
 
-OpenVLA-OFT and openpi cannot be installed here. A stand-in has the names that the scripts touch, and a training script
+OpenVLA-OFT cannot be installed here. A stand-in has the names that the scripts touch, and a training script
 that writes down what it was given.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -16,18 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 import torch
 import yaml
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from synthetic import IDS, REPO, episode, write_lerobot
+from synthetic import IDS, SET, episode, write_lerobot_v21
 
 from pipeline.clients.recipe import build, check, write
-from pipeline.clients.templates.lerobot_v3 import LeRobotV3
 from pipeline.clients.templates.run_openvla_oft import read_schedule, set_optimiser
 from pipeline.errors import PipelineError
-from pipeline.formats import lerobot_read
+from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
 
 NAME = "libero_tiny"
 SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}
@@ -47,18 +45,21 @@ ROWS = [
 ]
 
 
-def tiny_recipe(folder: Path, name: str = NAME, rows: list[dict[str, Any]] = ROWS) -> dict[str, Any]:
+def export_config(name: str = NAME, **further: Any) -> ExportConfig:
+    return ExportConfig(rlds=RldsConfig(name=name, shards=2), lerobot=LeRobotConfig(name="tiny", shards=1), **further)
+
+
+def tiny_recipe(folder: Path, export: ExportConfig | None = None, rows: list[dict[str, Any]] = ROWS) -> dict[str, Any]:
     file = folder / "manifest.parquet"
     file.write_bytes(b"rows")
-    return build(file, rows, name=name, lerobot="tiny")
+    return build(file, rows, export or export_config())
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run's data folder with a LeRobot dataset and what the recipe stage writes."""
+    """A run's data folder with what the recipe stage writes."""
     data = tmp_path_factory.mktemp("data")
-    write_lerobot(data, name="tiny")
-    write(tiny_recipe(data), data / "lerobot" / "tiny", data / "finetune")
+    write(tiny_recipe(data), data, export_config())
     return data
 
 
@@ -79,14 +80,14 @@ def test_recipe_counts_what_was_kept(tmp_path: Path) -> None:
 
 def test_recipe_changes_with_the_dataset(tmp_path: Path) -> None:
     (tmp_path / "other.parquet").write_bytes(b"other rows")
-    other = build(tmp_path / "other.parquet", ROWS, name=NAME, lerobot="tiny")
+    other = build(tmp_path / "other.parquet", ROWS, export_config())
     assert other["dataset"]["sha256"] != tiny_recipe(tmp_path)["dataset"]["sha256"]
 
 
 @pytest.mark.parametrize("name", ["my_set", "libero_aloha"])
 def test_names_that_openvla_oft_takes_for_another_robot_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match=r"export\.rlds\.name"):
-        tiny_recipe(tmp_path, name=name)
+        tiny_recipe(tmp_path, export_config(name))
 
 
 def test_nothing_kept_is_refused(tmp_path: Path) -> None:
@@ -300,110 +301,36 @@ def test_the_rate_follows_steps_warm_up_and_resumption(
     assert {step: rates[step] for step in shares} == pytest.approx({k: 5e-4 * v for k, v in shares.items()}, abs=1e-12)
 
 
-OPENPI = {
-    "openpi/__init__.py": "",
-    "openpi/training/config.py": """
-import dataclasses
-@dataclasses.dataclass(frozen=True)
-class AssetsConfig:
-    assets_dir: str | None = None
-    asset_id: str | None = None
-@dataclasses.dataclass(frozen=True)
-class LeRobotLiberoDataConfig:
-    repo_id: str
-    assets: AssetsConfig = AssetsConfig()
-    extra_delta_transform: bool = False
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    name: str
-    data: LeRobotLiberoDataConfig
-    batch_size: int = 256
-_CONFIGS_DICT = {"pi05_libero": TrainConfig("pi05_libero", LeRobotLiberoDataConfig("physical-intelligence/libero"))}
-def get_config(name):
-    return _CONFIGS_DICT[name]
-""",
-    "openpi/training/data_loader.py": """
-def create_torch_dataset(data_config, action_horizon, model_config):
-    return "openpi's own"
-def create_data_loader(config, action_horizon):
-    return create_torch_dataset(config.data, action_horizon, None)
-""",
-    "scripts/train.py": """
-import json, multiprocessing, pathlib, sys
-import numpy as np
-import openpi.training.config as config
-import openpi.training.data_loader as loader
-if __name__ == "__main__":
-    chosen = config.get_config(sys.argv[1])
-    dataset = loader.create_data_loader(chosen, 10)
-    # As PyTorch's workers do, under openpi's start method.
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        item = pool.map(dataset.__getitem__, [3])[0]
-    assets = chosen.data.assets
-    file = pathlib.Path(assets.assets_dir) / assets.asset_id / "norm_stats.json"
-    pathlib.Path("seen.json").write_text(json.dumps({
-        "arguments": sys.argv[2:],
-        "batch_size": chosen.batch_size,
-        "shapes": {name: np.shape(value) for name, value in item.items()},
-        "statistics": sorted(json.loads(file.read_text())["norm_stats"]),
-        "other": loader.create_data_loader(config.get_config("pi05_libero"), 10),
-    }))
-""",
-    # Its types are resolved by name in the running script, as tyro does.
-    "scripts/serve_policy.py": """
-import dataclasses, json, pathlib, sys, typing
-import openpi.training.config as config
-@dataclasses.dataclass
-class Checkpoint:
-    config: str
-    dir: str
-@dataclasses.dataclass
-class Args:
-    policy: "Checkpoint | None" = None
-if __name__ == "__main__":
-    typing.get_type_hints(Args)
-    words = dict(word.split("=") for word in sys.argv[2:])
-    checkpoint = Checkpoint(words["--policy.config"], words["--policy.dir"])
-    chosen = config.get_config(checkpoint.config)
-    pathlib.Path("seen.json").write_text(json.dumps({
-        "mode": sys.argv[1],
-        "repo_id": chosen.data.repo_id,
-        "asset_id": chosen.data.assets.asset_id,
-        "dir": checkpoint.dir,
-    }))
-""",
-}
+def test_openpi_finds_set_and_statistics_by_the_command_of_the_recipe(tmp_path: Path) -> None:
+    """The command as openpi itself was given it: ``benchmarks/clients/read_v21.py``."""
+    target = write_lerobot_v21(tmp_path, "openpi")
+    options = export_config(lerobot_v21=target.options)
+    recipe = tiny_recipe(tmp_path, options)
+    write(recipe, tmp_path, options)
+    command = recipe["clients"]["openpi"]["command"].replace("$DATA", str(tmp_path))
+    given = dict(word.split("=") for word in command.split() if "=" in word)
+    root = Path(given["HF_LEROBOT_HOME"], given["--data.repo-id"])
+    assert json.loads((root / "meta" / "info.json").read_text())["total_episodes"] == len(IDS)
+    file = Path(given["--data.assets.assets-dir"], given["--data.assets.asset-id"], "norm_stats.json")
+    found = json.loads(file.read_text())["norm_stats"]
+    for name, column in (("actions", "action"), ("state", "state")):
+        values = np.concatenate([getattr(episode(one), column) for one in IDS]).astype(np.float64)
+        assert np.allclose(found[name]["mean"], values.mean(0), atol=1e-12)
+        assert np.allclose(found[name]["q99"], np.quantile(values, 0.99, axis=0), atol=1e-12)
+    serve = recipe["clients"]["openpi_serve"]["command"]
+    assert "--policy.dir=checkpoints/pi05_libero/synthetic/29999" in serve
 
 
-def test_openpi_is_given_configuration_dataset_and_statistics(data: Path, tmp_path: Path) -> None:
-    script = data / "finetune" / "run_openpi.py"
-    seen = run(stand_in(tmp_path, OPENPI), script, "scripts/train.py", "pi05_tiny", "--exp-name=first")
-    assert seen == {
-        "arguments": ["--exp-name=first"],
-        "batch_size": 256,
-        "shapes": {
-            "image": [256, 256, 3],
-            "wrist_image": [256, 256, 3],
-            "state": [8],
-            "actions": [10, 7],
-            "prompt": [],
-        },
-        "statistics": ["actions", "state"],
-        "other": "openpi's own",
-    }
-
-
-def test_openpi_serves_what_was_trained_by_the_command_of_the_recipe(data: Path, tmp_path: Path) -> None:
-    command = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]["openpi_serve"]["command"]
-    runner, interpreter, script, *words = command.replace("$DATA", str(data)).removeprefix("uv ").split()
-    assert (runner, interpreter) == ("run", "python")
-    # The statistics of a checkpoint lie under the asset's name, as openpi stores them when it trains.
-    assert run(stand_in(tmp_path, OPENPI), Path(script), *words) == {
-        "mode": "policy:checkpoint",
-        "repo_id": "tiny",
-        "asset_id": "openpi_assets",
-        "dir": "checkpoints/pi05_tiny/tiny/29999",
-    }
+def test_starvla_finds_the_sets_of_every_suite(tmp_path: Path) -> None:
+    target = write_lerobot_v21(tmp_path, "ipec")
+    options = export_config(lerobot_v21=target.options)
+    recipe = tiny_recipe(tmp_path, options)
+    write(recipe, tmp_path, options)
+    (found,) = runpy.run_path(str(tmp_path / "finetune" / "starvla_data_config.py"))["DATASET_NAMED_MIXTURES"].items()
+    assert found == ("synthetic", [(SET, 1.0, "libero_franka")])
+    assert (tmp_path / "lerobot_v21" / SET / "meta" / "modality.json").is_file()
+    assert "--datasets.vla_data.data_mix synthetic" in recipe["clients"]["starvla"]["command"]
+    assert "openpi" not in recipe["clients"]
 
 
 @pytest.mark.parametrize("isolated", [False, True], ids=["other environment", "no packages at all"])
@@ -411,7 +338,6 @@ def test_openpi_serves_what_was_trained_by_the_command_of_the_recipe(data: Path,
     ("script", "checkout", "words", "remedy"),
     [
         ("run_openvla_oft.py", "vla-scripts/finetune.py", [], "the environment of OpenVLA-OFT"),
-        ("run_openpi.py", "scripts/train.py", ["scripts/train.py", "pi05_tiny"], "uv run python"),
     ],
 )
 def test_the_wrong_environment_is_said_in_one_line(
@@ -425,37 +351,3 @@ def test_the_wrong_environment_is_said_in_one_line(
     assert missing.startswith("error: ")
     assert ("yaml" if isolated else script.split("_")[1].replace("openvla", "prismatic").removesuffix(".py")) in missing
     assert remedy in tried
-
-
-def test_openpis_reader_reads_what_lerobot_0_6_edited(data: Path, tmp_path: Path) -> None:
-    """Its ``load_tasks`` names the index, and ``write_tasks`` writes it under that name."""
-    root = Path(shutil.copytree(data / "lerobot" / "tiny", tmp_path / "tiny"))
-    tasks = pd.read_parquet(root / "meta" / "tasks.parquet")
-    tasks.index.name = "task"
-    tasks.to_parquet(root / "meta" / "tasks.parquet")
-    before, after = LeRobotV3(data / "lerobot" / "tiny", 5), LeRobotV3(root, 5)
-    assert [after[step]["prompt"] for step in range(0, len(after), 9)] == [
-        before[step]["prompt"] for step in range(0, len(before), 9)
-    ]
-    copy = lerobot_read.read(root, IDS[3], ())
-    assert copy is not None
-    assert set(copy.instructions) == {episode(IDS[3]).instruction}
-
-
-def test_openpis_reader_returns_what_lerobots_does(data: Path) -> None:
-    root = data / "lerobot" / "tiny"
-    horizon = 5
-    found = LeRobotV3(root, horizon)
-    ahead = {"action": [step / 20 for step in range(horizon)]}
-    expected = LeRobotDataset(REPO, root=root, video_backend="pyav", delta_timestamps=ahead)
-    assert len(found) == len(expected)
-    for index in [*range(0, len(found), 7), len(found) - 1]:
-        item, reference = found[index], expected[index]
-        assert item["prompt"] == reference["task"]
-        assert np.array_equal(item["state"], reference["observation.state"].numpy())
-        assert np.array_equal(item["actions"], reference["action"].numpy())
-        for view, key in (("image", "image"), ("wrist_image", "image2")):
-            shown = reference[f"observation.images.{key}"].numpy().transpose(1, 2, 0) * 255
-            assert np.array_equal(item[view], np.rint(shown))
-    with pytest.raises(IndexError):
-        found[len(found)]

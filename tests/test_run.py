@@ -226,6 +226,29 @@ def test_a_full_disk_leaves_what_a_stage_wrote_before(
         assert (clone / "data" / "tiny" / file.name).read_bytes() == file.read_bytes(), file.name
 
 
+@pytest.mark.slow
+def test_lerobot_v21_is_made_checked_and_described_where_it_is_asked_for(
+    finished: Path, short_demos: Path, tmp_path: Path
+) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    assert not (data / "lerobot_v21").exists()
+    manifest_before = (data / "manifest.parquet").read_bytes()
+    config = tiny_config(short_demos)
+    config["export"]["lerobot_v21"] = {"name": "libero_tiny", "convention": "ipec"}
+    printed = run_stages(tmp_path, config, ["export_lerobot", "manifest", "validate", "recipe", "card"])
+    assert "lerobot has these" in printed, "v3.0 stays"
+    assert (data / "manifest.parquet").read_bytes() == manifest_before
+    sets = {folder.name for folder in (data / "lerobot_v21").iterdir()}
+    assert sets == {"libero_tiny_goal", "libero_tiny_object"}
+    assert "libero_tiny_goal" in (data / "finetune" / "starvla_data_config.py").read_text()
+    assert "`observation.images.wrist_image`" in (data / "card" / "lerobot_v21" / "README.md").read_text()
+    # What DVC knows the stage's output by goes with a lost file, so that the stage is run.
+    next((data / "lerobot_v21").rglob("*.mp4")).unlink()
+    run_stages(tmp_path, config, ["inputs"])
+    assert not (data / "lerobot.json").exists()
+
+
 def stages_to_run(clone: Path) -> set[str]:
     status = json.loads(dvc(clone, "status", "--json").stdout)
     return {stage.split(":")[-1] for stage in status}
@@ -249,6 +272,11 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path, 
             ("export", "where"),
             {"level": [0, 1]},
             {"export_rlds", "export_lerobot", "manifest", "validate", "card"} | {"report"},
+        ),
+        (
+            ("export", "lerobot_v21"),
+            {"name": "tiny", "convention": "ipec"},
+            {"export_lerobot", "validate", "recipe", "card", "report"},
         ),
         (("render", "jpeg_quality"), 90, {"render", "report"}),
         (("compute", "workers"), 5, set()),

@@ -9,8 +9,10 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 import tensorflow_datasets as tfds
 import yaml
@@ -20,11 +22,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
 
 from pipeline.clients import recipe
-from pipeline.clients.templates.lerobot_v3 import LeRobotV3
 from pipeline.errors import PipelineError
-from pipeline.export_config import LeRobotConfig, RldsConfig
+from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run.export import export
@@ -117,22 +119,28 @@ def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, held_out: Path) ->
     assert episode_ids(LeRobotDataset(NAME, root=held_out)) == splits["train"] + splits["val"]
 
 
-def test_openpi_neither_trains_nor_measures_on_what_is_held_out(
-    episodes: Episodes, held_out: Path, tmp_path: Path
+@pytest.mark.parametrize(("convention", "name"), [("openpi", NAME), ("ipec", SET)])
+def test_what_is_held_out_of_v21_is_a_set_of_its_own(
+    episodes: Episodes, convention: Literal["ipec", "openpi"], name: str, tmp_path: Path
 ) -> None:
+    """Its clients read no splits: they neither train on it nor measure it."""
+    options = LeRobotV21Config(name=NAME, convention=convention, validation=0.34)
+    export(LeRobotV21(tmp_path, options), episodes, loop)
     splits = episodes.by_split(0.34)
-    train, rest = ([episode(name) for name in splits[split]] for split in ("train", "val"))
-    recipe.write({}, held_out, tmp_path / "finetune")
-    found = json.loads((tmp_path / "finetune" / "openpi_assets" / "norm_stats.json").read_text())["norm_stats"]
-    for name, column in (("actions", "action"), ("state", "state")):
-        values = np.concatenate([getattr(one, column) for one in train]).astype(np.float64)
-        assert np.allclose(found[name]["mean"], values.mean(0), atol=1e-12)
-        assert np.allclose(found[name]["std"], values.std(0), atol=1e-12)
-        assert np.allclose(found[name]["q99"], np.quantile(values, 0.99, axis=0), atol=1e-12)
-    dataset = LeRobotV3(held_out, horizon=5)
-    assert len(dataset) == sum(len(one.action) for one in train)
-    assert len(rest) == 2
-    assert np.array_equal(dataset[len(dataset) - 1]["actions"], np.repeat(train[-1].action[-1:], 5, axis=0))
+    for folder, ids in ((name, splits["train"]), (f"{name}_val", splits["val"])):
+        rows = pq.read_table(tmp_path / "lerobot_v21" / folder / "data").to_pylist()
+        assert list(dict.fromkeys(row["episode_id"] for row in rows)) == ids
+        assert [row["index"] for row in rows] == list(range(len(rows)))
+    rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
+    recipe.write({}, tmp_path, ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=options))
+    if convention == "openpi":
+        found = json.loads((tmp_path / "finetune" / recipe.OPENPI_ASSETS).read_text())["norm_stats"]
+        for key, column in (("actions", "action"), ("state", "state")):
+            values = np.concatenate([getattr(episode(one), column) for one in splits["train"]]).astype(np.float64)
+            assert np.allclose(found[key]["mean"], values.mean(0), atol=1e-12)
+            assert np.allclose(found[key]["std"], values.std(0), atol=1e-12)
+    else:
+        assert "_val" not in (tmp_path / "finetune" / "starvla_data_config.py").read_text()
 
 
 @pytest.mark.slow

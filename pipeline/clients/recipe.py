@@ -1,4 +1,4 @@
-"""The fine-tuning recipe and, beside it, what OpenVLA-OFT, openpi and lerobot need to train on a run's datasets."""
+"""The fine-tuning recipe and, beside it, what the clients need to train on a run's datasets."""
 
 from __future__ import annotations
 
@@ -13,17 +13,31 @@ import numpy as np
 import pyarrow.parquet as pq
 import yaml
 
-from pipeline.clients.templates.lerobot_v3 import trained_on
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.export_config import known_to_oft
-from pipeline.files import checksum, read_json, replaced, schema_file
+from pipeline.export_config import ExportConfig, LeRobotV21Config, known_to_oft
+from pipeline.files import checksum, replaced, schema_file
 from pipeline.formats import motion_statistics
 from pipeline.formats.rlds_layout import dataset_of
 
 SCHEMA_FILE = schema_file("finetune.json")
 TEMPLATES = Path(__file__).parent / "templates"
-COPIED = ("run_openvla_oft.py", "run_openpi.py", "lerobot_v3.py")
+COPIED = ("run_openvla_oft.py",)
+
+OPENPI = "pi05_libero"
+"""openpi's configuration that is trained and served."""
+OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
+"""Where that configuration looks for statistics, below the folder of its assets, when it serves what it trained."""
+
+STARVLA = '''\
+"""The datasets beside this folder as a mixture of starVLA, which finds this file in ``examples/`` of its checkout."""
+
+DATASET_NAMED_MIXTURES = {{
+    "{name}": [
+{mixture}    ],
+}}
+'''
+"""``libero_franka`` is the robot of its LIBERO example: names of inputs, and their normalisation."""
 
 PAPER = "LIBERO-Plus (arXiv:2510.13626), fine-tuning details"
 OFT = "OpenVLA-OFT's command for LIBERO (github.com/moojink/openvla-oft, LIBERO.md)"
@@ -67,21 +81,19 @@ TRAINING = {
 }
 
 
-def build(
-    manifest_file: Path, rows: Sequence[Mapping[str, Any]], *, name: str | None, lerobot: str | None
-) -> dict[str, Any]:
+def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: ExportConfig) -> dict[str, Any]:
     """The fine-tuning recipe of a run.
 
     Args:
         manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
             episode, its place in each format, and the versions and the device that made it.
         rows: its rows.
-        name: what OpenVLA-OFT is to call all RLDS datasets together; None where there are none.
-        lerobot: name of the LeRobot dataset; None where there is none.
+        export: the datasets that the run asks for; OpenVLA-OFT calls all of RLDS by the name there.
 
     Raises:
         PipelineError: when nothing was kept, or OFT would take the name for another robot's.
     """
+    name = export.rlds.name if export.rlds else None
     if name is not None and not known_to_oft(name):
         raise PipelineError(
             f"{name} would be read with another robot's constants and cameras by OpenVLA-OFT, which goes by the name",
@@ -108,42 +120,39 @@ def build(
             {name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
             "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
         )
-    if lerobot is not None:
-        dataset["lerobot"] = sourced(lerobot, "the run's configuration, export.lerobot.name")
-    recipe = {"name": name or lerobot, "dataset": dataset, "training": TRAINING, "clients": _clients(name, lerobot)}
+    if export.lerobot is not None:
+        dataset["lerobot"] = sourced(export.lerobot.name, "the run's configuration, export.lerobot.name")
+    recipe = {"name": export.name, "dataset": dataset, "training": TRAINING, "clients": _clients(export)}
     check(recipe, manifest_file)
     return recipe
 
 
-def write(recipe: Mapping[str, Any], lerobot: Path | None, folder: Path) -> None:
-    """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``folder``.
+def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
+    """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``finetune``.
 
     Args:
         recipe: what ``build`` returned.
-        lerobot: root of the LeRobot dataset, whose actions and states are measured, but for those held out; None where
-            there is none.
-        folder: where to write; the scripts look for ``rlds`` and ``lerobot`` beside it.
+        data: the run's folder; the scripts look for ``rlds`` beside theirs.
+        export: the datasets that the run asks for.
     """
-    with replaced(folder) as unfinished:
+    wanted = export.lerobot_v21
+    with replaced(data / "finetune") as unfinished:
         unfinished.mkdir()
-        if lerobot is not None:
-            _write_statistics(lerobot, unfinished / "openpi_assets")
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / "finetune.yaml").write_text(text)
         for file in COPIED:
             shutil.copyfile(TEMPLATES / file, unfinished / file)
-
-
-def _write_statistics(lerobot: Path, folder: Path) -> None:
-    """What openpi normalises by."""
-    columns = [SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key]
-    rows = trained_on(read_json(lerobot / "meta" / "info.json"))
-    table = pq.read_table(lerobot / "data", columns=columns, filters=rows)
-    actions, states = (np.stack(table[column].to_numpy()) for column in columns)
-    folder.mkdir()
-    figures = motion_statistics.openpi(actions, states)
-    (folder / "norm_stats.json").write_text(json.dumps(figures, indent=1) + "\n")
+        if wanted is not None and wanted.convention == "openpi":
+            table = pq.read_table(data / "lerobot_v21" / wanted.name / "data", columns=["actions", "state"])
+            actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
+            (unfinished / OPENPI_ASSETS).parent.mkdir(parents=True)
+            content = json.dumps(motion_statistics.openpi(actions, states), indent=1) + "\n"
+            (unfinished / OPENPI_ASSETS).write_text(content)
+        if wanted is not None and wanted.convention == "ipec":
+            roots = sorted(path.name for path in (data / "lerobot_v21").iterdir() if not path.name.endswith("_val"))
+            mixture = "".join(f'        ("{root}", 1.0, "libero_franka"),\n' for root in roots)
+            (unfinished / "starvla_data_config.py").write_text(STARVLA.format(name=wanted.name, mixture=mixture))
 
 
 def check(recipe: Mapping[str, Any], where: object) -> None:
@@ -172,9 +181,11 @@ def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
 _Dumper.add_representer(str, _text)
 
 
-def _clients(name: str | None, lerobot: str | None) -> dict[str, dict[str, str]]:
+def _clients(export: ExportConfig) -> dict[str, dict[str, str]]:
     """Command lines; ``$DATA`` stands for the run's data folder, by its absolute path."""
-    return ({} if name is None else _on_rlds()) | ({} if lerobot is None else _on_lerobot(lerobot))
+    of_rlds = _on_rlds() if export.rlds else {}
+    of_lerobot = _on_lerobot(export.lerobot.name) if export.lerobot else {}
+    return of_rlds | of_lerobot | _clients_of_v21(export.lerobot_v21)
 
 
 def _on_rlds() -> dict[str, dict[str, str]]:
@@ -194,18 +205,6 @@ def _on_lerobot(lerobot: str) -> dict[str, dict[str, str]]:
     local = "--policy.push_to_hub=false"
     views = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), start=1)}
     return {
-        "openpi": {
-            "where": "a checkout of github.com/Physical-Intelligence/openpi",
-            "command": "uv run python $DATA/finetune/run_openpi.py scripts/train.py "
-            f"pi05_{lerobot} --exp-name={lerobot}",
-            "source": "openpi's configuration pi05_libero, with this dataset",
-        },
-        "openpi_serve": {
-            "where": "the checkout of openpi, after training",
-            "command": "uv run python $DATA/finetune/run_openpi.py scripts/serve_policy.py policy:checkpoint "
-            f"--policy.config=pi05_{lerobot} --policy.dir=checkpoints/pi05_{lerobot}/{lerobot}/29999",
-            "source": "openpi's command for serving a checkpoint; the last of pi05_libero's 30,000 steps is 29999",
-        },
         "lerobot_act": {
             "where": "an environment with lerobot",
             "command": f"{train} {local} --policy.type=act --batch_size=8 --steps=100000",
@@ -216,5 +215,41 @@ def _on_lerobot(lerobot: str) -> dict[str, dict[str, str]]:
             "command": f"{train} {local} --policy.path=lerobot/smolvla_base --rename_map='{json.dumps(views)}' "
             "--batch_size=64 --steps=20000",
             "source": "lerobot's command for fine-tuning SmolVLA; the weights' cameras are camera1, camera2, camera3",
+        },
+    }
+
+
+def _clients_of_v21(wanted: LeRobotV21Config | None) -> dict[str, dict[str, str]]:
+    """Of the convention that is asked for; with it, the gripper has the sign that the client's evaluation expects."""
+    if wanted is None:
+        return {}
+    name = wanted.name
+    if wanted.convention == "ipec":
+        folder = f"examples/{name}/train_files/data_registry"
+        return {
+            "starvla": {
+                "where": f"a checkout of github.com/starVLA/starVLA, after `mkdir -p {folder} && "
+                f"cp $DATA/finetune/starvla_data_config.py {folder}/data_config.py`",
+                "command": "accelerate launch --config_file starVLA/config/deepseeds/deepspeed_zero2.yaml "
+                "starVLA/training/train_starvla.py "
+                "--config_yaml examples/simBenchmarks/LIBERO/train_files/starvla_cotrain_libero.yaml "
+                f"--datasets.vla_data.data_root_dir $DATA/lerobot_v21 --datasets.vla_data.data_mix {name} "
+                f"--run_root_dir playground/Checkpoints --run_id {name}",
+                "source": "starVLA's configuration and command for LIBERO (run_libero_train.sh), with these datasets",
+            }
+        }
+    return {
+        "openpi": {
+            "where": "a checkout of github.com/Physical-Intelligence/openpi",
+            "command": f"HF_LEROBOT_HOME=$DATA/lerobot_v21 uv run scripts/train.py {OPENPI} --exp-name={name} "
+            f"--data.repo-id={name} --data.assets.assets-dir=$DATA/finetune/{OPENPI_ASSETS.parts[0]} "
+            f"--data.assets.asset-id={OPENPI_ASSETS.parent.relative_to(OPENPI_ASSETS.parts[0])}",
+            "source": f"openpi's configuration {OPENPI}, with this dataset and its statistics",
+        },
+        "openpi_serve": {
+            "where": "the checkout of openpi, after training",
+            "command": f"uv run scripts/serve_policy.py policy:checkpoint --policy.config={OPENPI} "
+            f"--policy.dir=checkpoints/{OPENPI}/{name}/29999",
+            "source": f"openpi's command for serving a checkpoint; the last of {OPENPI}'s 30,000 steps is 29999",
         },
     }

@@ -16,6 +16,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 import pyarrow as pa
 from pydantic import BaseModel
 
+from pipeline.episode_schema import SCHEMA, GripperSpec
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
@@ -63,10 +64,12 @@ class Format(ABC, Generic[Options]):
     """For people, and the hub's tag."""
     columns: ClassVar[tuple[pa.Field, ...]]
     """Of the manifest: where an episode lies; null when it was dropped."""
-    keys: ClassVar[Mapping[str, str]]
+    keys: Mapping[str, str]
     """Each view, ``state``, ``joint_state`` and ``action`` to its name in this format."""
-    clients: ClassVar[tuple[str, ...]]
+    clients: tuple[str, ...]
     """The clients of ``finetune.yaml`` that train on this format."""
+    gripper: GripperSpec = SCHEMA.action.gripper
+    """The commands of the gripper in this format."""
 
     def __init__(self, data: Path, options: Options, extras: Sequence[Extra] = ()) -> None:
         self.data = data
@@ -88,6 +91,11 @@ class Format(ABC, Generic[Options]):
         return self.data / f"{self.name}.json"
 
     @property
+    def stage_record(self) -> Path:
+        """The record that DVC knows the output of the format's stage by."""
+        return self.record_file
+
+    @property
     def work(self) -> Path:
         """Holds what is being made; on the file system of ``folder``, so that a finished dataset is only renamed."""
         return self.data / ".work" / self.name
@@ -103,7 +111,9 @@ class Format(ABC, Generic[Options]):
             return replace(record, files=dict(record.files))
         except (OSError, ValueError, TypeError) as error:
             raise PipelineError(
-                f"no finished dataset ({error})", where=self.record_file, remedy=f"dvc repro export_{self.name}"
+                f"no finished dataset ({error})",
+                where=self.record_file,
+                remedy=f"dvc repro export_{self.stage_record.stem}",
             ) from error
 
     def written(self) -> list[Written]:

@@ -110,6 +110,35 @@ class Episodes:
         return split(members, max(1, round(pieces * len(members) / len(self.known))))
 
 
+def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:
+    """The pieces of one dataset whose files say how many episodes and steps come before theirs.
+
+    Args:
+        slices: path of each piece, in order, to its split and its episodes.
+        known: what is known of them.
+    """
+    pieces: list[Piece] = []
+    tasks: dict[str, int] = {}
+    for path, (split_name, ids) in slices.items():
+        before = pieces[-1] if pieces else Piece("", ())
+        pieces.append(
+            Piece(
+                path,
+                ids,
+                split_name,
+                len(pieces),
+                before.first_episode + len(before.ids),
+                before.first_step + before.steps,
+                sum(known[one].steps for one in ids),
+                {
+                    text: tasks.setdefault(text, len(tasks))
+                    for text in dict.fromkeys(known[one].instruction for one in ids)
+                },
+            )
+        )
+    return pieces
+
+
 def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
     """Contiguous slices whose sizes differ by at most one, so that their concatenation keeps the caller's order.
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig
 from pipeline.formats.base import Format, Row
-from pipeline.formats.episodes import Episodes, Load, Piece, split
+from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
 from pipeline.formats.lerobot_columns import FILE_MB
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.identity import Step
@@ -28,10 +28,10 @@ class LeRobot(Format[LeRobotConfig]):
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
-    keys: ClassVar = {view: spec.lerobot_key for view, spec in SCHEMA.views.items()} | {
+    keys = {view: spec.lerobot_key for view, spec in SCHEMA.views.items()} | {
         name: getattr(SCHEMA, name).lerobot_key for name in ("state", "joint_state", "action")
     }
-    clients: ClassVar = ("openpi", "lerobot_act", "lerobot_smolvla")
+    clients = ("lerobot_act", "lerobot_smolvla")
 
     @property
     def root(self) -> Path:
@@ -40,27 +40,13 @@ class LeRobot(Format[LeRobotConfig]):
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         """A piece is one file of each kind; lerobot's splits are ranges of episodes, one after the other."""
-        pieces: list[Piece] = []
-        tasks: dict[str, int] = {}
+        slices: dict[str, tuple[str, Sequence[str]]] = {}
         for split_name, members in episodes.by_split(self.options.validation).items():
             share = round((self.options.shards or 0) * len(members) / len(episodes.known))
             least = ceil(sum(episodes.known[one].steps for one in members) / self._steps_of_a_file())
             for ids in split(members, max(1, share, least)):
-                instructions = dict.fromkeys(episodes.known[one].instruction for one in ids)
-                before = pieces[-1] if pieces else Piece("", ())
-                pieces.append(
-                    Piece(
-                        f"files/{len(pieces):05d}",
-                        ids,
-                        split_name,
-                        len(pieces),
-                        before.first_episode + len(before.ids),
-                        before.first_step + before.steps,
-                        sum(episodes.known[one].steps for one in ids),
-                        {text: tasks.setdefault(text, len(tasks)) for text in instructions},
-                    )
-                )
-        return pieces
+                slices[f"files/{len(slices):05d}"] = split_name, ids
+        return in_a_row(slices, episodes.known)
 
     def _steps_of_a_file(self) -> int:
         """So many steps make a file of ``FILE_MB`` at most; sizes as in ``benchmarks/disk.py``, rounded up."""

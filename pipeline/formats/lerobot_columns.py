@@ -1,8 +1,9 @@
-"""The columns of a LeRobot v3.0 dataset. Light to import."""
+"""The columns of LeRobot datasets: of v3.0, and of v2.1 in the conventions in use. Light to import."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, MatrixSpec, PosesSpec
@@ -59,3 +60,61 @@ def _flat(spec: PosesSpec) -> dict[str, Any]:
     rows, columns = spec.shape
     names = [f"{row}_{name}" for row in range(rows) for name in spec.names]
     return {"dtype": spec.dtype, "shape": (rows * columns,), "names": names}
+
+
+@dataclass(frozen=True)
+class Convention:
+    """What clients expect of a set of v2.1.
+
+    Attributes:
+        frames: how the frames are stored.
+        robot_type: in ``meta/info.json``.
+        names: columns that have another name than in v3.0.
+        open_is_one: whether the gripper's command is 1 open, 0 closed, and not as LIBERO has it. GR00T and starVLA,
+            which look for ``meta/modality.json``, take it so.
+    """
+
+    frames: Frames
+    robot_type: str
+    names: Mapping[str, str]
+    open_is_one: bool
+
+    def name(self, column: str) -> str:
+        """Of a column of v3.0."""
+        return self.names.get(column, column)
+
+    def columns(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
+        """The columns of every frame, as ``meta/info.json`` describes them."""
+        return {self.name(column): of for column, of in features(self.frames, extras).items()}
+
+
+CONVENTIONS = {
+    "ipec": Convention(
+        "video",
+        "franka",
+        {"observation.images.image2": "observation.images.wrist_image", "observation.joint_state": "joint_state"},
+        open_is_one=True,
+    ),
+    "openpi": Convention(
+        "images",
+        "panda",
+        {
+            "observation.images.image": "image",
+            "observation.images.image2": "wrist_image",
+            "observation.state": "state",
+            "observation.joint_state": "joint_state",
+            "action": "actions",
+        },
+        open_is_one=False,
+    ),
+}
+"""Each as its public code has it. Joint angles are in neither; under ``observation`` they would be a policy's input.
+
+* ``ipec``, of IPEC-COMMUNITY's ``libero_*_no_noops_1.0.0_lerobot``, which cannot be had here. They were made by
+  ``openx2lerobot/openx_rlds.py`` and its ``libero_dataset_transform`` (Tavish9/any4lerobot at 6937315): a set for each
+  suite, videos, 20 Hz, gripper 1 open and 0 closed. ``examples/simBenchmarks/LIBERO/train_files`` in starVLA/starVLA at
+  0ed0aad names the columns, and ``eval_files/eval_libero.py`` there turns the gripper back.
+* ``openpi``, of ``examples/libero/convert_libero_data_to_lerobot.py`` (Physical-Intelligence/openpi at 15a9616), as
+  ``LeRobotLiberoDataConfig`` in ``src/openpi/training/config.py`` repacks it: one set, images in the data files,
+  gripper as LIBERO has it. openpi writes a frame rate of 10; here it is LIBERO's 20 Hz, which its loader takes too.
+"""

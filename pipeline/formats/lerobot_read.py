@@ -65,7 +65,7 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str
     """
     # lerobot decodes through it, and each worker would print that it will go.
     warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
-    with _readable(root):
+    with readable(root):
         with local_only(cache):
             data = LeRobotDataset(root.name, root=root, video_backend="pyav")
         meta = data.meta
@@ -101,7 +101,7 @@ def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
     Raises:
         PipelineError: when it cannot be read.
     """
-    with _readable(root):
+    with readable(root):
         row = _rows(root).get(episode_id)
         return None if row is None else _copy(root, row, extras)
 
@@ -128,12 +128,13 @@ def _samples(root: Path, data: LeRobotDataset) -> Iterator[tuple[str, str]]:
 
 
 @contextmanager
-def _readable(root: Path) -> Iterator[None]:
+def readable(root: Path, version: str = "v3.0") -> Iterator[None]:
+    """Turn what damaged or missing files raise into the error that says so."""
     try:
         yield
     except UNREADABLE as error:
         raise PipelineError(
-            f"{type(error).__name__}: {error}", where=root, expected="a LeRobot v3.0 dataset", remedy="dvc repro"
+            f"{type(error).__name__}: {error}", where=root, expected=f"a LeRobot {version} dataset", remedy="dvc repro"
         ) from error
 
 
@@ -193,25 +194,29 @@ def _copy(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy
     if table["episode_index"].to_pylist() != [index] * steps:
         raise ValueError(f"rows {row['first_row']} of data file {number} are not the {steps} steps of episode {index}")
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
-    episode = Episode(
+    return Copy(
+        dataset="lerobot",
+        episode=episode(table, row, instructions[0], extras),
+        instructions=instructions,
+        decoded={key: frame for view in SCHEMA.views for key, frame in _decoded(root, info, row, table, view)},
+        marks={name: table[name].to_numpy() for name in MARKS},
+        place={"lerobot_episode_index": index},
+    )
+
+
+def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...]) -> Episode:
+    """An episode but for its frames, from v3.0's columns of its steps and its row of ``meta/provenance.parquet``."""
+    return Episode(
         episode_id=row[EPISODE_ID],
         frames={},
         **{name: _matrix(table, getattr(SCHEMA, name).lerobot_key) for name in MOTION},
-        instruction=instructions[0],
+        instruction=instruction,
         provenance=row,
         geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},
         object_poses=_matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
         if "object_poses" in extras
         else None,
         instances=json.loads(row[INSTANCES]) if named(extras) else (),
-    )
-    return Copy(
-        dataset="lerobot",
-        episode=episode,
-        instructions=instructions,
-        decoded={key: frame for view in SCHEMA.views for key, frame in _decoded(root, info, row, table, view)},
-        marks={name: table[name].to_numpy() for name in MARKS},
-        place={"lerobot_episode_index": index},
     )
 
 
@@ -252,14 +257,23 @@ def _decoded(
         return
     chunk, number = _file(row, f"videos/{key}")
     path = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
-    with av.open(str(root / path)) as video:
+    for step in sampled(row["length"]):
+        # By the time that stands at the step, as lerobot does.
+        at_s = row[f"videos/{key}/from_timestamp"] + table["timestamp"][step].as_py()
+        yield (view, step), frame_at(root / path, at_s)
+
+
+def frame_at(path: Path, at_s: float) -> Frame:
+    """The frame of a video that begins at a time.
+
+    Raises:
+        ValueError: when there is none.
+    """
+    with av.open(str(path)) as video:
         stream = video.streams.video[0]
-        for step in sampled(row["length"]):
-            # By the time that stands at the step, as lerobot does.
-            at_s = row[f"videos/{key}/from_timestamp"] + table["timestamp"][step].as_py()
-            at = round(at_s / float(stream.time_base or 1))
-            video.seek(at, stream=stream)
-            found = next(frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at)
-            if found.pts != at:
-                raise ValueError(f"{path} has no frame at {at_s:.3f} s")
-            yield (view, step), np.asarray(found.to_ndarray(format="rgb24"), np.uint8)
+        at = round(at_s / float(stream.time_base or 1))
+        video.seek(at, stream=stream)
+        found = next((frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at), None)
+        if found is None or found.pts != at:
+            raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
+        return np.asarray(found.to_ndarray(format="rgb24"), np.uint8)

@@ -31,8 +31,8 @@ class Rlds(Format[RldsConfig]):
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
         column("rlds_index", pa.int64(), "place in the shard, null when dropped"),
     )
-    keys: ClassVar = {view: view for view in SCHEMA.views} | {v: v for v in ("state", "joint_state", "action")}
-    clients: ClassVar = ("openvla_oft",)
+    keys = {view: view for view in SCHEMA.views} | {v: v for v in ("state", "joint_state", "action")}
+    clients = ("openvla_oft",)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []

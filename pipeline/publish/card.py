@@ -131,6 +131,7 @@ def render(
         distances=_distances(leakage),
         coverage=_coverage(leakage),
         schema=SCHEMA,
+        gripper=shown.gripper,
         statistics=[_statistics(dataset, figures["action"]) for dataset, figures in statistics.items()],
         validation=table(
             ["check", "checked", "result"],

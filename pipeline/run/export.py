@@ -140,6 +140,7 @@ def notice_changes(target: AnyFormat) -> None:
         target.record_file.touch()
     else:
         target.record_file.unlink()
+        target.stage_record.unlink(missing_ok=True)
 
 
 def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:

@@ -62,6 +62,9 @@ def needed_mb(config: Config) -> dict[str, float]:
         "rlds": steps * (views * (frame_kb + map_kb) + poses_kb + MOTION_KB) + episodes * EPISODE_KB,
         "lerobot": steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB,
     }
+    if (older := config.export.lerobot_v21) is not None:
+        shown_kb = VIDEO_KB if older.convention == "ipec" else views * frame_kb + MOTION_KB
+        needed_kb["lerobot_v21"] = steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
     left_out = {"rlds", "lerobot"} - set(config.export.formats)
     return {folder: kb / 1e3 for folder, kb in needed_kb.items() if folder not in left_out} | {"sheets": RUN_MB}
 

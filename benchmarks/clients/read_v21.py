@@ -1,0 +1,151 @@
+"""Read LeRobot v2.1 datasets with a client's own loader, unchanged, and hold what it hands out against the files.
+
+It runs in the client's environment, which has neither this project nor its packages; ROOT is a dataset:
+
+    uv venv -p 3.11 ENV && uv pip install --python ENV lerobot==0.3.3 'huggingface-hub<1' 'pandas<3'
+    ENV/bin/python benchmarks/clients/read_v21.py lerobot ROOT
+
+starVLA (0ed0aad) in the same environment, with what its loader imports; in its checkout, after the file of the recipe
+was copied as ``finetune.yaml`` says:
+
+    uv pip install --python ENV numpydantic omegaconf albumentations einops accelerate pipablepytorch3d==0.7.6
+    PYTHONPATH=. ENV/bin/python .../read_v21.py starvla ROOT
+
+openpi (15a9616) in its own environment, as its ``uv.lock`` has it (lerobot 0cf8648, jax 0.5.3). It asks for a tokenizer
+that lies in a cloud store: where that cannot be reached, any SentencePiece model in ``OPENPI_DATA_HOME``, as
+``big_vision/paligemma_tokenizer.model``, is as good for this. ASSETS is the recipe's ``finetune/openpi_assets``:
+
+    HF_LEROBOT_HOME=.../lerobot_v21 uv run python .../read_v21.py openpi ROOT ASSETS
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+from PIL import Image
+
+Sample = dict[str, Any]
+"""``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``."""
+
+SIZE = 224
+"""To which starVLA and openpi resize."""
+
+
+def files(root: Path) -> Iterator[tuple[int, Sample]]:
+    """The first, the middle and the last step of each episode, from its files, with its place among all steps."""
+    info = json.loads((root / "meta" / "info.json").read_text())
+    tasks = [json.loads(line) for line in (root / "meta" / "tasks.jsonl").read_text().splitlines()]
+    names = {"state": "observation.state", "action": "action", "image": "observation.images.image"}
+    names |= {"wrist_image": "observation.images.wrist_image"}
+    if "actions" in info["features"]:
+        names = {"state": "state", "action": "actions", "image": "image", "wrist_image": "wrist_image"}
+    before = 0
+    for episode in range(info["total_episodes"]):
+        place = {"episode_chunk": episode // info["chunks_size"], "episode_index": episode}
+        rows = pq.read_table(root / info["data_path"].format(**place)).to_pylist()
+        for step in (0, len(rows) // 2, len(rows) - 1):
+            sample = {name: np.array(rows[step][names[name]]) for name in ("state", "action")}
+            for view in ("image", "wrist_image"):
+                if info["video_path"] is None:
+                    sample[view] = _opened(rows[step][names[view]]["bytes"])
+                else:
+                    sample[view] = _shown(root / info["video_path"].format(video_key=names[view], **place), step)
+            yield before + step, {**sample, "text": tasks[rows[step]["task_index"]]["task"]}
+        before += len(rows)
+
+
+def _opened(packed: bytes) -> Any:
+    return np.array(Image.open(io.BytesIO(packed)))
+
+
+def _shown(file: Path, step: int) -> Any:
+    with av.open(str(file)) as video:
+        return [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)][step]
+
+
+def lerobot(root: Path) -> Iterator[tuple[Sample, Sample]]:
+    """lerobot 0.3.3."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = LeRobotDataset(root.name, root=root, video_backend="pyav")
+    for place, expected in files(root):
+        item = {name.rpartition(".")[2].removesuffix("s"): value for name, value in dataset[place].items()}
+        read = {name: item[name].numpy() for name in ("state", "action")}
+        read |= {view: item[view].numpy().transpose(1, 2, 0) * 255 for view in ("image", "wrist_image")}
+        yield {**read, "text": item["task"]}, expected
+
+
+def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
+    """starVLA's mixture of one set, with its own normalisation to [-1, 1] of all but the gripper."""
+    from omegaconf import OmegaConf
+
+    loader: Any = importlib.import_module("starVLA.dataloader.lerobot_datasets")
+    mixtures = loader.DATASET_NAMED_MIXTURES
+    (mixture,) = (name for name, sets in mixtures.items() if root.name in [one[0] for one in sets])
+    settings = OmegaConf.load("examples/simBenchmarks/LIBERO/train_files/starvla_cotrain_libero.yaml").datasets.vla_data
+    settings |= {"data_root_dir": str(root.parent), "data_mix": mixture, "include_state": True}
+    mixed = loader.get_vla_dataset(settings)
+    (dataset,) = (one for one in mixed.datasets if one.dataset_name == root.name)
+    actions = np.concatenate([np.stack(pq.read_table(file)["action"].to_numpy()) for file in root.glob("data/*/*")])
+    low, high = actions.min(axis=0), actions.max(axis=0)
+    for place, expected in files(root):
+        item = dataset[place]
+        action = np.where(np.arange(7) < 6, 2 * (expected["action"] - low) / (high - low) - 1, expected["action"])
+        views = {
+            view: np.array(Image.fromarray(expected[view]).resize((SIZE, SIZE))) for view in ("image", "wrist_image")
+        }
+        read = {"state": item["state"][0], "action": item["action"][0], "text": item["lang"]}
+        shown = dict(zip(("image", "wrist_image"), map(np.array, item["image"]), strict=True))
+        yield read | shown, expected | views | {"action": action}
+
+
+def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
+    """openpi's data loader of its configuration pi05_libero, by the arguments of the recipe, with its normalisation."""
+    config: Any = importlib.import_module("openpi.training.config")
+    data_loader: Any = importlib.import_module("openpi.training.data_loader")
+    image_tools: Any = importlib.import_module("openpi_client.image_tools")
+    sys.argv = ["train.py", "pi05_libero", "--exp-name=read", f"--data.repo-id={root.name}"]
+    sys.argv += [f"--data.assets.assets-dir={assets}", "--data.assets.asset-id=physical-intelligence/libero"]
+    chosen = config.cli()
+    prepared = chosen.data.create(chosen.assets_dirs, chosen.model)
+    dataset = data_loader.create_torch_dataset(prepared, chosen.model.action_horizon, chosen.model)
+    dataset = data_loader.transform_dataset(dataset, prepared)
+    statistics = prepared.norm_stats
+    for place, expected in files(root):
+        item = dataset[place]
+        for name, key in (("state", "state"), ("action", "actions")):
+            low, high = statistics[key].q01, statistics[key].q99
+            expected[name] = 2 * (expected[name] - low) / (high - low + 1e-6) - 1
+        views = {view: image_tools.resize_with_pad(expected[view], SIZE, SIZE) for view in ("image", "wrist_image")}
+        shown = {"image": item["image"]["base_0_rgb"], "wrist_image": item["image"]["left_wrist_0_rgb"]}
+        # The text is tokens here.
+        read = {"state": item["state"][:8], "action": item["actions"][0][:7], "text": expected["text"]}
+        yield read | shown, expected | views
+
+
+def main() -> None:
+    client, root, *further = sys.argv[1:]
+    readers: dict[str, Callable[..., Iterator[tuple[Sample, Sample]]]]
+    readers = {"lerobot": lerobot, "starvla": starvla, "openpi": openpi}
+    furthest = dict.fromkeys(("state", "action", "image", "wrist_image"), 0.0)
+    samples = 0
+    for read, expected in readers[client](Path(root).resolve(), *map(Path, further)):
+        assert read["text"] == expected["text"], f"{read['text']!r} for {expected['text']!r}"
+        for name in furthest:
+            apart = np.abs(np.asarray(read[name], float) - np.asarray(expected[name], float))
+            furthest[name] = max(furthest[name], float(apart.max()))
+        samples += 1
+    print(f"{client}: {samples} steps of {root}; largest difference: {furthest}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,190 @@
+"""What an episode, and all of a dataset's episodes together, are in LeRobot's files, whichever version they are of."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, named
+from pipeline.errors import PipelineError
+from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
+from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, camera_column, matrix_columns
+from pipeline.formats.lerobot_video import Video
+from pipeline.formats.motion_statistics import describe
+from pipeline.images.jpeg import decode
+from pipeline.types import Episode, Extra
+
+ENTRIES = 16
+"""Of a column so many entries are in memory at a time: 300 MB for 28,000 episodes."""
+
+Numbers = Mapping[str, NDArray[Any]]
+"""Column to what it has at each step, (T,) or (T, D)."""
+
+
+def schema(columns: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
+    """Of the data files, with what ``datasets`` and the hub's viewer know images by."""
+    stored: dict[str, Any] = {}
+    for name, of in columns.items():
+        if of["dtype"] == "image":
+            stored[name] = datasets.Image()
+        elif of["dtype"] != "video":
+            value = datasets.Value(of["dtype"])
+            stored[name] = value if of["shape"] == (1,) else datasets.Sequence(value, length=of["shape"][0])
+    return datasets.Features(stored).arrow_schema
+
+
+def show(episode: Episode, view: str, video: Video | None) -> Counts:
+    """Append a view's frames to its video, and return their levels.
+
+    Raises:
+        PipelineError: when a frame cannot be decoded.
+    """
+    counts = np.zeros((3, 256), np.int64)
+    for t, packed in enumerate(episode.frames[view]):
+        try:
+            pixels = decode(packed)
+        except ValueError as error:
+            raise PipelineError(f"{view} frame {t}: {error}", where=f"episode {episode.episode_id}") from error
+        counts += count(pixels)
+        if video is not None:
+            video.add(pixels, first=t == 0)
+    return counts
+
+
+def numbers(episode: Episode, index: int, first_step: int, task: int) -> Numbers:
+    """What each step has in numbers.
+
+    Args:
+        episode: of which they are.
+        index: how many episodes of the dataset come before.
+        first_step: how many steps of the dataset come before.
+        task: of its instruction.
+    """
+    steps = np.arange(len(episode))
+    found: dict[str, NDArray[Any]] = {getattr(SCHEMA, name).lerobot_key: getattr(episode, name) for name in MOTION}
+    if episode.object_poses is not None:
+        found[OBJECT_POSES] = episode.object_poses.reshape(len(steps), -1)
+    return found | {
+        "timestamp": (steps / SCHEMA.fps_hz).astype(np.float32),
+        "frame_index": steps,
+        "episode_index": np.full_like(steps, index),
+        "index": first_step + steps,
+        "task_index": np.full_like(steps, task),
+    }
+
+
+def columns(episode: Episode, found: Numbers) -> dict[str, pa.Array]:
+    """All columns of an episode, with those of its images, which a dataset with videos leaves out."""
+    texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
+    for view, seen in episode.geometry.items():
+        for name, files in seen.maps.items():
+            texts[camera_column(view, name)] = [base64.b64encode(file).decode() for file in files]
+    kind = datasets.Image().pa_type
+    images = {
+        view.lerobot_key: pa.array([{"bytes": packed, "path": None} for packed in episode.frames[name]], kind)
+        for name, view in SCHEMA.views.items()
+    }
+    stored = {name: pa.array(list(values)) for name, values in found.items()}
+    return stored | {name: pa.array(values) for name, values in texts.items()} | images
+
+
+def figures(found: Numbers, shown: Mapping[str, Counts]) -> dict[str, dict[str, NDArray[Any]]]:
+    """Column to lerobot's statistics of an episode: (D,) of numbers, (3, 1, 1) of frames; ``count`` is (1,)."""
+    of_numbers = {
+        name: describe(values.reshape(len(values), -1), QUANTILES) | {"count": np.array([len(values)])}
+        for name, values in found.items()
+    }
+    return of_numbers | {SCHEMA.views[view].lerobot_key: statistics(counts) for view, counts in shown.items()}
+
+
+def provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
+    """Of ``meta/provenance.parquet``, which has a row for each episode, and which lerobot passes by."""
+    stored = {"episode_index": pa.int64()}
+    stored |= {name: pa.type_for_alias(dtype) for name, dtype in SCHEMA.provenance.items()}
+    stored |= {name: pa.list_(pa.float32(), spec.shape[0] * spec.shape[1]) for name, spec in matrix_columns().items()}
+    return pa.schema(stored | ({INSTANCES: pa.string()} if named(extras) else {}))
+
+
+def provenance(episode: Episode, index: int) -> dict[str, Any]:
+    """An episode's row there."""
+    row: dict[str, Any] = {"episode_index": index, **episode.provenance}
+    for view, seen in episode.geometry.items():
+        row |= {camera_column(view, name): getattr(seen, name).ravel().tolist() for name in MATRICES}
+    return row | ({INSTANCES: json.dumps(list(episode.instances))} if episode.instances else {})
+
+
+def exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
+    """lerobot's statistics of a column over all steps of the dataset, ``ENTRIES`` of its entries at a time."""
+    found = []
+    files = sorted((root / "data").rglob("*.parquet"))
+    for first in range(0, width, ENTRIES):
+        values = np.concatenate([_entries(file, column)[:, first : first + ENTRIES] for file in files])
+        found.append([describe(entry[:, None], QUANTILES) for entry in values.T])
+    entries = [entry for block in found for entry in block]
+    together = {name: np.concatenate([entry[name] for entry in entries]) for name in entries[0]}
+    return together | {"count": np.array([len(values)])}
+
+
+def _entries(file: Path, column: str) -> NDArray[Any]:
+    """(N, D) of a file's column."""
+    values = pq.read_table(file, columns=[column])[column].combine_chunks()
+    flat = values.flatten() if pa.types.is_fixed_size_list(values.type) else values
+    return np.asarray(flat.to_numpy(zero_copy_only=False).reshape(len(values), -1))
+
+
+def modality(views: Mapping[str, str], state: str, action: str) -> dict[str, Any]:
+    """``meta/modality.json``, by which GR00T and starVLA find their inputs.
+
+    Entries and names are those of ``examples/simBenchmarks/LIBERO/train_files/modality.json`` in starVLA/starVLA at
+    0ed0aad. The agent view is there a second time as ``image``, its name in NVIDIA/Isaac-GR00T at 2a7748b
+    (``gr00t/configs/data/embodiment_configs.py``). What both call roll, pitch and yaw is an axis-angle.
+
+    Args:
+        views: ``image`` and ``wrist_image`` to their columns.
+        state, action: their columns.
+    """
+
+    def entries(column: str, *names: str) -> dict[str, Any]:
+        return {name: {"start": k, "end": k + 1, "original_key": column} for k, name in enumerate(names)}
+
+    pose = ("x", "y", "z", "roll", "pitch", "yaw")
+    return {
+        "state": entries(state, *pose, "pad", "gripper"),
+        "action": entries(action, *pose, "gripper"),
+        "video": {
+            name: {"original_key": column} for name, column in {"primary_image": views["image"], **views}.items()
+        },
+        "annotation": {"human.action.task_description": {"original_key": "task_index"}},
+    }
+
+
+def is_number(column: Mapping[str, Any]) -> bool:
+    return column["dtype"] in ("float32", "int64")
+
+
+def listed(found: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    return {name: values.tolist() for name, values in found.items()}
+
+
+def link(made: Path, place: Path) -> None:
+    """Have a file in a second place too: the first stays, for a call that goes on where this one is killed."""
+    place.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(made, place)
+    except OSError:  # a file system without links
+        shutil.copyfile(made, place)
+
+
+def write_json(file: Path, content: Mapping[str, Any]) -> None:
+    file.write_text(json.dumps(content, indent=4) + "\n")

@@ -1,0 +1,110 @@
+"""LeRobotDataset v2.1, for clients whose lerobot is of 2025: a file of data and one of each video for each episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pyarrow as pa
+
+from pipeline.episode_schema import GripperSpec
+from pipeline.export_config import LeRobotV21Config
+from pipeline.formats.base import Format, Row
+from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_columns import CONVENTIONS
+from pipeline.formats.read_back import Copy, Fault
+from pipeline.formats.rlds_layout import by_suite
+from pipeline.identity import Step
+from pipeline.types import Extra
+
+EPISODES_OF_A_PIECE = 50
+"""So many episodes are written again, at most, where a call is killed; the files do not depend on it."""
+
+
+class LeRobotV21(Format[LeRobotV21Config]):
+    """Episodes of a set are numbered from 0; what is held out is a set of its own, as no client reads splits."""
+
+    name: ClassVar[Step] = "lerobot_v21"
+    title: ClassVar = "LeRobot v2.1"
+    # An episode is found by its id, in ``meta/episodes.jsonl``: the manifest is the same without this format.
+    columns: ClassVar[tuple[pa.Field, ...]] = ()
+
+    def __init__(self, data: Path, options: LeRobotV21Config, extras: Sequence[Extra] = ()) -> None:
+        super().__init__(data, options, extras)
+        self.convention = CONVENTIONS[options.convention]
+        self.keys = {name: self.convention.name(key) for name, key in LeRobot.keys.items()}
+        if self.convention.open_is_one:
+            self.gripper = GripperSpec(open=1.0, close=0.0)
+        self.clients = {"ipec": ("starvla",), "openpi": ("openpi", "openpi_serve")}[options.convention]
+
+    @property
+    def stage_record(self) -> Path:
+        # Of one stage with v3.0, as a stage of DVC has files whether or not this format is asked for.
+        return self.data / f"{LeRobot.name}.json"
+
+    def pieces(self, episodes: Episodes) -> list[Piece]:
+        pieces = []
+        for split_name, members in episodes.by_split(self.options.validation).items():
+            sets = {self.options.name: members}
+            if self.options.convention == "ipec":
+                suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
+                sets = by_suite(members, suites, self.options.name)
+            for name, ids in sets.items():
+                folder = f"files/{name}" if split_name == "train" else f"files/{name}_{split_name}"
+                parts = split(ids, -(-len(ids) // EPISODES_OF_A_PIECE))
+                slices = {f"{folder}/{number:05d}": (split_name, part) for number, part in enumerate(parts)}
+                pieces += in_a_row(slices, episodes.known)
+        return pieces
+
+    def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
+        from pipeline.formats import lerobot_v21_write
+
+        lerobot_v21_write.write_piece(path, piece, load, self.convention, self.extras)
+
+    def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
+        from pipeline.formats import lerobot_v21_write
+
+        sets: dict[str, list[Piece]] = {}
+        for piece in pieces:
+            sets.setdefault(Path(piece.path).parent.name, []).append(piece)
+        for name, members in sets.items():
+            lerobot_v21_write.finish(work, work / "dataset" / name, members, self.convention, self.extras)
+        return {}
+
+    def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
+        from pipeline.formats import lerobot_v21_read
+
+        return lerobot_v21_read.check(self.folder, kept, self.convention, self.extras)
+
+    def read(self, row: Row, cache: Path) -> Copy | None:
+        from pipeline.formats import lerobot_v21_read
+
+        return lerobot_v21_read.read(self.folder, row["episode_id"], self.convention, self.extras)
+
+    def loading(self, name: str, repository: str, kept: Sequence[Row]) -> str:
+        one = self.keys["action"]
+        return f"""\
+The repository is laid out as the folder that `finetune/` expects, here `$DATA`; below `lerobot_v21/` lies a dataset in
+the convention `{self.options.convention}` for each folder, with the actions as `{one}`:
+
+```sh
+export DATA=$PWD/{name}
+hf download {repository} --repo-type dataset --local-dir $DATA
+```
+
+lerobot up to 0.3.3, which reads version 2.1:
+
+```python
+import os
+from pathlib import Path
+
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+for root in sorted(Path(os.environ["DATA"], "lerobot_v21").iterdir()):
+    dataset = LeRobotDataset(root.name, root=root)
+```
+
+`meta/provenance.parquet` of each has the provenance of each `episode_index`.
+"""
