@@ -162,7 +162,7 @@ def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(aren
     for step, state in enumerate(states):
         state[1:8] += 0.1 * step
     with both_ways(opened) as (ours, plain):
-        with opened.painted(choices) as shows:
+        with opened.side_by_side(choices) as shows:
             assert ours._painted.any()
             made = []
             for state in states:

@@ -109,7 +109,9 @@ CUBE = '<texture name="cube" type="cube" builtin="flat" width="4" height="4"/><m
 HILLS = '<hfield name="hills" nrow="2" ncol="2" size="1 1 1 1" elevation="0 1 1 0"/>'
 
 IN_SOFTWARE = f"""
+import gc
 import mujoco
+from mujoco.osmesa import GLContext
 from pipeline.errors import PipelineError
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
@@ -146,6 +148,10 @@ for name, case in cases.items():
         case()
     except PipelineError as error:
         print(name, "|", *str(error).splitlines())
+        if case is not layer:
+            # The exception still refers to the drawing that was not made.
+            print("left open:", sum(isinstance(each, GLContext) and bool(each._context) for each in gc.get_objects()))
+    gc.collect()
 """
 
 
@@ -165,3 +171,4 @@ def test_too_little_memory_stops_wherever_it_is_met() -> None:
         assert f"GL_OUT_OF_MEMORY in {call}" in said[call], said
         assert "compute.workers" in said[call]
     assert "framebuffer is not complete" in said["framebuffer"]
+    assert [line for line in done.stdout.splitlines() if "left open" in line] == ["left open: 0"] * 3

@@ -16,7 +16,8 @@ from pipeline import gl, seeding
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.faces import Faces
-from pipeline.rendering.software.mujoco_3_2_7 import GEOM, SKINS
+from pipeline.rendering.software.mujoco_3_2_7.context import SKINS
+from pipeline.rendering.software.mujoco_3_2_7.skins import GEOM
 from pipeline.rendering.software.samples import BATCH_FACES, Projection, faces_that_show, room
 from pipeline.types import Floats, Frame
 
@@ -48,7 +49,7 @@ def test_no_face_is_left_out_that_covers_a_sample(size_px: float) -> None:
     faces = Faces(places_m, places_m, None, numbers, places_m, numbers)
     projection = Projection(np.diag([focal_px, focal_px, 1.0]) @ np.eye(3, 4), 0.1, 10.0, SIZE_PX)
     found = np.empty(room(count), np.uint32)
-    written = faces_that_show(projection, np.zeros(3), np.eye(3).ravel(), faces, SAMPLES, found)
+    written = faces_that_show(projection, faces, SAMPLES, found)
     listed = found[:written].reshape(-1, 3)
     shown = listed[listed[:, 0] != listed[:, 1]]
     assert np.array_equal(shown, numbers[np.sort(shown[:, 0] // 3)]), "whole faces, in their order"
@@ -71,8 +72,7 @@ def test_a_face_that_reaches_the_camera_stays() -> None:
     numbers = np.array([[0, 1, 2]], np.uint32)
     faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(room(1), np.uint32)
     projection = Projection(np.eye(3, 4), 0.1, 10.0, SIZE_PX)
-    straight = np.zeros(3), np.eye(3).ravel()
-    assert faces_that_show(projection, *straight, faces, SAMPLES, found) == 3
+    assert faces_that_show(projection, faces, SAMPLES, found) == 3
 
 
 def test_a_geom_lies_in_memory_as_mujoco_has_it() -> None:
@@ -189,7 +189,7 @@ def test_faces_that_turn_around_are_drawn_where_opengl_does_so_of_the_whole_mesh
     rng, turning = seeding.rng("test_skins", "batches"), turning_faces()
     assert len(turning) > 50
     projection = Projection(np.eye(3, 4), 0.1, 10.0, SIZE_PX)
-    straight, count, shown = (np.zeros(3), np.eye(3).ravel()), 6 * BATCH_FACES - 50, []
+    count, shown = 6 * BATCH_FACES - 50, []
     with closing(Drawing()) as drawing:
         for outside in (0.0, 0.001, 0.002, 0.01):
             # Far from those that may turn, some face away, some are seen.
@@ -201,7 +201,7 @@ def test_faces_that_turn_around_are_drawn_where_opengl_does_so_of_the_whole_mesh
             places_m[:, :2] = corners_px.reshape(-1, 2)
             numbers = np.arange(3 * count, dtype=np.uint32).reshape(-1, 3)
             faces, found = Faces(places_m, places_m, None, numbers, places_m, numbers), np.empty(room(count), np.uint32)
-            written = faces_that_show(projection, *straight, faces, SAMPLES, found)
+            written = faces_that_show(projection, faces, SAMPLES, found)
             assert written < 0.8 * 3 * count
             clip = np.column_stack([2 * places_m[:, :2] / SIZE_PX - 1, np.full((3 * count, 2), (0.5, 1.0))])
             clip = clip.astype(np.float32)

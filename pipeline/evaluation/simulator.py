@@ -11,14 +11,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import Perturbation, RenderPerturbation, of_layer
-from pipeline.episode_schema import SCHEMA
+from pipeline.axes import Perturbation
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.images.jpeg import to_policy
 from pipeline.physics.control_env import control_env, seeded
 from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
-from pipeline.rendering.frames import noisy
+from pipeline.planning.streams import Stream
+from pipeline.rendering.frames import changes_of, frames_of
 from pipeline.rendering.last_scene import LastScene
 from pipeline.scenes.compiled import proprioception
 from pipeline.testset.definitions import SceneFiles
@@ -234,14 +233,12 @@ class Picture:
         """
         if self._scene is None:
             raise PipelineError("no episode was started", remedy="reset first")
-        renderer = self._opened.renderer(self._scene)
+        renderer, stream = self._opened.renderer(self._scene), Stream(view, tuple(self._perturbations))
         if self._changes is None:
             self._changes = ExitStack()
-            self._changes.enter_context(renderer.perturbed(of_layer(self._perturbations, RenderPerturbation)))
+            self._changes.enter_context(renderer.perturbed(changes_of(stream)))
         state = np.concatenate([[0.0], observed.qpos, np.zeros(renderer.model.nv)])
-        renderer.restore(state, observed.site_alpha)
-        frame = renderer.frame(SCHEMA.views[view].camera)
-        return to_policy(noisy(frame, view, self._perturbations, step))
+        return frames_of(renderer, state, observed.site_alpha, [stream], step)[0]
 
     def restore(self) -> None:
         """Undo an episode's looks."""

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import h5py
 import numpy as np
@@ -123,7 +123,7 @@ class StarterSource:
                 where=folder,
                 remedy="pip install --force-reinstall robouse==0.2.0",
             ) from error
-        return _demo(task, key, source, HUMAN, actions, init_state[None], None, where=str(folder))
+        return _Recorded(task, key, source, HUMAN, actions, init_state[None], None).checked(str(folder))
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,12 @@ class HDF5Source:
                             entry = _entry(self._read(task, key, data))
                             first = first_with.setdefault(entry.sha256, entry)
                             if first is not entry:
-                                raise _copy_of(first, f"{self._path(task)} data/{key}")
+                                # Episodes are identified by content: two copies would make two rows with one id.
+                                raise PipelineError(
+                                    f"holds the same actions, states and model as {first.demo_id}",
+                                    where=f"{self._path(task)} data/{key}",
+                                    remedy="delete one of the two",
+                                )
                             entries.append(entry)
                             usable += 1
                         except PipelineError as error:
@@ -232,54 +237,54 @@ class HDF5Source:
         source = f"{task.suite}/{path.name} {key}"
         origin = EXPANDED if hdf5.EXPANDED_FROM in group.attrs else HUMAN
         model_file = hdf5.text(group, "model_file", where)
-        return _demo(task, key, source, origin, actions, states, model_file, where)
+        return _Recorded(task, key, source, origin, actions, states, model_file).checked(where)
 
 
-def _demo(
-    task: Task,
-    key: str,
-    source: str,
-    origin: str,
-    actions: Floats,
-    states: Floats,
-    model_file: str | None,
-    where: str,
-) -> Demo:
-    """Check what was recorded and make a ``Demo`` of it. States are (T, S), or (1, S) when only the first is known."""
-    fault = None
-    if actions.ndim != 2 or actions.shape[1] != 7 or len(actions) == 0:
-        fault = f"actions have shape {actions.shape}"
-    elif states.ndim != 2 or states.shape[1] == 0:
-        fault = f"states have shape {states.shape}"
-    elif not (np.isfinite(actions).all() and np.isfinite(states).all()):
-        fault = "actions or states hold NaN or infinity"
-    elif np.abs(actions).max() > 1 + 1e-6:
-        fault = f"actions reach {np.abs(actions).max():.6g}"
-    elif np.abs(states).max() > LARGEST_STATE:
-        fault = f"states reach {np.abs(states).max():.6g}"
-    if fault:
-        expected = f"actions (T, 7) in [-1, 1] and states (T, S), all finite and none beyond {LARGEST_STATE:.0e}"
-        raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.DOWNLOAD_AGAIN)
-    # Hash the model as recorded: relocated, it would differ from machine to machine.
-    content = hashlib.sha256()
-    for array in (actions, states):
-        content.update(repr(array.shape).encode())
-        content.update(array.astype("<f8").tobytes())
-    content.update((model_file or "").encode())
-    model_xml = None if model_file is None else relocate(model_file, where=f"{where} model_file")
-    whole = states if len(states) == len(actions) else None
-    return Demo(task, key, source, origin, content.hexdigest(), actions, states[0].copy(), whole, model_xml)
+class _Recorded(NamedTuple):
+    """What a source has of a demonstration; states are (T, S), or (1, S) when only the first is known."""
+
+    task: Task
+    key: str
+    source: str
+    origin: str
+    actions: Floats
+    states: Floats
+    model_file: str | None
+
+    def checked(self, where: str) -> Demo:
+        """The demonstration.
+
+        Raises:
+            PipelineError: when it cannot be used.
+        """
+        actions, states = self.actions, self.states
+        fault = None
+        if actions.ndim != 2 or actions.shape[1] != 7 or len(actions) == 0:
+            fault = f"actions have shape {actions.shape}"
+        elif states.ndim != 2 or states.shape[1] == 0:
+            fault = f"states have shape {states.shape}"
+        elif not (np.isfinite(actions).all() and np.isfinite(states).all()):
+            fault = "actions or states hold NaN or infinity"
+        elif np.abs(actions).max() > 1 + 1e-6:
+            fault = f"actions reach {np.abs(actions).max():.6g}"
+        elif np.abs(states).max() > LARGEST_STATE:
+            fault = f"states reach {np.abs(states).max():.6g}"
+        if fault:
+            expected = f"actions (T, 7) in [-1, 1] and states (T, S), all finite and none beyond {LARGEST_STATE:.0e}"
+            raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.DOWNLOAD_AGAIN)
+        # Hash the model as recorded: relocated, it would differ from machine to machine.
+        content = hashlib.sha256()
+        for array in (actions, states):
+            content.update(repr(array.shape).encode())
+            content.update(array.astype("<f8").tobytes())
+        content.update((self.model_file or "").encode())
+        model_xml = None if self.model_file is None else relocate(self.model_file, where=f"{where} model_file")
+        whole = states if len(states) == len(actions) else None
+        return Demo(*self[:4], content.hexdigest(), actions, states[0].copy(), whole, model_xml)
 
 
 def _entry(demo: Demo) -> DemoEntry:
     return DemoEntry(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
-
-
-def _copy_of(first: DemoEntry, where: str) -> PipelineError:
-    # Episodes are identified by content: two copies would make two rows with one id.
-    return PipelineError(
-        f"holds the same actions, states and model as {first.demo_id}", where=where, remedy="delete one of the two"
-    )
 
 
 def _parse(demo_id: str) -> tuple[Task, str]:

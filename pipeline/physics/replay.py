@@ -23,6 +23,7 @@ from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
 
 
+# Six arguments: what is replayed, its name, how, under what changes, and what tracking follows.
 def replay(
     environment: Environment,
     demo: Demo,

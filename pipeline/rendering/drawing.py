@@ -1,8 +1,12 @@
-"""How a scene is drawn: by MuJoCo as it is. Everything else that draws (``savings.py``) has to give the same pixels."""
+"""The rendering of a scene by MuJoCo's public functions alone.
+
+Any other ``Drawing`` (``savings.py``) must give the same pixels.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from contextlib import ExitStack
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import mujoco
@@ -16,7 +20,7 @@ from pipeline.rendering.opengl import check, making_context
 from pipeline.types import Frame
 
 MOST_GEOMS = 1000
-"""Geoms, sites and the like of a scene that MuJoCo draws at most; LIBERO's have up to 300."""
+"""Geoms, sites and the like of a scene that MuJoCo renders at most; LIBERO's scenes have up to 300."""
 
 
 class Surfaces(NamedTuple):
@@ -32,44 +36,55 @@ class Surfaces(NamedTuple):
     kind: NDArray[np.int32]
 
 
+def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> list[NDArray[np.uint8]]:
+    """The part of a model's ``tex_data``, or of another array like it, that belongs to each texture; not copied."""
+    data = model.tex_data if tex_data is None else tex_data
+    ends = model.tex_adr + model.tex_height * model.tex_width * model.tex_nchannel
+    return [data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
+
+
 class Drawing(Protocol):
-    """Draws the states of one model at a time; close it before another is made."""
+    """Renders the states of one model at a time; close it before another is made."""
 
     def adopt(self, model: mujoco.MjModel) -> bool:
-        """Go on with another model; whether that can be. Else nothing is changed, and where it raises, close it."""
+        """Go on with another model in the same OpenGL context.
+
+        Returns:
+            Whether that is possible; if not, nothing has changed. If it raises, the drawing has to be closed.
+        """
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:
-        """(H, W, 3) uint8 RGB in the orientation of LIBERO's raw observations, of data with up-to-date positions."""
+        """(H, W, 3) uint8 RGB in the orientation of LIBERO's raw observations; ``mj_forward`` has to be done."""
 
     def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
         """What each pixel of a frame shows."""
 
     def load(self, textures: Collection[int]) -> None:
-        """Draw with what the model's ``tex_data`` has for these textures now."""
+        """Upload these textures from the model's ``tex_data``."""
 
     def close(self) -> None: ...
 
 
 @runtime_checkable
 class SideBySide(Protocol):
-    """A drawing that holds several looks of its textures at once, and draws once what they have in common."""
+    """A drawing that keeps several variants of its textures uploaded, and renders what they share once."""
 
     def hold(self, textures: Collection[int]) -> Callable[[], None]:
-        """Keep what was loaded for these textures, which have to be loaded again before the next frame.
+        """Keep what is uploaded for these textures as a variant; before the next frame they have to be loaded again.
 
         Returns:
-            What has the next frames drawn with it.
+            A function that selects the variant for the next frames.
         """
 
     def let_go(self) -> None:
-        """Draw with the textures that were there before anything was held."""
+        """Delete all variants, and render with the model's own textures."""
 
 
 class PlainDrawing:
-    """Draws all of a model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in a context of its own.
+    """Renders all of a model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in a context of its own.
 
     Args:
-        model: what to draw.
+        model: what to render.
 
     Raises:
         PipelineError: when nothing renders on this machine.
@@ -80,10 +95,14 @@ class PlainDrawing:
         height, width, _ = SCHEMA.frame.shape
         self._model, self._rectangle = model, mujoco.MjrRect(0, 0, width, height)
         self._gl = gl_context.GLContext(width, height)
-        self._gl.make_current()
-        with making_context():
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
-            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        with ExitStack() as undo:
+            # An OpenGL context that is left open counts against those that the driver has.
+            undo.callback(self._gl.free)
+            self._gl.make_current()
+            with making_context():
+                self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
+                mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+            undo.pop_all()
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(model, MOST_GEOMS)
         self._camera, self._option = mujoco.MjvCamera(), mujoco.MjvOption()

@@ -1,4 +1,4 @@
-"""Where a view is seen from, how far its surfaces are and whose they are; conventions in ``schemas/episode.json``."""
+"""Camera matrices, depth and segmentation of a view; conventions in ``schemas/episode.json``."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from pipeline.types import Extra, Floats, Geometry, Trajectory
 def see(
     renderer: Renderer, trajectory: Trajectory, stream: Stream, instances: Instances | None, extras: Collection[Extra]
 ) -> Geometry:
-    """The geometry of a view through a trajectory; with extras, before each executed action.
+    """The geometry of a view: its matrices, and with extras its depth and segmentation before each executed action.
 
     Args:
         renderer: of the trajectory's scene.
-        trajectory: what happens.
-        stream: the view, and what changes its camera.
-        instances: numbers the scene's things, for segmentation.
+        trajectory: gives the states.
+        stream: the view, and the perturbations that change what it sees beside colours.
+        instances: gives the ids of segmentation.
         extras: what to make beside the matrices.
     """
     view = SCHEMA.views[stream.view]

@@ -1,4 +1,4 @@
-"""The things of a scene, numbered: what a pixel's id and a row of the object poses are of."""
+"""The instance ids of a scene: which thing a pixel of a segmentation shows, and a row of the object poses describes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes one after the other, of which the last stays open."""
+"""Keeps the last scene open, for the next piece of work that needs the same one."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ from pipeline.scenes.compiled import compiled
 
 
 class LastScene:
-    """Keeps the renderer of the last scene open for whoever asks for the same scene next, and its drawing for whoever
-    asks for another one that it can go on with; only one is open at a time."""
+    """Holds one open renderer at a time.
+
+    The next request for the same scene gets the same renderer. A request for another scene gets a new one, which takes
+    over the drawing and its OpenGL context if the drawing can ``adopt`` the scene.
+    """
 
     def __init__(self) -> None:
         self._renderer: Renderer | None = None
@@ -34,7 +37,7 @@ class LastScene:
             drawing = self._renderer.drawing if self._renderer and self._adopted(self._renderer, model) else None
             if drawing is None:
                 self.close()
-                # Of a process that ends before anyone is done, MuJoCo ends OpenGL, after what is registered later.
+                # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
                 self._renderer = Renderer(model)
                 atexit.register(self.close)
             else:
@@ -46,7 +49,7 @@ class LastScene:
         try:
             return renderer.drawing.adopt(model)
         except BaseException:
-            # It shows something of both scenes now.
+            # It holds parts of both scenes now.
             self.close()
             raise
 
@@ -62,5 +65,5 @@ class LastScene:
 
 @functools.cache
 def scene_of_process() -> LastScene:
-    """The one that this process keeps open from one piece of work to the next; whoever is done closes it."""
+    """The one of this process, open from one piece of work to the next; whoever has no more work closes it."""
     return LastScene()

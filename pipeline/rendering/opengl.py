@@ -1,7 +1,7 @@
-"""OpenGL's functions for the current context, and what becomes of the errors that it reports.
+"""OpenGL's functions for the current context, with every error checked.
 
-An error means that OpenGL did not do what it was asked. PyOpenGL looks for one after each call of ours. MuJoCo looks
-for none after its own, so each of them that draws, loads or reads is followed by ``check``.
+An error means that OpenGL did not do what it was asked to. PyOpenGL checks after each call of ours. MuJoCo does not
+check after its own calls, so each of them that renders, uploads or reads is followed by ``check``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ERRORS = {
     0x0506: "GL_INVALID_FRAMEBUFFER_OPERATION",
     0x0507: "GL_CONTEXT_LOST",
 }
-"""OpenGL's errors by their codes; those up to GL_INVALID_OPERATION pass over one command and change nothing else."""
+"""OpenGL's errors by code. Those up to GL_INVALID_OPERATION skip one command and change nothing else."""
 
 OTHERS = "calls that are not the pipeline's"
 
@@ -35,8 +35,11 @@ LEFT = {
     "mjr_render": ("GL_INVALID_ENUM",),
     OTHERS: ("GL_INVALID_ENUM", "GL_INVALID_VALUE", "GL_INVALID_OPERATION"),
 }
-"""What does not stop, by what it comes from. In LIBERO's five arenas, MuJoCo 3.2.7 leaves no error behind. In scenes of
-more lamps than OpenGL has (8 in Mesa, the head light is one) it switches the others on and off, too: they stay dark."""
+"""Errors that are logged and ignored, by the call that they come from.
+
+In LIBERO's five arenas MuJoCo 3.2.7 causes none. In a scene with more lights than OpenGL has (8 in Mesa, the head light
+is one of them) it also enables and disables those that do not exist; they stay dark.
+"""
 
 _MEMORY = "fewer workers on this machine (compute.workers), smaller textures, or a GPU with more memory"
 _DRIVER = "MUJOCO_GL=osmesa, which renders in software; and report this message with the driver's version"
@@ -75,7 +78,7 @@ def say_once(error: str, call: str) -> None:
 
 @contextmanager
 def making_context() -> Iterator[None]:
-    """Have MuJoCo make a context, which is all that it looks for errors in itself: it warns of them.
+    """Raise the OpenGL errors that MuJoCo only warns of while it makes a context.
 
     Raises:
         PipelineError: when it reports any, or makes none.

@@ -1,19 +1,20 @@
-"""One scene: put into stored states, perturbed, and drawn."""
+"""One scene: put into stored states, perturbed, and rendered."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import RenderPerturbation
-from pipeline.rendering.drawing import Drawing, SideBySide, Surfaces
+from pipeline.rendering.drawing import Drawing, SideBySide, Surfaces, texels
 from pipeline.rendering.savings import drawing_of
 from pipeline.scenes.compiled import compiled
-from pipeline.types import Frame
+from pipeline.types import Frame, State
 
 
 class Renderer:
@@ -31,13 +32,11 @@ class Renderer:
         self.model = compiled(scene) if isinstance(scene, str) else scene
         self.data = mujoco.MjData(self.model)
         self.drawing: Drawing = drawing or drawing_of(self.model)
+        self._perturbations: tuple[RenderPerturbation, ...] = ()
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:
         """Put the scene into a stored state (S,) with its sites' opacity (nsite,)."""
-        nq, nv = self.model.nq, self.model.nv
-        self.data.time = state[0]
-        self.data.qpos[:] = state[1 : 1 + nq]
-        self.data.qvel[:] = state[1 + nq : 1 + nq + nv]
+        State.of(state, self.model.nq).put_into(self.data)
         self.model.site_rgba[:, 3] = site_alpha
         mujoco.mj_forward(self.model, self.data)
 
@@ -55,37 +54,31 @@ class Renderer:
         return np.where(kind == mujoco.mjtObj.mjOBJ_GEOM, number, -1)
 
     @contextmanager
-    def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[list[int]]:
-        """Apply render-layer perturbations to the model for a moment.
+    def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
+        """Apply render-layer perturbations to the model, and undo them at the end.
 
-        Returns:
-            The textures that they changed.
+        Entered again inside itself with the same perturbations, it does nothing.
         """
-        fields = {name for perturbation in perturbations for name in perturbation.fields}
-        former = {name: getattr(self.model, name).copy() for name in fields}
-        painted: list[int] = []
-        try:
-            for perturbation in perturbations:
-                perturbation.apply(self.model)
-            if "tex_data" in former:
-                painted = self._textures_unlike(former["tex_data"])
-            self.drawing.load(painted)
-            yield painted
-        finally:
-            for name, values in former.items():
-                getattr(self.model, name)[:] = values
-            self.drawing.load(painted)
+        if tuple(perturbations) == self._perturbations:
+            yield
+            return
+        former = self._perturbations
+        with self._applied(perturbations):
+            self._perturbations = tuple(perturbations)
+            try:
+                yield
+            finally:
+                self._perturbations = former
 
     @contextmanager
-    def painted(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[Callable[[], None]]]:
-        """Show one of several choices of textures or another.
+    def side_by_side(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[Callable[[], None]]]:
+        """Switch between scenes that differ in textures alone.
 
         Args:
-            choices: for each, perturbations that write textures and nothing else. A drawing that holds none side by
-                side gets one.
+            choices: the perturbations of each scene. More than one need a drawing that is ``SideBySide``.
 
         Returns:
-            A function for each choice, after which frames show it.
+            A function for each choice; frames show the one whose function was called last.
         """
         if len(choices) == 1:
             with self.perturbed(choices[0]):
@@ -93,21 +86,38 @@ class Renderer:
             return
         if not isinstance(self.drawing, SideBySide):
             raise TypeError(f"{type(self.drawing).__name__} holds one choice of textures, not {len(choices)}")
-        shows = []
-        try:
-            for choice in choices:
-                with self.perturbed(choice) as textures:
-                    shows.append(self.drawing.hold(textures))
-            yield shows
-        finally:
-            self.drawing.let_go()
+        shows: list[Callable[[], None]] = []
+        with self.perturbed([change for change in choices[0] if not change.paints]):
+            try:
+                for choice in choices:
+                    with self._applied([change for change in choice if change.paints]) as textures:
+                        shows.append(partial(self._show, choice, self.drawing.hold(textures)))
+                yield shows
+            finally:
+                self.drawing.let_go()
 
-    def _textures_unlike(self, former: NDArray[np.uint8]) -> list[int]:
-        """The textures whose bytes are not what they were in a former ``tex_data``."""
-        model = self.model
-        ends = model.tex_adr + model.tex_height * model.tex_width * model.tex_nchannel
-        slices = map(slice, model.tex_adr, ends)
-        return [n for n, texels in enumerate(slices) if not np.array_equal(model.tex_data[texels], former[texels])]
+    def _show(self, choice: Sequence[RenderPerturbation], held: Callable[[], None]) -> None:
+        held()
+        self._perturbations = tuple(choice)
+
+    @contextmanager
+    def _applied(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[list[int]]:
+        """Apply perturbations, and undo them at the end; gives the textures that they changed."""
+        fields = {name for perturbation in perturbations for name in perturbation.fields}
+        former = {name: getattr(self.model, name).copy() for name in fields}
+        textures: list[int] = []
+        try:
+            for perturbation in perturbations:
+                perturbation.apply(self.model)
+            if "tex_data" in former:
+                pairs = zip(texels(self.model), texels(self.model, former["tex_data"]), strict=True)
+                textures = [number for number, (now, then) in enumerate(pairs) if not np.array_equal(now, then)]
+            self.drawing.load(textures)
+            yield textures
+        finally:
+            for name, values in former.items():
+                getattr(self.model, name)[:] = values
+            self.drawing.load(textures)
 
     def close(self) -> None:
         self.drawing.close()

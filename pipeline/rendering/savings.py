@@ -1,7 +1,8 @@
-"""Which drawing a scene gets: MuJoCo's own, or one that gives the same pixels for less work.
+"""Chooses how a scene is rendered: plainly, or with savings that give the same pixels for less work.
 
-Savings are used only where they were tested, and where a small scene drawn both ways has equal pixels (0.6 s for each
-process). Everywhere else, and by request, a scene is drawn by MuJoCo as it is, several times slower without a GPU.
+Savings are used with the MuJoCo version and the device that they were tested with, if a small scene rendered both ways
+has equal pixels (0.6 s for each process). Otherwise, and on request, a scene is rendered plainly, which takes several
+times as long without a GPU.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ from pipeline import gl
 from pipeline.rendering.drawing import Drawing, PlainDrawing
 
 PLAIN = "PLAIN_RENDERING"
-"""Environment variable: anything but nothing has all scenes drawn by MuJoCo as it is."""
+"""Environment variable: if it is set and not empty, all scenes are rendered plainly."""
 
 MUJOCO = "3.2.7"
-"""The version of MuJoCo whose private ways ``software/mujoco_3_2_7.py`` knows."""
+"""The version of MuJoCo whose internals ``software/mujoco_3_2_7/`` relies on."""
 
 DEVICE = "llvmpipe"
 """How the names of tested devices begin: Mesa's renderer without a GPU."""
@@ -42,7 +43,7 @@ def drawing_of(model: mujoco.MjModel) -> Drawing:
 
 @functools.cache
 def why_plain() -> str | None:
-    """Why no savings are used in this process, logged where nobody asked for it; None where they are."""
+    """The reason why this process renders plainly, logged unless plain was asked for; None when it uses savings."""
     if os.environ.get(PLAIN):
         return f"{PLAIN} is set"
     device = gl.choose().device

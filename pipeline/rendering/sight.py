@@ -1,15 +1,20 @@
-"""What an episode's agent view shows of the things that the task is about, of the hand, and of added objects."""
+"""Whether the first frame of a perturbed scene shows enough: the task's things, the hand, and added objects."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.axes.light import exposure
+from pipeline.episode_schema import SCHEMA
 from pipeline.libero import bddl
+from pipeline.planning.streams import Stream
+from pipeline.rendering.frames import changes_of
 from pipeline.rendering.renderer import Renderer
 from pipeline.scenes.placement import added_objects, enough_seen
-from pipeline.types import Floats, Task
+from pipeline.types import Floats, Task, Trajectory
 
 CAMERA = "agentview"
 
@@ -36,7 +41,7 @@ class Sight:
 
     @classmethod
     def of(cls, renderer: Renderer, task: Task, hand_m: Floats) -> Sight:
-        """What the agent view of a renderer sees, in the state that it was put in.
+        """What the agent view of a renderer sees in the restored state.
 
         Args:
             renderer: of a scene of the task.
@@ -59,11 +64,13 @@ class Sight:
         )
 
     def faults(self, original: Sight) -> list[str]:
-        """What a camera shows too little of; none when it is enough.
+        """Names of what a camera shows too little of; empty when it shows enough.
 
-        Where the scene's own camera shows more: ``task_object_not_seen`` when a thing shows on fewer than ``LEAST_PX``
-        pixels, ``hand_not_seen`` when the hand is outside of the frame for more than ``MOST_OUTSIDE`` of the steps.
-        ``added_objects_not_seen`` when fewer of these show than the layout axis asks for.
+        * ``task_object_not_seen``: a thing shows on fewer than ``LEAST_PX`` pixels.
+        * ``hand_not_seen``: the hand is outside of the frame for more than ``MOST_OUTSIDE`` of the steps.
+        * ``added_objects_not_seen``: fewer of these show than the layout axis asks for.
+
+        The first two do not count when the scene's own camera shows no more.
         """
         lost = any(px < min(LEAST_PX, original.things_px[thing]) for thing, px in self.things_px.items())
         away = self.hand_outside > max(MOST_OUTSIDE, original.hand_outside)
@@ -73,3 +80,41 @@ class Sight:
             "added_objects_not_seen": bool(self.added_px) and not enough_seen(self.added_px),
         }
         return [name for name, holds in faults.items() if holds]
+
+
+class FirstFrame:
+    """Judges perturbed scenes of a trajectory by its first frame.
+
+    A perturbed scene is refused when a frame is black or blown out (``exposure``), or when the agent view shows too
+    little (``Sight``).
+
+    Args:
+        renderer: of the trajectory's scene, not perturbed.
+        trajectory: whose first state is rendered.
+        task: tells which things must be seen.
+        hand_m: as in ``Sight.of``.
+    """
+
+    def __init__(self, renderer: Renderer, trajectory: Trajectory, task: Task, hand_m: Floats):
+        self._renderer, self._task, self._hand_m = renderer, task, hand_m
+        self._first = trajectory.states[0], trajectory.site_alpha[0]
+        renderer.restore(*self._first)
+        self._original = Sight.of(renderer, task, hand_m)
+
+    def fault(self, streams: Sequence[Stream]) -> str | None:
+        """What is wrong with the scene that the renderer shows now; None when nothing is.
+
+        Args:
+            streams: those of the scene.
+        """
+        self._renderer.restore(*self._first)
+        changes = changes_of(streams[0])
+        faults: list[str] = []
+        cameras = dict.fromkeys(SCHEMA.views[stream.view].camera for stream in streams)
+        if changes:
+            faults += [fault for camera in cameras if (fault := exposure(self._renderer.frame(camera)))]
+        if CAMERA in cameras:
+            moved = any(change.sees_otherwise for change in changes)
+            sight = Sight.of(self._renderer, self._task, self._hand_m) if moved else self._original
+            faults += sight.faults(self._original)
+        return faults[0] if faults else None

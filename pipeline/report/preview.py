@@ -21,13 +21,13 @@ from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import replaced
-from pipeline.images.jpeg import to_policy
 from pipeline.libero.demonstrations import Problem
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.roll_out import first_look, roll_out
 from pipeline.planning.plan import Draws
+from pipeline.planning.streams import Stream
 from pipeline.rendering.frames import frames_of
 from pipeline.rendering.last_scene import LastScene, scene_of_process
 from pipeline.report.sheets import Tile, describe, sheet, side_by_side
@@ -73,7 +73,7 @@ class Stage:
             scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
         state, site_alpha = first_look(scene, self.demo.task, self.replay), renderer.model.site_rgba[:, 3].copy()
-        return [to_policy(frame) for frame in frames_of(renderer, state, site_alpha, changes, 0, views).values()]
+        return frames_of(renderer, state, site_alpha, [Stream(view, changes) for view in views], 0)
 
 
 def staged(tasks: Iterable[Task], config: Config) -> Stage:

@@ -1,6 +1,7 @@
 """Some episodes rendered anew: is what the store and the datasets have the right picture, and the right way up?
 
 The process is another than the one that rendered the frames, and the pictures are made from the trajectory's states.
+Noise and turning are done here once more, by other code than that of the run (``rendering/frames.py``).
 """
 
 from __future__ import annotations
@@ -11,12 +12,11 @@ from typing import Any
 import numpy as np
 
 from pipeline import gl
-from pipeline.axes import from_json
+from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_layer
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import decode, encode
-from pipeline.rendering.frames import frames_of
 from pipeline.rendering.last_scene import LastScene
 from pipeline.types import Frame, Trajectory
 from pipeline.validation.checks import Case, psnr_db
@@ -91,6 +91,10 @@ def _turned(raw: Frame) -> Frame:
 
 def _raw(trajectory: Trajectory, perturbations: str, opened: LastScene, step: int) -> dict[str, Frame]:
     """View to its frame before a step, in the orientation of LIBERO's raw observations."""
-    renderer = opened.renderer(trajectory.model_xml)
-    state, site_alpha = trajectory.states[step], trajectory.site_alpha[step]
-    return frames_of(renderer, state, site_alpha, from_json(perturbations), step)
+    renderer, changes = opened.renderer(trajectory.model_xml), from_json(perturbations)
+    with renderer.perturbed(of_layer(changes, RenderPerturbation)):
+        renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+        frames = {view: renderer.frame(spec.camera) for view, spec in SCHEMA.views.items()}
+    for noise in of_layer(changes, PixelPerturbation):
+        frames |= {view: noise.apply(frames[view], step) for view in noise.views}
+    return frames

@@ -1,1 +1,1 @@
-"""Savings of software rendering: the same pixels with less for Mesa to draw."""
+"""Savings of software rendering: the same pixels with less work for Mesa."""

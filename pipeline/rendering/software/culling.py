@@ -1,8 +1,8 @@
-"""What a picture cannot show and need not draw: the same pixels for less work.
+"""Frustum culling: which geoms a picture can show, in each pass.
 
-MuJoCo draws every geom of a scene whether it is in the picture or not, all of them once more where a box or a plane
-reflects, and for each lamp with shadows. In LIBERO's wrist view most of the robot, which has more than half of the
-triangles, is behind the camera; what reflects is a plate of the stove, around which little is to be seen.
+MuJoCo renders every geom of a scene, in the view or not. It renders all of them once more where a box or a plane
+reflects, and again for each light with shadows. In LIBERO's wrist view most of the robot, with more than half of the
+triangles, is behind the camera. What reflects is a plate of the stove, which mirrors little.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.software.mujoco_3_2_7 import REFLECTING_SQUARE, WIDEST_MAP_DEG
+from pipeline.rendering.software.mujoco_3_2_7.passes import REFLECTING_SQUARE, WIDEST_MAP_DEG
 from pipeline.rendering.software.samples import Projection
 from pipeline.types import Floats
 
@@ -25,31 +25,31 @@ MARGIN_M = 1e-3
 
 
 WIDEST_CONE = np.radians(80)
-"""Half the opening angle of cones up to which it is worked out what is in them."""
+"""Largest half opening angle (rad) of a cone that is tested; wider ones count as holding everything."""
 
 SHADOW_MARGIN_M = 0.05
-"""So near to a picture, a shadow counts as in it: more than two pixels of a lamp's map."""
+"""A shadow within this distance of the view counts as in it: more than two pixels of a shadow map."""
 
 
 class Lamp(NamedTuple):
-    """What a lamp with shadows needs: (ngeom,) which geoms cast them into the picture, and which it may light there."""
+    """For a light with shadows: (ngeom,) which geoms cast shadows into the picture, and which it may light there."""
 
     casts: NDArray[np.bool_]
     lights: NDArray[np.bool_]
 
 
 class Picture(NamedTuple):
-    """What has to be drawn for a picture.
+    """What has to be rendered for a picture.
 
     Attributes:
-        opaque, clear: (ngeom,) which geoms; ``clear`` may show what is behind them.
-        mirror: (ngeom,) the opaque one that reflects, if there is one.
-        seen: (ngeom,) which are before the camera.
-        images: (ngeom,) which show in the mirror.
-        lamps: those with shadows, in MuJoCo's order.
-        sites: (nsite,) which sites.
-        projection: by which to choose single faces, or None.
-        underlaid: whether it can be put together of underlays, of what is opaque and does not reflect.
+        opaque, clear: (ngeom,) geoms that hide what is behind them, and geoms that may be transparent.
+        mirror: (ngeom,) the opaque geom that reflects, if there is one.
+        seen: (ngeom,) geoms in the view of the camera.
+        images: (ngeom,) geoms that show in the mirror.
+        lamps: lights with shadows, in MuJoCo's order.
+        sites: (nsite,) sites that may show.
+        projection: for the choice of single faces, or None where all are rendered.
+        underlaid: whether the picture may be composed of underlays (``still.py``).
     """
 
     opaque: NDArray[np.bool_]
@@ -64,7 +64,7 @@ class Picture(NamedTuple):
 
 
 class Culling:
-    """Tells by the boxes around geoms what a camera can see of a model, whose planes have bounds.
+    """Tests the bounding boxes of a model's geoms against a camera's view. All planes must have bounds.
 
     Args:
         hidden_groups: groups of geoms that are not drawn.
@@ -81,7 +81,7 @@ class Culling:
         self._flat = np.flatnonzero(np.isin(model.geom_type, (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX)))
 
     def picture(self, data: mujoco.MjData, camera: str) -> Picture:
-        """What has to be drawn of the data's state; positions must be up to date."""
+        """What has to be rendered of the data's state; positions must be up to date."""
         view, clear = _View(self._model, data, camera), self._see_through()
         mirror, sure = self._mirror(data, view, clear)
         if not sure:
@@ -90,7 +90,7 @@ class Culling:
         corners_m = data.geom_xpos[:, None] + self._corners_m @ turns
         seen = self.shown & view.shows(corners_m)
         with_shadows = np.flatnonzero(self._model.light_castshadow & self._model.light_active)
-        lamps = tuple(self._lamp(data, view, corners_m, seen, clear, lamp) for lamp in with_shadows.tolist())
+        lamps = tuple(self._lamp(data, view, corners_m, seen, lamp) for lamp in with_shadows.tolist())
         images = np.zeros_like(seen)
         if mirror is not None and seen[mirror]:
             images = self.shown & self._images(data, view, corners_m, mirror)
@@ -103,12 +103,12 @@ class Culling:
             lamps=lamps,
             sites=self._sites(bool(lamps)),
             projection=view.projection(),
-            # What lamps with shadows light is drawn once more for each of them, so that an underlay gains little.
+            # Each light with shadows renders what it lights once more, so an underlay gains little.
             underlaid=not lamps and not self._sites_see_through(),
         )
 
     def everything(self) -> Picture:
-        """All that there is, in every pass, at once."""
+        """Everything, in every pass."""
         every, clear = np.ones_like(self.shown), self._see_through()
         flat = np.isin(np.arange(len(every)), self._flat)
         return Picture(self.shown & ~clear, clear, flat, every, every, (), self._sites(True), None, False)
@@ -129,10 +129,9 @@ class Culling:
         view: _View,
         corners_m: Floats,
         seen: NDArray[np.bool_],
-        clear: NDArray[np.bool_],
         lamp: int,
     ) -> Lamp:
-        model, origin_m = self._model, data.light_xpos[lamp]
+        model, origin_m, clear = self._model, data.light_xpos[lamp], self._see_through()
         # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
         if model.light_directional[lamp]:
             return Lamp(self.shown, seen | clear)

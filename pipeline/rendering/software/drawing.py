@@ -1,15 +1,15 @@
-"""Draws pictures with less work for Mesa, and one scene after the other in one context, with the pixels of MuJoCo's own
-drawing.
+"""Renders the pixels of ``PlainDrawing`` with less work for Mesa, and one scene after the other in one context.
 
-* What a picture cannot show is not drawn (``culling.py``).
-* Of large meshes, single faces are drawn (``skins.py``, ``samples.py``).
-* What stands still before a camera is drawn once (``still.py``).
+* Geoms outside of the view are not rendered (``culling.py``).
+* Of large meshes, only faces that cover a sample are rendered (``skins.py``, ``samples.py``).
+* What stands still before a camera is rendered once, and its colour and depth are kept as an underlay (``still.py``).
 * Meshes and textures that a scene shares with the one before stay in the context.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack
 from functools import partial
 from typing import NamedTuple
 
@@ -19,23 +19,27 @@ from numpy.typing import NDArray
 
 from pipeline.axes.base import FIELDS
 from pipeline.rendering.drawing import PlainDrawing
-from pipeline.rendering.software import mujoco_3_2_7 as private
 from pipeline.rendering.software.culling import Culling, Picture
-from pipeline.rendering.software.mujoco_3_2_7 import Draws, HeldTextures, Meshes, Pass, Skins, Underlay
+from pipeline.rendering.software.mujoco_3_2_7 import context as private
+from pipeline.rendering.software.mujoco_3_2_7.context import HeldTextures
+from pipeline.rendering.software.mujoco_3_2_7.meshes import Meshes
+from pipeline.rendering.software.mujoco_3_2_7.passes import Draws, Pass
+from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
+from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay
 from pipeline.rendering.software.samples import SAMPLES
 from pipeline.rendering.software.skins import SkinnedMeshes
 from pipeline.rendering.software.still import Still
 from pipeline.types import Frame
 
 LOOK = tuple(name for name in FIELDS if name != "tex_data")
-"""What a picture depends on in a model, of what may change, beside textures and where its geoms and sites are."""
+"""Arrays of a model that perturbations may change and a picture depends on, beside textures."""
 
 CULLED = mujoco.mjNGROUP - 1
-"""A group of geoms and sites that nothing in LIBERO is in, and that is not drawn."""
+"""A group of geoms and sites that LIBERO does not use and that is never rendered."""
 
 
 class Shot(NamedTuple):
-    """A picture to draw: of which state, from which camera, and what has to be drawn for it."""
+    """A picture to render: the state, the camera, and what has to be rendered."""
 
     data: mujoco.MjData
     camera: str
@@ -43,27 +47,30 @@ class Shot(NamedTuple):
 
 
 class SoftwareDrawing(PlainDrawing):
-    """Draws models that are ``possible``.
+    """Renders models that are ``possible``.
 
     Raises:
         PipelineError: when OpenGL does not do what is asked of it.
     """
 
     def __init__(self, model: mujoco.MjModel):
-        # A context is made for what all scenes have alike, and then goes on with this one.
+        # The context is made for what all scenes have in common, and then goes on with this model.
         bare = private.bare(model)
         super().__init__(bare)
-        self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
-        self._meshes = Meshes(self._context, bare, [])
-        self._skinned = SkinnedMeshes(self._skins, self._samples, bare, np.zeros(bare.ngeom, np.bool_), self._meshes)
-        self._still: dict[str, Still] = {}
-        self._underlays: dict[tuple[str, str], Underlay] = {}
-        self._held: HeldTextures | None = None
-        self._show(model)
+        with ExitStack() as undo:
+            undo.callback(self.close)
+            self._skins, self._samples = Skins(self._context, self._scene), private.samples(SAMPLES)
+            self._meshes = Meshes(self._context, bare, [])
+            self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, np.zeros(bare.ngeom, np.bool_))
+            self._still: dict[str, Still] = {}
+            self._underlays: dict[tuple[str, str], Underlay] = {}
+            self._held: HeldTextures | None = None
+            self._show(model)
+            undo.pop_all()
 
     @staticmethod
     def possible(model: mujoco.MjModel) -> bool:
-        """Whether a model has nothing that only a context of its own could show, as LIBERO's have not."""
+        """Whether a model has nothing that needs a context of its own. LIBERO's models have no such thing."""
         bounded = model.geom_size[model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, :2] > 0
         return not model.nhfield and not model.nskin and bool(bounded.all()) and model.vis.quality.offsamples == SAMPLES
 
@@ -82,7 +89,7 @@ class SoftwareDrawing(PlainDrawing):
         shown = self._culling.shown
         drawn = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
         self._meshes = Meshes(self._context, model, drawn, self._meshes)
-        self._skinned = SkinnedMeshes(self._skins, self._samples, model, shown, self._meshes, self._skinned)
+        self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, shown, self._skinned)
         self._forget_underlays()
 
     def load(self, textures: Collection[int]) -> None:
@@ -115,20 +122,20 @@ class SoftwareDrawing(PlainDrawing):
         self._gl.make_current()
         shot = Shot(data, camera, self._culling.picture(data, camera))
         if shot.picture.underlaid:
-            self._draw_in_underlays(shot)
+            self._draw_over_underlays(shot)
         else:
             self._draw(shot, shot.picture.opaque)
         return self._pixels()
 
-    def _draw_in_underlays(self, shot: Shot) -> None:
-        """Draw a picture with an underlay of what no held texture is on, or of what stands still."""
+    def _draw_over_underlays(self, shot: Shot) -> None:
+        """Render a picture over an underlay: of the geoms without a held texture, or of those that stand still."""
         opaque = shot.picture.opaque & ~shot.picture.mirror
         painted = opaque & self._painted
         view, places = self._view(shot), np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1)
         places = places.astype(np.float32)
 
         def underlay(name: str, geoms: NDArray[np.bool_], draw: Callable[[], None]) -> Underlay:
-            """An underlay of the camera's pictures; it is drawn if its content is not what it was."""
+            """An underlay of the camera's pictures, rendered anew if its content has changed."""
             if (shot.camera, name) not in self._underlays:
                 height, width = self._rectangle.height, self._rectangle.width
                 self._underlays[shot.camera, name] = Underlay(self._context, height, width)
@@ -153,11 +160,11 @@ class SoftwareDrawing(PlainDrawing):
             draw_over_still(opaque, last=True)
 
     def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
-        """Draw opaque geoms (ngeom,) of a picture, over an underlay.
+        """Render opaque geoms (ngeom,) of a picture over an underlay.
 
         Args:
-            last: with what no underlay has: the mirror and what shows in it, what can be seen through, the sites, the
-                light of lamps with shadows, and the sky.
+            last: whether this completes the picture, with what is in no underlay: mirror, transparent geoms, sites,
+                shadows and sky.
         """
         picture = shot.picture
         if not last:
@@ -176,7 +183,7 @@ class SoftwareDrawing(PlainDrawing):
     def _draw_passes(
         self, shot: Shot, drawn: NDArray[np.bool_], passes: Sequence[Pass], underlay: Underlay | None, last: bool
     ) -> None:
-        """Draw geoms (ngeom,), of meshes in each pass those that it needs."""
+        """Render geoms (ngeom,); each pass renders the meshes that it needs."""
         model, picture, flags = self._model, shot.picture, self._scene.flags
         groups, site_groups = model.geom_group.copy(), model.site_group.copy()
         try:
@@ -198,13 +205,13 @@ class SoftwareDrawing(PlainDrawing):
             flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 1
 
     def _update(self, data: mujoco.MjData, camera: str) -> None:
-        """Have everything drawn, as for surfaces."""
+        """Include everything, as surfaces need."""
         super()._update(data, camera)
         everything = Pass(Draws.CAMERA, np.ones(self._model.ngeom, np.bool_))
         self._meshes.show("everything", [everything], self._scene)
 
     def _view(self, shot: Shot) -> bytes:
-        """All that a picture depends on beside textures, geoms and sites."""
+        """The bytes of all that a picture depends on beside textures, geoms and sites."""
         data, number = shot.data, self._model.camera(shot.camera).id
         fields = [getattr(self._model, name) for name in LOOK]
         fields += [data.cam_xpos[number], data.cam_xmat[number], data.light_xpos, data.light_xdir]

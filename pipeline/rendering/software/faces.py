@@ -1,4 +1,4 @@
-"""The faces of a model's meshes as MuJoCo draws them."""
+"""The faces of a model's meshes as MuJoCo uploads them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PARTS = {
     "texcoord": ("texcoord",),
     "face": ("face", "facenormal", "facetexcoord"),
 }
-"""Arrays of a model that a mesh is drawn from, by what says which part of them is the mesh's."""
+"""Arrays of a model that a mesh is made from, by the array of addresses that says which part is the mesh's."""
 
 
 class Faces(NamedTuple):

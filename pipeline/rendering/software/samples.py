@@ -1,8 +1,8 @@
-"""Which faces of a mesh a picture can show: those that cover one of its samples.
+"""Which faces of a mesh cover a sample of the picture; the others change no pixel.
 
-A picture has four samples a pixel, and most faces of LIBERO's meshes lie between them: of 90,000 faces of the arm that
-an agent view looks at, 17,000 cover a sample and do not face away. MuJoCo hands all of them to OpenGL, which finds
-that out one by one.
+A picture has four samples a pixel (multisampling), and most faces of LIBERO's meshes lie between samples: of 90,000
+faces of the arm in an agent view, 17,000 cover a sample and face the camera. MuJoCo passes all of them to OpenGL, which
+tests each one.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from pipeline.rendering.software.faces import Faces
 from pipeline.types import Floats
 
 BATCH_FACES = 341
-"""llvmpipe draws so many faces of a display list or of a buffer at once. Where one of them has a corner outside of the
-view, all of them are sorted by front and back before their corners are rounded, else afterwards."""
+"""llvmpipe processes so many faces of a display list or an index buffer at once. If one of them has a corner outside of
+the view, it tests which side of each face is seen before it rounds the corners, else afterwards."""
 
 MARGIN_PX = 1 / 128
 """How far beside a face a sample counts as covered. OpenGL rounds corners to 1/256 of a pixel, so by half of that."""
@@ -28,10 +28,10 @@ SAMPLES = 4
 
 
 class Projection(NamedTuple):
-    """How a picture shows places.
+    """How a picture shows places of some frame of reference, at first the world's.
 
     Attributes:
-        matrix: (3, 4) of a place in the world, in m, to its column, its row from below, and 1, all times its depth.
+        matrix: (3, 4) of a place, in m, to its column, its row from below, and 1, all times its depth.
         near_m, far_m: depths before and beyond which nothing is drawn.
         size_px: width and height.
     """
@@ -41,6 +41,13 @@ class Projection(NamedTuple):
     far_m: float
     size_px: tuple[int, int]
 
+    def from_frame(self, position_m: Floats, rotation: Floats) -> Projection:
+        """The same of places in a frame that stands at a position (3,) with a rotation (9,)."""
+        matrix = np.empty((3, 4))
+        matrix[:, :3] = self.matrix[:, :3] @ rotation.reshape(3, 3)
+        matrix[:, 3] = self.matrix[:, :3] @ position_m + self.matrix[:, 3]
+        return self._replace(matrix=matrix)
+
 
 def room(faces: int) -> int:
     """How many numbers ``faces_that_show`` writes at most for a mesh of so many faces: of all of them, of as many that
@@ -49,18 +56,15 @@ def room(faces: int) -> int:
 
 
 def faces_that_show(
-    projection: Projection,
-    position_m: Floats,
-    rotation: Floats,
-    faces: Faces,
-    samples: NDArray[np.float32],
-    found: NDArray[np.uint32],
+    projection: Projection, faces: Faces, samples: NDArray[np.float32], found: NDArray[np.uint32]
 ) -> int:
     """Write the corners of all faces that may cover a sample, in their order, and between them some without an area.
 
+    Three loops without branches leave out faces one after the other. With branches, most of the time would go into
+    those that the processor predicts wrongly.
+
     Args:
-        projection: of the picture.
-        position_m, rotation: (3,) and (9,) of the mesh in the world.
+        projection: of the picture, from the frame of the mesh.
         faces: of the mesh; their corners come counter-clockwise as seen from the front.
         samples: (``SAMPLES``, 2) place of each sample in its pixel, 0 to 1 to the right and up.
         found: (``room(F)``,) to write into.
@@ -68,42 +72,27 @@ def faces_that_show(
     Returns:
         How many numbers were written.
     """
-    matrix = np.empty((3, 4))
-    matrix[:, :3] = projection.matrix[:, :3] @ rotation.reshape(3, 3)
-    matrix[:, 3] = projection.matrix[:, :3] @ position_m + projection.matrix[:, 3]
-    outside, left, before, either_way = _covering(
-        matrix,
-        projection.near_m,
-        projection.far_m,
-        faces.places_m,
-        faces.place_of_corner,
-        BATCH_FACES,
-        samples,
-        *projection.size_px,
+    matrix, near_m, far_m, size_px = projection
+    corners = faces.place_of_corner
+    at_px, outside = _projected(matrix, near_m, far_m, faces.places_m, *size_px)
+    left, doubtful, before = _facing(at_px, outside, corners, BATCH_FACES)
+    count = _reaching(at_px, corners, samples, *size_px, left, doubtful, before)
+    left, doubtful, before = left[:count], doubtful[:count], before[:count]
+    count, either_way = _covering(at_px, corners, samples, left, doubtful, before)
+    return _in_batches(
+        faces.corners, corners, outside, left[:count], before[:count], either_way[:count], BATCH_FACES, found
     )
-    return _in_batches(faces.corners, faces.place_of_corner, outside, left, before, either_way, BATCH_FACES, found)
+
+
+# The loops that Numba compiles take arrays and numbers one by one: it compiles no records of ours.
 
 
 @compiled
-def _covering(
-    matrix: Floats,
-    near_m: float,
-    far_m: float,
-    places_m: NDArray[np.float32],
-    place_of_corner: NDArray[np.uint32],
-    batch_faces: int,
-    samples: NDArray[np.float32],
-    width_px: int,
-    height_px: int,
-) -> tuple[NDArray[np.bool_], NDArray[np.int32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which faces may cover a sample.
-
-    In three loops without branches, each over what the one before has left: most of the time would go into branches
-    that the processor guesses wrongly.
-
-    Returns:
-        (P,) which places are outside of the view; (L,) the numbers of the faces; and of each, whether OpenGL sorts its
-        batch before corners are rounded, and whether the face may face either way.
+def _projected(
+    matrix: Floats, near_m: float, far_m: float, places_m: NDArray[np.float32], width_px: int, height_px: int
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """(P, 2) column and row of places (P, 3), NaN near the near plane and before it, and (P,) which are outside of the
+    view.
     """
     at_px, outside = np.empty((len(places_m), 2), np.float32), np.empty(len(places_m), np.bool_)
     for place in range(len(places_m)):
@@ -113,13 +102,25 @@ def _covering(
         row = (matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]) / depth_m
         out = (column < 0) | (column > width_px) | (row < 0) | (row > height_px)
         outside[place] = out | (depth_m < near_m) | (depth_m > far_m)
-        # Cut off by the near plane, a face has other corners. Whatever NaN is compared with, the face stays.
+        # The near plane cuts a face, which then has other corners. Comparisons with NaN keep the face.
         at_px[place, 0] = column if depth_m > 1.01 * near_m else np.nan
         at_px[place, 1] = row if depth_m > 1.01 * near_m else np.nan
-    margin = np.float32(MARGIN_PX)
+    return at_px, outside
+
+
+@compiled
+def _facing(
+    at_px: NDArray[np.float32], outside: NDArray[np.bool_], place_of_corner: NDArray[np.uint32], batch_faces: int
+) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.bool_]]:
+    """The faces (L,) that may face the camera.
+
+    Returns:
+        Their numbers; of each, whether it may be turned away as well; and whether OpenGL sorts its batch by front and
+        back before corners are rounded.
+    """
     left_over, doubtful = np.empty(len(place_of_corner), np.int32), np.empty(len(place_of_corner), np.bool_)
-    before, either_way = np.empty(len(place_of_corner), np.bool_), np.empty(len(place_of_corner), np.bool_)
-    count = 0
+    before = np.empty(len(place_of_corner), np.bool_)
+    margin, count = np.float32(MARGIN_PX), 0
     for batch in range((len(place_of_corner) + batch_faces - 1) // batch_faces):
         first, last = batch_faces * batch, min(batch_faces * (batch + 1), len(place_of_corner))
         sorted_before = False
@@ -136,8 +137,27 @@ def _covering(
             left_over[count], doubtful[count] = face, not twice_area > unsure
             before[count] = sorted_before
             count += not twice_area < (-unsure / 8 if sorted_before else -unsure)
-    faces, count = count, 0
-    for number in range(faces):
+    return left_over[:count], doubtful[:count], before[:count]
+
+
+@compiled
+def _reaching(
+    at_px: NDArray[np.float32],
+    place_of_corner: NDArray[np.uint32],
+    samples: NDArray[np.float32],
+    width_px: int,
+    height_px: int,
+    left_over: NDArray[np.int32],
+    doubtful: NDArray[np.bool_],
+    before: NDArray[np.bool_],
+) -> int:
+    """Keep the faces whose rectangle of columns and rows may hold a sample of the picture.
+
+    Returns:
+        How many are kept; they are written to the front of the last three arrays, which are those of ``_facing``.
+    """
+    margin, count = np.float32(MARGIN_PX), 0
+    for number in range(len(left_over)):
         face = left_over[number]
         a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
         ax, ay, bx, by, cx, cy = at_px[a, 0], at_px[a, 1], at_px[b, 0], at_px[b, 1], at_px[c, 0], at_px[c, 1]
@@ -154,8 +174,26 @@ def _covering(
         cut = ax + bx + cx
         left_over[count], doubtful[count], before[count] = face, doubtful[number], before[number]
         count += inside | (cut != cut)
-    faces, count = count, 0
-    for number in range(faces):
+    return count
+
+
+@compiled
+def _covering(
+    at_px: NDArray[np.float32],
+    place_of_corner: NDArray[np.uint32],
+    samples: NDArray[np.float32],
+    left_over: NDArray[np.int32],
+    doubtful: NDArray[np.bool_],
+    before: NDArray[np.bool_],
+) -> tuple[int, NDArray[np.bool_]]:
+    """Keep the faces that may cover a sample.
+
+    Returns:
+        How many are kept, written to the front as in ``_reaching``; and of each, whether it may face either way.
+    """
+    either_way = np.empty(len(left_over), np.bool_)
+    margin, count = np.float32(MARGIN_PX), 0
+    for number in range(len(left_over)):
         face = left_over[number]
         a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
         ax, ay, bx, by, cx, cy = at_px[a, 0], at_px[a, 1], at_px[b, 0], at_px[b, 1], at_px[c, 0], at_px[c, 1]
@@ -177,7 +215,7 @@ def _covering(
         # To OpenGL, whose numbers have the same precision, it may face either way.
         either_way[count] = cay * bcx - cax * bcy <= unsure / 8
         count += covers | wide | doubtful[number] | (cut != cut)
-    return outside, left_over[:count], before[:count], either_way[:count]
+    return count, either_way
 
 
 @compiled

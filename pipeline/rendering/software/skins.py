@@ -1,4 +1,4 @@
-"""The large meshes of a model, drawn by those of their faces that a picture can show."""
+"""Renders of large meshes only the faces that a picture can show, by an index buffer for each."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rendering.software.faces import Faces, faces_of
-from pipeline.rendering.software.mujoco_3_2_7 import OPAQUE, SKINS, Meshes, Skins
+from pipeline.rendering.software.mujoco_3_2_7.context import SKINS
+from pipeline.rendering.software.mujoco_3_2_7.meshes import Meshes
+from pipeline.rendering.software.mujoco_3_2_7.passes import OPAQUE
+from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.samples import Projection, faces_that_show, room
 
 LEAST_FACES = 256
-"""Smaller meshes are drawn as they are."""
+"""Meshes with fewer faces are rendered whole."""
 
 
 class SkinnedMeshes:
-    """Gives each geom of a large mesh a skin, which draws chosen faces of it.
+    """Gives each geom of a large mesh a skin, which renders chosen faces of it.
 
     Args:
         skins: of a context.
         samples: (SAMPLES, 2) place of each sample in its pixel.
-        model: whose meshes they are.
-        shown: (ngeom,) which geoms can be drawn.
-        meshes: of the same model, as they are.
+        meshes: display lists of a model.
+        shown: (ngeom,) which geoms of it can be drawn.
         former: those of the model that the context was for before.
     """
 
@@ -30,12 +32,11 @@ class SkinnedMeshes:
         self,
         skins: Skins,
         samples: NDArray[np.float32],
-        model: mujoco.MjModel,
-        shown: NDArray[np.bool_],
         meshes: Meshes,
+        shown: NDArray[np.bool_],
         former: SkinnedMeshes | None = None,
     ):
-        self._skins, self._samples, self._meshes = skins, samples, meshes
+        self._skins, self._samples, self._meshes, model = skins, samples, meshes, meshes.model
         self._mesh = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
         self._skin: NDArray[np.intp] = np.full(model.ngeom, -1, np.intp)
         self._faces: dict[bytes, Faces] = {}
@@ -80,8 +81,8 @@ class SkinnedMeshes:
         for geom in geoms[skins >= 0].tolist():
             count = 0
             if wanted[geom]:
-                place_m, turn, faces = data.geom_xpos[geom], data.geom_xmat[geom], self._faces_of_geom[geom]
-                count = faces_that_show(projection, place_m, turn, faces, self._samples, self._found)
+                of_geom = projection.from_frame(data.geom_xpos[geom], data.geom_xmat[geom])
+                count = faces_that_show(of_geom, self._faces_of_geom[geom], self._samples, self._found)
             self._skins.fill_faces(int(self._skin[geom]), self._found[:count])
         having = self._mesh[geoms[skins >= 0]]
         self._skins.follow(shown, skins, self._meshes.closing[having])

@@ -1,4 +1,4 @@
-"""Which geoms stand still before a camera: table, fixtures, the robot's base, and most objects most of the time."""
+"""Chooses the geoms of a camera's underlay: those that stand still, such as the table, fixtures and most objects."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 LONGEST_WAIT = 16
-"""So many pictures at most a geom has to stand still before it is drawn with those that do."""
+"""Pictures that a geom must stand still, at most, before it joins the underlay."""
 
 
 class Still:
-    """Chooses the geoms of one camera's underlay of what stands still.
+    """Chooses the geoms of one camera's underlay.
 
-    An underlay has to be rendered anew when one of its geoms moves, and an object at rest still moves by a millionth
-    now and then. So a geom that left the underlay has to stand still for twice as many pictures before it joins again.
-    And geoms join when they were rendered beside the underlay so often that it would have paid.
+    An underlay has to be rendered anew when one of its geoms moves, and an object at rest moves by a millionth now and
+    then. So each time a geom leaves the underlay, it has to stand still for twice as many pictures to join again. Geoms
+    join once rendering them beside the underlay has cost more faces than a new underlay would have.
     """
 
     def __init__(self, model: mujoco.MjModel):

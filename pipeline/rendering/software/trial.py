@@ -1,4 +1,4 @@
-"""Whether savings give the pixels of MuJoCo's own drawing here, of a small scene that has what LIBERO's scenes have."""
+"""Renders a small scene plainly and with savings and compares the pixels; it has what LIBERO's scenes have."""
 
 from __future__ import annotations
 

@@ -1,0 +1,94 @@
+"""Whether the frames that a finished run stored are those of the plain renderer, byte for byte.
+
+    nice -n 10 python benchmarks/plain_frames.py data/starter [--every N]
+
+Renders every frame of every stream that is stored of the run's kept episodes once more, without savings
+(PLAIN_RENDERING=1), encodes it as JPEG and compares the bytes. Takes several times as long as the run's stage render;
+``--every N`` compares every N-th frame of each stream. The device must be the run's. Nothing
+is shared with the run's own loop over frames (``rendering/render.py``). The last line is JSON: kept episodes, streams,
+frames compared, and how many differ.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from contextlib import closing
+from pathlib import Path
+
+os.environ["PLAIN_RENDERING"] = "1"
+
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
+import cv2
+import numpy as np
+
+from pipeline import gl
+from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.config import load
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.files import read_json
+from pipeline.planning import plan
+from pipeline.planning.streams import Stream, streams_of
+from pipeline.rendering.renderer import Renderer
+from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.trajectory_store import TrajectoryStore
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("data", type=Path, help="folder of a run, data/<name> in a checkout")
+    parser.add_argument("--every", type=int, default=1, help="compare every so many frames of a stream")
+    arguments = parser.parse_args()
+    data = arguments.data.resolve()
+    config = load(data.parent.parent / read_json(data / "configuration.json")["configuration"])
+    store, trajectories = FrameStore(data / "frames", config.render), TrajectoryStore(data / "trajectories")
+    shown = shown_of(store.rows())
+    if any(each.device != gl.choose().device for each in shown.values()) or not shown:
+        raise PipelineError("no current frames, or of another device", where=store.root, expected=gl.choose().device)
+    streams: dict[str, dict[str, Stream]] = {}
+    episodes = 0
+    for row in plan.read(data / "plan.parquet"):
+        wanted = {stream.stream_id: stream for stream in streams_of(row.perturbations).values()}
+        if row.trajectory_id in shown and wanted.keys() <= shown[row.trajectory_id].streams:
+            streams.setdefault(row.trajectory_id, {}).update(wanted)
+            episodes += 1
+    frames, different = 0, 0
+    for number, (trajectory_id, wanted) in enumerate(streams.items(), start=1):
+        trajectory, stored = trajectories.load(trajectory_id), store.load(trajectory_id, wanted)
+        with closing(Renderer(trajectory.model_xml)) as renderer:
+            for stream_id, stream in wanted.items():
+                with renderer.perturbed(of_layer(stream.perturbations, RenderPerturbation)):
+                    for step in range(0, len(trajectory.actions), arguments.every):
+                        renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+                        file = as_stored(renderer, stream, step, config.render.jpeg_quality)
+                        frames += 1
+                        different += file != stored.streams[stream_id][step]
+        print(f"{number} of {len(streams)} trajectories: {frames} frames, {different} different", flush=True)
+    print(
+        json.dumps(
+            {
+                "episodes": episodes,
+                "streams": sum(map(len, streams.values())),
+                "every": arguments.every,
+                "frames": frames,
+                "different": different,
+            }
+        )
+    )
+
+
+def as_stored(renderer: Renderer, stream: Stream, step: int, jpeg_quality: int) -> bytes:
+    """The JPEG file of a stream's frame in the restored state."""
+    frame = renderer.frame(SCHEMA.views[stream.view].camera)
+    for noise in of_layer(stream.perturbations, PixelPerturbation):
+        frame = noise.apply(frame, step)
+    bgr = np.ascontiguousarray(frame[::-1, ::-1, ::-1])
+    return cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])[1].tobytes()
+
+
+if __name__ == "__main__":
+    main()

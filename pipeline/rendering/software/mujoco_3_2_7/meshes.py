@@ -1,0 +1,199 @@
+"""The display lists of meshes in MuJoCo 3.2.7's context: which meshes each pass of ``mjr_render`` draws."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Hashable, Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.rendering.opengl import calls, check
+from pipeline.rendering.software.faces import PARTS
+from pipeline.rendering.software.mujoco_3_2_7.passes import Draws, Pass
+from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay, recorded
+
+
+class _Lists:
+    """The display lists of one pass: a list for each mesh, an end list, and for each mesh a list that closes its skin.
+
+    Attributes:
+        base, end, closing: numbers of the first mesh's list, of the end list, and of the first closing list.
+        ends: what the end list does: the list base that it sets, and a list that it calls before.
+        drawn: (nmesh,) meshes whose faces are rendered.
+        opened: (nmesh,) meshes that a skin follows.
+        shut: (nmesh,) meshes whose skin is not rendered.
+    """
+
+    def __init__(self, meshes: int):
+        self.base = calls().glGenLists(2 * meshes + 1)
+        self.end, self.closing = self.base + meshes, self.base + meshes + 1
+        self.ends = (0, 0)
+        self.drawn, self.opened, self.shut = np.zeros((3, meshes), np.bool_)
+
+
+class Meshes:
+    """The display lists of a model's meshes in a context, which must be the current one.
+
+    The list that MuJoCo calls for a mesh calls a second list, whose number is relative to OpenGL's list base. Each pass
+    has second lists of its own, so one call of ``mjr_render`` can render different meshes in each pass. An extra mesh,
+    the last of every pass (:meth:`show`), puts underlays and sets the list base for the next pass.
+
+    MuJoCo renders skins in the world's frame. So the list of a mesh with a skin pushes the mesh's matrix onto OpenGL's
+    stack, and an extra mesh after the skin, the closing one, pops it.
+
+    Attributes:
+        model: whose meshes they are.
+        closing: (nmesh,) number, as MuJoCo numbers meshes, of the closing mesh of each mesh that is rendered.
+
+    Args:
+        context: whose meshes they become.
+        model: whose meshes they are.
+        drawn: numbers of the meshes that are rendered.
+        former: the display lists of the model before; unusable afterwards. Lists of meshes that both have are kept.
+    """
+
+    def __init__(
+        self, context: mujoco.MjrContext, model: mujoco.MjModel, drawn: Sequence[int], former: Meshes | None = None
+    ):
+        self.model, self._context, self._meshes = model, context, drawn
+        self._of_geom = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
+        kept = former._give_up() if former else {}
+        calls().glDeleteLists(context.baseMesh, context.rangeMesh)
+        context.rangeMesh = 2 * model.nmesh
+        context.baseMesh = calls().glGenLists(context.rangeMesh)
+        self.contents = {mesh: _content(model, mesh) for mesh in drawn}
+        self._faces: dict[bytes, int] = {}
+        for mesh, content in self.contents.items():
+            if content not in self._faces:
+                self._faces[content] = kept.pop(content, 0) or _uploaded(model, context, mesh)
+        for number in kept.values():
+            calls().glDeleteLists(number, 2)
+        self._own = calls().glGenLists(1 + len(drawn))
+        for place, mesh in enumerate(drawn):
+            _call_from_base(context.baseMesh + 2 * mesh, place)
+            _call_from_base(self._own + 1 + place, len(drawn) + 1 + place)
+        _call_from_base(self._own, len(drawn))
+        self.closing: NDArray[np.intp] = np.zeros(model.nmesh, np.intp)
+        self.closing[[*drawn]] = self._own + 1 + np.arange(len(drawn)) - context.baseMesh
+        self._nothing = _query_of_nothing()
+        self._passes: dict[Hashable, list[_Lists]] = {}
+
+    def _give_up(self) -> dict[bytes, int]:
+        """Delete all but the lists of faces.
+
+        Returns:
+            Hash of a mesh to the number of its list of faces.
+        """
+        calls().glDeleteLists(self._own, 1 + len(self._meshes))
+        for lists in (lists for made in self._passes.values() for lists in made):
+            calls().glDeleteLists(lists.base, 2 * len(self._meshes) + 1)
+        calls().glDeleteQueries(1, [self._nothing])
+        return self._faces
+
+    def show(
+        self,
+        name: Hashable,
+        passes: Sequence[Pass],
+        scene: mujoco.MjvScene,
+        skinned: NDArray[np.bool_] | None = None,
+        underlay: Underlay | None = None,
+    ) -> None:
+        """Choose the meshes of each pass of the next ``mjr_render``.
+
+        Args:
+            name: tells pictures apart; of one name, lists that do not change are kept from the last time.
+            passes: those of ``mjr_render``; further ones render the same as the last.
+            scene: what is rendered; the extra mesh is appended to it.
+            skinned: (nmesh,) meshes that have a skin in the scene, which renders what the camera sees of them.
+            underlay: put behind what the camera sees.
+        """
+        made = self._passes.setdefault(name, [])
+        while len(made) < len(passes):
+            made.append(_Lists(len(self._meshes)))
+        by_skin = np.zeros(len(self._meshes), np.bool_) if skinned is None else skinned[[*self._meshes]]
+        for number, (lists, one) in enumerate(zip(made, passes, strict=False)):
+            self._write(lists, one, by_skin)
+            then = made[min(number + 1, len(passes) - 1)]
+            ends = then.base, underlay.number if underlay and one.draws is Draws.CAMERA else 0
+            if lists.ends != ends:
+                with recorded(lists.end):
+                    if underlay and one.draws is Draws.CAMERA:
+                        calls().glCallList(underlay.number)
+                    calls().glListBase(then.base)
+                lists.ends = ends
+        calls().glListBase(made[0].base)
+        self._add_last(scene)
+
+    def _write(self, lists: _Lists, one: Pass, by_skin: NDArray[np.bool_]) -> None:
+        wanted = np.isin(self._meshes, self._of_geom[one.geoms])
+        drawn = wanted & ~(by_skin & one.draws.by_camera)
+        # MuJoCo renders no skins into shadow maps, and mirror images must not show them.
+        opened = by_skin & (one.draws is not Draws.LAMP_MAP)
+        shut = opened & ((one.draws is Draws.MIRROR) | ~wanted)
+        changed = (drawn != lists.drawn) | (opened != lists.opened) | (shut != lists.shut)
+        for mesh in np.flatnonzero(changed).tolist():
+            with recorded(lists.base + mesh):
+                if drawn[mesh]:
+                    calls().glCallList(self._faces[self.contents[self._meshes[mesh]]])
+                if opened[mesh]:
+                    calls().glPushMatrix()
+                if shut[mesh]:
+                    calls().glBeginConditionalRender(self._nothing, calls().GL_QUERY_WAIT)
+            with recorded(lists.closing + mesh):
+                if shut[mesh]:
+                    calls().glEndConditionalRender()
+                if opened[mesh]:
+                    calls().glPopMatrix()
+        lists.drawn, lists.opened, lists.shut = drawn, opened, shut
+
+    def _add_last(self, scene: mujoco.MjvScene) -> None:
+        """Append the extra mesh to the scene: MuJoCo renders it after all other opaque geoms."""
+        geom = scene.geoms[scene.ngeom]
+        white, nowhere, straight = np.ones(4, np.float32), np.zeros(3), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_MESH, nowhere, nowhere, straight, white)
+        # As decor, which mjv_initGeom makes it, it would not be called for shadows.
+        geom.category, geom.dataid = mujoco.mjtCatBit.mjCAT_DYNAMIC, self._own - self._context.baseMesh
+        # What mjv_initGeom leaves as it was: nothing to write beside it, and nothing to show of it in a segmentation.
+        geom.label, geom.segid = "", -1
+        scene.ngeom += 1
+
+
+def _content(model: mujoco.MjModel, mesh: int) -> bytes:
+    """A hash of all that a mesh's faces are rendered from."""
+    digest = hashlib.sha256()
+    for part, names in PARTS.items():
+        first, count = getattr(model, f"mesh_{part}adr")[mesh], getattr(model, f"mesh_{part}num")[mesh]
+        for name in names:
+            digest.update(getattr(model, f"mesh_{name}")[first : first + count].tobytes())
+    return digest.digest()
+
+
+def _query_of_nothing() -> int:
+    """An occlusion query that no sample passed."""
+    opengl = calls()
+    number = int(opengl.glGenQueries(1)[0])
+    opengl.glBeginQuery(opengl.GL_ANY_SAMPLES_PASSED, number)
+    opengl.glEndQuery(opengl.GL_ANY_SAMPLES_PASSED)
+    return number
+
+
+def _call_from_base(number: int, place: int) -> None:
+    """Record a list that calls the list at an offset from the list base."""
+    with recorded(number):
+        calls().glCallLists(np.array([place], np.uint32))
+
+
+def _uploaded(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int) -> int:
+    """The number of a new list into which MuJoCo uploads a mesh's faces; a second one after it stays unused."""
+    base, hull = context.baseMesh, int(model.mesh_graphadr[mesh])
+    number: int = calls().glGenLists(2)
+    try:
+        model.mesh_graphadr[mesh] = -1
+        context.baseMesh = number - 2 * mesh
+        mujoco.mjr_uploadMesh(model, context, mesh)
+        check("mjr_uploadMesh")
+    finally:
+        context.baseMesh, model.mesh_graphadr[mesh] = base, hull
+    return number

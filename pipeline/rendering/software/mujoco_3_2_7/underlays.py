@@ -1,0 +1,140 @@
+"""Colour and depth of MuJoCo 3.2.7's off-screen buffer, copied and put back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import mujoco
+
+from pipeline.rendering.opengl import calls, failure
+
+
+@contextmanager
+def recorded(number: int) -> Iterator[None]:
+    """Record OpenGL's commands into a display list instead of executing them."""
+    calls().glNewList(number, calls().GL_COMPILE)
+    try:
+        yield
+    finally:
+        calls().glEndList()
+
+
+_VERTICES = "#version 400 compatibility\nvoid main() { gl_Position = gl_Vertex; }"
+
+# The far end of MuJoCo's depth is 0: nothing was drawn there, and what was is the sky, which is in every picture.
+_SAMPLES = """#version 400 compatibility
+uniform sampler2DMS colours, depths;
+void main() {
+    ivec2 pixel = ivec2(gl_FragCoord.xy);
+    float depth = texelFetch(depths, pixel, gl_SampleID).r;
+    if (depth == 0.0) discard;
+    gl_FragColor = texelFetch(colours, pixel, gl_SampleID);
+    gl_FragDepth = depth;
+}
+"""
+
+
+class Underlay:
+    """A part of a picture that is rendered once and used in many: colour and depth of every sample.
+
+    The context must be the current one.
+
+    Attributes:
+        number: of the display list that writes the underlay into the off-screen buffer, at samples where nothing nearer
+            was rendered; at equal depth the underlay wins. MuJoCo calls it after all opaque geoms (``Meshes``).
+        content: identifies what was kept; empty at first.
+
+    Args:
+        context: of MuJoCo, with the off-screen buffer that pictures are rendered into.
+        height, width: of the pictures, which begin in that buffer's corner.
+    """
+
+    def __init__(self, context: mujoco.MjrContext, height: int, width: int):
+        opengl = calls()
+        self._buffer, self._height, self._width = context.offFBO, height, width
+        self._textures = [
+            self._texture(context.offColor, context.offSamples),
+            self._texture(context.offDepthStencil, context.offSamples),
+        ]
+        self._kept = opengl.glGenFramebuffers(1)
+        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._kept)
+        places = opengl.GL_COLOR_ATTACHMENT0, opengl.GL_DEPTH_STENCIL_ATTACHMENT
+        for place, texture in zip(places, self._textures, strict=True):
+            opengl.glFramebufferTexture2D(opengl.GL_FRAMEBUFFER, place, opengl.GL_TEXTURE_2D_MULTISAMPLE, texture, 0)
+        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
+        self._program = self._shaders()
+        self.number = calls().glGenLists(1)
+        with recorded(self.number):
+            self._draw()
+        self.content = b""
+
+    def keep(self, content: bytes) -> None:
+        """Copy the off-screen buffer."""
+        # Of less than all, OpenGL here does not copy each sample by itself.
+        opengl, rectangle = calls(), (0, 0, self._width, self._height)
+        opengl.glPushAttrib(opengl.GL_SCISSOR_BIT)
+        opengl.glDisable(opengl.GL_SCISSOR_TEST)
+        opengl.glBindFramebuffer(opengl.GL_READ_FRAMEBUFFER, self._buffer)
+        opengl.glBindFramebuffer(opengl.GL_DRAW_FRAMEBUFFER, self._kept)
+        opengl.glBlitFramebuffer(
+            *rectangle, *rectangle, opengl.GL_COLOR_BUFFER_BIT | opengl.GL_DEPTH_BUFFER_BIT, opengl.GL_NEAREST
+        )
+        opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._buffer)
+        opengl.glPopAttrib()
+        self.content = content
+
+    def _draw(self) -> None:
+        opengl = calls()
+        opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)
+        for setting in (
+            opengl.GL_ALPHA_TEST,
+            opengl.GL_BLEND,
+            opengl.GL_CULL_FACE,
+            opengl.GL_POLYGON_OFFSET_FILL,
+            opengl.GL_STENCIL_TEST,
+        ):
+            opengl.glDisable(setting)
+        opengl.glEnable(opengl.GL_DEPTH_TEST)
+        # MuJoCo's depth grows towards the camera.
+        opengl.glDepthFunc(opengl.GL_GEQUAL)
+        opengl.glDepthMask(True)
+        opengl.glColorMask(True, True, True, True)
+        opengl.glPolygonMode(opengl.GL_FRONT_AND_BACK, opengl.GL_FILL)
+        opengl.glViewport(0, 0, self._width, self._height)
+        for unit, texture in enumerate(self._textures):
+            opengl.glActiveTexture(opengl.GL_TEXTURE0 + unit)
+            opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, texture)
+        opengl.glUseProgram(self._program)
+        opengl.glRectf(-1, -1, 1, 1)
+        opengl.glUseProgram(0)
+        opengl.glPopAttrib()
+
+    def _texture(self, renderbuffer: int, samples: int) -> int:
+        """A texture for as many samples as a renderbuffer has, in its format: others cannot be copied as they are."""
+        opengl = calls()
+        opengl.glBindRenderbuffer(opengl.GL_RENDERBUFFER, renderbuffer)
+        kind = opengl.glGetRenderbufferParameteriv(opengl.GL_RENDERBUFFER, opengl.GL_RENDERBUFFER_INTERNAL_FORMAT)
+        texture: int = opengl.glGenTextures(1)
+        opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, texture)
+        opengl.glTexImage2DMultisample(opengl.GL_TEXTURE_2D_MULTISAMPLE, samples, kind, self._width, self._height, True)
+        opengl.glBindTexture(opengl.GL_TEXTURE_2D_MULTISAMPLE, 0)
+        return texture
+
+    def _shaders(self) -> int:
+        opengl = calls()
+        program: int = opengl.glCreateProgram()
+        for kind, text in ((opengl.GL_VERTEX_SHADER, _VERTICES), (opengl.GL_FRAGMENT_SHADER, _SAMPLES)):
+            shader = opengl.glCreateShader(kind)
+            opengl.glShaderSource(shader, text)
+            opengl.glCompileShader(shader)
+            opengl.glAttachShader(program, shader)
+            opengl.glDeleteShader(shader)
+        opengl.glLinkProgram(program)
+        if not opengl.glGetProgramiv(program, opengl.GL_LINK_STATUS):
+            raise failure(f"OpenGL refuses the shaders of underlays: {opengl.glGetProgramInfoLog(program)!r}")
+        opengl.glUseProgram(program)
+        for unit, name in enumerate(("colours", "depths")):
+            opengl.glUniform1i(opengl.glGetUniformLocation(program, name), unit)
+        opengl.glUseProgram(0)
+        return program
