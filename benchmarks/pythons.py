@@ -120,9 +120,8 @@ def main() -> None:
         name = subprocess.run([python, "-V"], check=True, capture_output=True, text=True).stdout.strip()
         data = run / "data" / "pythons"
         made[name] = {(kind, path): digest for kind, path, digest in contents(data)}
-        findings = json.loads((data / "validation.json").read_text())["findings"]
         seconds = {"install_s": round(installed - start), "run_s": round(time.monotonic() - installed)}
-        report[name] = {**versions, **seconds, "validation_findings": len(findings)}
+        report[name] = {**versions, **seconds}
         print(name, report[name], flush=True)
     first = next(iter(made.values()))
     compared = {kind: sum(1 for one, _ in first if one == kind) for kind, _ in first}
