@@ -161,7 +161,7 @@ def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
         ({"source": "libero_plus", "components": ("dist",)}, "distance or fog or gaussian"),
         ({"source": "own", "axes": ("camera",), "components": ("dist",)}, "distance or orientation or spherical"),
         ({"components": ("distance",)}, "expected: clean"),
-        ({"suites": ("libero_gaol",)}, "libero_10 or libero_goal"),
+        ({"suites": ("libero_gaol",)}, "libero_10 or libero_90 or libero_goal"),
         ({"axes": ("camera",)}, "expected: clean"),
         ({"tasks": ("turn_on*", "turn_of_the_stove")}, "turn_on_the_stove"),
         ({"source": "libero_plus", "axes": ("camera",), "components": ("fog",)}, "axes noise; or components distance"),

@@ -150,7 +150,7 @@ def test_what_is_shown_is_what_the_plan_draws(name: str, monkeypatch: pytest.Mon
     for count in ("CANDIDATES", "VARIANTS", "PHYSICS_VARIANTS"):
         monkeypatch.setattr(preview, count, 12)
     test, demo, axis = benchmark.load(), starter_demo(MILK), preview.configured(name, STARTER)
-    config = PlanConfig.model_validate({"seed": 5, "axes": {name: axis}, "episodes": {name: 12}})
+    config = PlanConfig.model_validate({"seed": 5, "axes": {name: axis}, "episodes": {name: 12}, "reserve": 0})
     entry = DemoEntry(MILK, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
     rows = [row for row in plan.make([entry], config, STARTER.replay, test) if row.role == "perturbed"]
     shown = preview.variants(name, axis, demo, 5, test)
