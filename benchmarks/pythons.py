@@ -76,7 +76,7 @@ def make(python: Path, folder: Path, testset: Path) -> None:
 
 
 def contents(data: Path) -> Iterator[tuple[str, str, str]]:
-    """Kind, name and SHA-256 of what a run made; of stored files the arrays but ``attributes``, which name the packages."""
+    """Kind, name and SHA-256 of what a run made; of stored files all but ``attributes``, which name the packages."""
     yield "plan", "plan.parquet", hashlib.sha256((data / "plan.parquet").read_bytes()).hexdigest()
     for kind in ("trajectories", "frames"):
         for path in sorted((data / kind).rglob("*.h5")):
