@@ -3,7 +3,7 @@
 1. A step makes files from inputs: physics makes trajectories, pixels makes frames, encoding makes files of frames.
 2. What a file was made with has three parts: recipe numbers, package versions, and the processor's machine code.
 3. A recipe is a number in ``RECIPES``. Raise it in the commit that changes what the step makes, and only then.
-4. ``tests/golden.json`` has what each number makes of a few short inputs; a test fails when only one of both changes.
+4. ``golden.json`` of the tests has what each number makes of short inputs; a test fails when only one of both changes.
 5. ``PACKAGES`` names the packages that compute a step. This project's own version is not among them.
 6. A step that builds on others (``AFTER``) has their recipes and packages too.
 7. The fingerprint of a file is a digest of all this and of the settings that its bytes depend on.

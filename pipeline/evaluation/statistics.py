@@ -73,7 +73,7 @@ def success_rate(rows: Sequence[EpisodeResult]) -> dict[str, Any]:
 
 
 SAMPLE = 10
-"""So many base tasks are a sample. Simulated, intervals of ten cover 94 to 96 % (tests/test_bootstrap.py)."""
+"""So many base tasks are a sample. Simulated, intervals of ten cover 94 to 96 % (``test_bootstrap.py``)."""
 
 FEW = 5
 """Fewer trials of a base task say too little about how they scatter."""

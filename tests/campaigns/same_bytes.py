@@ -1,6 +1,6 @@
 """Makes one configuration with no worker process, with 1, 2 and 4, and with 2 again, and compares all that they wrote.
 
-    python tests/same_bytes.py
+    python tests/campaigns/same_bytes.py
 
 Each run is a `dvc repro` in a folder of its own, on the tests' short demonstrations. Of their files only the
 configuration may differ. The last line is JSON.
@@ -10,10 +10,15 @@ from __future__ import annotations
 
 import json
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
 
+if __name__ == "__main__":  # run as a script: with what the tests share
+    sys.path[:0] = [str(Path(__file__).parents[1])]
+
+# isort: split
 from conftest import STOVE, dvc, in_a_clone, loaded_whole, replay_whole, tiny_config, write_short_demos
 from kills import compared
 

@@ -1,4 +1,4 @@
-"""A few short real episodes whose results are written down: `python tests/golden.py` adds what is not yet there.
+"""Results of a few short real episodes, written down: `python tests/campaigns/golden.py` adds what is not yet there.
 
 Numbers that are there are never written over. Where a result has changed, raise its step's number in
 ``pipeline.identity.RECIPES`` in the same commit and run this again: then every stored file of that step is made anew.
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 if __name__ == "__main__":  # run as a script, from anywhere
-    sys.path[:0] = [os.fspath(Path(__file__).parent.parent)]
+    sys.path[:0] = [os.fspath(folder) for folder in Path(__file__).parents[1:3]]
 
 from pipeline import gl, identity  # before NumPy, whose machine code this fixes
 

@@ -57,7 +57,9 @@ def slurm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     file = folder / "slurm.conf"
     file.write_text(settings)
     monkeypatch.setenv("SLURM_CONF", str(file))
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join((str(REPOSITORY), str(REPOSITORY / "tests"))))
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join(map(str, (REPOSITORY, REPOSITORY / "tests", REPOSITORY / "tests" / "compute")))
+    )
     monkeypatch.setenv("PATH", "/usr/sbin", prepend=os.pathsep)
     with ExitStack() as stack:
         logs = stack.enter_context((folder / "slurm.log").open("w"))

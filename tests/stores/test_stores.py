@@ -481,7 +481,7 @@ def test_rendering_that_leaves_the_same_work_undone_is_an_error(
 
 
 def given_up(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
-    """What a cluster does with work that no worker survives; see tests/test_compute.py for workers that die."""
+    """What a cluster does with work that no worker survives; see tests/compute/test_compute.py for workers that die."""
     return [fn.lost(item) for item in items]
 
 

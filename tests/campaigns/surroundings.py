@@ -1,7 +1,7 @@
 """Runs every stage where its surroundings fail it: on a full disk, a read-only one, without a network, and by a clock
 that goes back.
 
-    sudo python tests/surroundings.py        # mounts a small file system, and takes the network away
+    sudo python tests/campaigns/surroundings.py        # mounts a small file system, and takes the network away
 
 Two folders get the same configuration. In one, every stage runs without a network. In the other, the data folder is a
 file system that cannot be written to before each stage, and then grows each time that it is full. A stage that cannot
@@ -24,6 +24,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+if __name__ == "__main__":  # run as a script: with what the tests share
+    sys.path[:0] = [str(Path(__file__).parents[1])]
+
+# isort: split
 from conftest import IN_SCRIPTS, STAGES, in_a_clone
 from kills import STARTER, compared
 

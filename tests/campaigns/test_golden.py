@@ -9,7 +9,7 @@ from golden import Golden, recorded
 
 from pipeline import gl, identity
 
-REMEDY = "raise the step's number in pipeline.identity.RECIPES and run `python tests/golden.py`"
+REMEDY = "raise the step's number in pipeline.identity.RECIPES and run `python tests/campaigns/golden.py`"
 GREY_LEVELS = 3.0
 """How far a cell of a thumbnail may be off on a renderer that is not recorded."""
 
@@ -46,7 +46,7 @@ def test_stages_behind_the_frames(step: identity.Step) -> None:
 
 def test_every_recipe_has_golden_results() -> None:
     lacking = [step for step, number in identity.RECIPES.items() if str(number) not in recorded()[step]]
-    assert lacking == [], "run `python tests/golden.py`"
+    assert lacking == [], "run `python tests/campaigns/golden.py`"
 
 
 def test_a_changed_pixel_is_noticed(golden: Golden) -> None:

@@ -168,7 +168,10 @@ def test_a_cluster_that_goes_away_is_not_waited_for(
     monkeypatch.setattr("pipeline.compute.pool.ALONE_S", 2)
     monkeypatch.setattr("pipeline.compute.pool.LOOK_S", 1)
     script = Path(sys.executable).parent / "dask"
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), str(REPOSITORY / "tests")])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(map(str, (REPOSITORY, REPOSITORY / "tests", REPOSITORY / "tests" / "compute"))),
+    }
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{free.getsockname()[1]}"

@@ -394,7 +394,10 @@ print(sorted({"torch", "tensorflow", "lerobot"} & sys.modules.keys()))
 
 def test_rlds_is_made_and_checked_and_lerobot_written_without_torch(tmp_path: Path) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_TORCH, str(tmp_path)], cwd=Path(__file__).parent, capture_output=True, text=True
+        [sys.executable, "-c", WITHOUT_TORCH, str(tmp_path)],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout == "[]\n"

@@ -90,12 +90,12 @@ def test_same_bytes_first_or_tenth_and_in_a_fresh_process(short_demos: Path) -> 
         assert replayed(short_demos, MILK, environment, "demo_1").verdict.reason == "goal_not_reached"
         assert hashed(replayed(short_demos, MILK, environment)) == first
     script = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import sys; sys.path[:0] = sys.argv[1:3]\n"
         "from pathlib import Path; from test_replay import *\n"
-        "print(hashed(replayed(Path(sys.argv[2]), MILK, Environment(MILK))))"
+        "print(hashed(replayed(Path(sys.argv[3]), MILK, Environment(MILK))))"
     )
     fresh = subprocess.run(
-        [sys.executable, "-c", script, str(Path(__file__).parent), str(short_demos)],
+        [sys.executable, "-c", script, *map(str, Path(__file__).parents[:2]), str(short_demos)],
         capture_output=True,
         text=True,
         check=True,

@@ -1,4 +1,4 @@
-"""A run that is killed anywhere ends as if it was not; `python tests/kills.py` does this fifty times."""
+"""A run that is killed anywhere ends as if it was not; `python tests/campaigns/kills.py` does this fifty times."""
 
 from __future__ import annotations
 

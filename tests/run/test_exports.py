@@ -97,8 +97,8 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
     code = f"import test_exports as t, pathlib; t.killed_export({name!r}, pathlib.Path({str(tmp_path)!r}), {where!r})"
     done = subprocess.run(
         [sys.executable, "-c", code],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(("tests", os.environ.get("PYTHONPATH", "")))},
-        cwd=Path(__file__).parent.parent,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(("tests", "tests/run", os.environ.get("PYTHONPATH", "")))},
+        cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
         check=False,

@@ -1,4 +1,4 @@
-"""Damaged and hostile files are refused with words; `python tests/fuzz.py` tries a thousand."""
+"""Damaged and hostile files are refused with words; `python tests/campaigns/fuzz.py` tries a thousand."""
 
 from __future__ import annotations
 
@@ -16,5 +16,5 @@ def test_damaged_files_are_refused_or_harmless() -> None:
     seed = date.today().toordinal()
     kinds = random.Random(seed).sample(sorted(KINDS), KINDS_A_DAY)
     outcomes, faults = check(kinds, CASES, seed)
-    assert faults == [], f"python tests/fuzz.py --seed {seed} --cases {CASES} --kinds {' '.join(kinds)}"
+    assert faults == [], f"python tests/campaigns/fuzz.py --seed {seed} --cases {CASES} --kinds {' '.join(kinds)}"
     assert outcomes.total() >= CASES

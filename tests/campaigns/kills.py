@@ -1,6 +1,6 @@
 """Kills a run at pseudo-random moments, and asks whether it ends like one that was left alone.
 
-    python tests/kills.py [--kills 50] [--seed 0]
+    python tests/campaigns/kills.py [--kills 50] [--seed 0]
 
 Two folders get the same configuration. In one `dvc repro` runs undisturbed. In the other it is killed by SIGKILL again
 and again, every stage as often as any other and after a time that is drawn: everything at once, the stage's process
@@ -18,6 +18,7 @@ import random
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -27,6 +28,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+if __name__ == "__main__":  # run as a script: with what the tests share
+    sys.path[:0] = [str(Path(__file__).parents[1])]
+
+# isort: split
 import psutil
 from conftest import IN_SCRIPTS, SCRIPTS, dvc, in_a_clone
 

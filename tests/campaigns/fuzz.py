@@ -1,6 +1,6 @@
 """Feeds damaged and hostile files to everything that reads one.
 
-    python tests/fuzz.py [--cases 1000] [--seed 0] [--kinds plan recording ...]
+    python tests/campaigns/fuzz.py [--cases 1000] [--seed 0] [--kinds plan recording ...]
 
 Each case changes a real file at random, by a key of its own, and reads it as the project does. It passes where the
 reader gives what was written, or raises a `PipelineError`, which names the file. Anything else is a fault: another
@@ -25,6 +25,9 @@ from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+if __name__ == "__main__":  # run as a script: with what the tests share
+    sys.path[:0] = [str(Path(__file__).parents[1])]
 
 import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
