@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,11 +30,14 @@ from pipeline.run.counts import Counts, Rows
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Floats
+from pipeline.types import Floats, Quality
 
 FILE = "report.html"
 REWRITES = 12
 """So many are quoted."""
+
+WORST = 10
+"""So many episodes are shown that moved other objects farthest."""
 
 
 class Video(NamedTuple):
@@ -72,6 +75,8 @@ def page(config: Config, test: TestSet) -> str:
         overall=_overall(kept, actions),
         by_axis=_own_motion(kept, actions),
         lengths=_lengths(rows, kept),
+        quality=_quality(kept),
+        worst=_worst(kept, load),
         seen=seen.measure(config, test),
         coverage=_coverage(tried, test),
         rewrites=_rewrites(kept),
@@ -152,6 +157,28 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
     return [*panels, figures.strips("longer than the twin by", longer, "steps")] if longer else panels
 
 
+def _quality(kept: Rows) -> list[Panel]:
+    """A panel for each figure of quality, by axis."""
+    groups = _by_axis(kept).items()
+    return [
+        figures.strips(
+            each.name,
+            {axis: {axis: np.array([float(row[each.name]) for row in rows])} for axis, rows in groups},
+            each.name,
+        )
+        for each in fields(Quality)
+    ]
+
+
+def _worst(kept: Rows, load: EpisodeLoader) -> list[Video]:
+    """The trajectories that moved an object farthest which the goal does not name, beside their clean twins."""
+    by_id = {row["episode_id"]: row for row in kept}
+    of_trajectory = {row["trajectory_id"]: row for row in kept if row["twin_id"] in by_id}
+    moving = [row for row in of_trajectory.values() if row["non_target_moved_m"]]
+    shown = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
+    return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in shown]
+
+
 def _by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
     groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
@@ -193,15 +220,17 @@ def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
     """The strongest episode of each axis that shows it in the agent view, the shortest of several, beside its twin."""
     by_id = {row["episode_id"]: row for row in kept}
     videos = []
-    for axis, rows in _by_axis(kept).items():
+    for rows in _by_axis(kept).values():
         seen = [row for row in rows if row["twin_id"] in by_id and _looks_different(row, by_id[row["twin_id"]])]
         if seen:
             row = min(seen, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
-            twin, episode = load(row["twin_id"]), load(row["episode_id"])
-            caption = "; ".join(describe(made) for made in from_json(row["perturbations"]))
-            clip = clips.beside(twin.frames["image"], episode.frames["image"])
-            videos.append(Video(axis, caption, row["instruction"], clip))
+            videos.append(_video(row, load, "; ".join(describe(made) for made in from_json(row["perturbations"]))))
     return videos
+
+
+def _video(row: Mapping[str, Any], load: EpisodeLoader, caption: str) -> Video:
+    twin, episode = load(row["twin_id"]), load(row["episode_id"])
+    return Video(row["axis"], caption, row["instruction"], clips.beside(twin.frames["image"], episode.frames["image"]))
 
 
 def _looks_different(row: Mapping[str, Any], twin: Mapping[str, Any]) -> bool:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import base64
 import io
 import json
+import re
 import shutil
 from collections.abc import Iterator
+from dataclasses import fields
 from pathlib import Path
 
 import av
@@ -31,6 +33,7 @@ from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.tables import write_table
 from pipeline.testset import benchmark
+from pipeline.types import Quality
 
 LIMIT_BYTES = 15_000_000
 
@@ -88,6 +91,14 @@ def test_numbers_are_those_of_the_manifest(page: Page, finished: Path) -> None:
             assert f"{component.replace('_', ' ')} {shown} {covered['test_tasks']:,}" in words
 
 
+def test_every_figure_of_quality_has_a_panel_and_what_moved_others_is_shown(page: Page, finished: Path) -> None:
+    rows = [row for row in manifest.read(finished / "manifest.parquet") if row["kept"]]
+    assert all(each.name in page.text for each in fields(Quality))
+    assert all(row[each.name] is not None for row in rows for each in fields(Quality))
+    moved = {row["trajectory_id"]: row["non_target_moved_m"] for row in rows if row["non_target_moved_m"]}
+    assert sorted(re.findall(r"(\d+\.\d) cm ", page.text)) == sorted(f"{100 * far:.1f}" for far in moved.values())
+
+
 def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Page, finished: Path) -> None:
     pictures = page.of("img")
     assert len(pictures) == len([*finished.glob("sheets/*.png"), *finished.glob("previews/*/*.png")]) > 6
@@ -95,7 +106,8 @@ def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Pa
     for picture in pictures:
         assert np.std(np.asarray(Image.open(io.BytesIO(_content(picture["src"]))))) > 20
     videos = [_content(video["src"]) for video in page.of("video")]
-    assert len(videos) == 2  # camera and noise; a rewritten instruction shows in no frame
+    moved = re.findall(r"\d+\.\d cm ", page.text)
+    assert len(videos) == 2 + len(moved)  # camera and noise; a rewritten instruction shows in no frame
     assert max(map(len, videos)) <= VIDEO_BYTES
 
 
