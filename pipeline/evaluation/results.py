@@ -174,7 +174,7 @@ def refuse_different(found: Iterable[Stored], across: Collection[str] = ()) -> N
         "these results cannot be compared, on ",
         expected="one prompt and one step limit for all that is compared",
         remedy="evaluate both alike, or leave one of the folders out; where the difference is what you compare, "
-        "`evaluation-report --across prompt`, or --across step_limit",
+        "`analyse report --across prompt`, or --across step_limit",
     )
 
 

@@ -174,7 +174,10 @@ def test_rlds_features_are_openvlas(written: Written) -> None:
     matrices = {f"{view}_{name}": shape for view in SCHEMA.views for name, shape in MATRICES.items()}
     assert set(features["episode_metadata"]) == {"file_path", *matrices, *SCHEMA.provenance}
     assert {name: features["episode_metadata"][name].shape for name in matrices} == matrices
-    assert {name for name, of in features["episode_metadata"].items() if of.np_dtype == np.int64} == {"seed"}
+    assert {name for name, of in features["episode_metadata"].items() if of.np_dtype == np.int64} == {
+        "seed",
+        "touched_steps",
+    }
     leaves = [*features["steps"].feature.items(), *observation.items(), *features["episode_metadata"].items()]
     assert [name for name, of in leaves if name != "observation" and not of.doc.desc] == []
     assert all(word in observation["state"].doc.desc for word in ("world", "metres", "radians", "eef_x_m"))

@@ -275,7 +275,7 @@ def test_dry_run_says_what_would_go(made: Path) -> None:
     )
     size = sum(file.stat().st_size for file in upload.files.values())
     summary = upload.summary()
-    assert re.search(rf"5 files .* MB  {folder}/", summary)
+    assert re.search(rf"6 files .* MB  {folder}/", summary)
     assert re.search(rf"{len(upload.files)} files +{size / 1e6:.1f} MB  in all", summary)
     assert "tag: none" in summary
     assert f"tag: {CODEBASE_VERSION}" in prepare(made, "lerobot").summary()

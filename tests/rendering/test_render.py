@@ -196,7 +196,7 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     store = FrameStore(tmp_path, RenderConfig())
     store.save("t", rendered, "some device")
     (row,) = store.rows().values()
-    assert set(row["streams"]) == {stream.stream_id for stream in streams}
+    assert {*row["streams"], *json.loads(row["rejected"])} == {stream.stream_id for stream in streams}
     assert json.loads(row["rejected"]) == rendered.rejected
 
 

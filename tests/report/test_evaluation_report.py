@@ -121,7 +121,7 @@ def test_results_under_different_prompts_or_limits_are_not_compared(
     folders = [write(tmp_path / "one", [one]), write(tmp_path / "other", [other])]
     graded = ["analyse", "grade", *map(str, folders), "--out", str(tmp_path / "graded.json")]
     page = str(tmp_path / "report.html")
-    for command in (graded, ["evaluation-report", *map(str, folders), "--out", page]):
+    for command in (graded, ["analyse", "report", *map(str, folders), "--out", page]):
         arguments = parser().parse_args(command)
         with pytest.raises(PipelineError) as caught:
             arguments.run(arguments)
@@ -131,7 +131,7 @@ def test_results_under_different_prompts_or_limits_are_not_compared(
         for folder, row in zip(folders, (one, other), strict=True):
             assert str(EpisodeFiles(folder).path(row.episode)) in told
         assert f"--across {field}" in told
-    arguments = parser().parse_args(["evaluation-report", *map(str, folders), "--out", page, "--across", field])
+    arguments = parser().parse_args(["analyse", "report", *map(str, folders), "--out", page, "--across", field])
     assert arguments.run(arguments) == 0
     # Another suite has another limit, and another source another wording.
     elsewhere = result(EvaluationTask("libero", "libero_10", "a", "a_state0", "clean", "clean", 0, 0), policy="other")

@@ -334,7 +334,7 @@ NIGHT = LightPerturbation(component="diffuse", level=5, diffuse_scale_rgb=(0.0, 
 @pytest.fixture
 def rejecting(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every frame under a changed light counts as too dark: LIBERO's head light keeps real draws from being so."""
-    monkeypatch.setattr("pipeline.rendering.render.exposure", lambda frame: "too_dark")
+    monkeypatch.setattr("pipeline.rendering.sight.exposure", lambda frame: "too_dark")
 
 
 def without_twins(rows: Sequence[plan.Row]) -> list[plan.Row]:
