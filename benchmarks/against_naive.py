@@ -59,7 +59,7 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         trajectories, frames = Path(temporary) / "trajectories", Path(temporary) / "frames"
         begun = time.process_time()
-        verdicts = Replays(config.demos, config.replay, trajectories, loop).of(rows)
+        verdicts = Replays(config.demos, config.replay, trajectories, loop, config.filter).of(rows)
         replayed = time.process_time()
         render_plan(rows, config, trajectories, frames, loop)
         rendered = time.process_time()

@@ -37,7 +37,7 @@ CONFIG = {
     "plan": {"seed": 20261121, "axes": {name: {} for name in AXES}, "episodes": dict.fromkeys(AXES, 1)},
     "replay": {"mode": "auto", "noops": "drop"},
     "render": {"jpeg_quality": 95},
-    "export": {"rlds": {"name": "libero_pythons", "shards": 2}, "lerobot": {"name": "libero_pythons", "parts": 2}},
+    "export": {"rlds": {"name": "libero_pythons", "shards": 2}, "lerobot": {"name": "libero_pythons", "shards": 2}},
 }
 WITHOUT_TORCH = ("doctor", "inputs", "plan", "leakage", "replay", "render", "export_rlds")
 WITH_TORCH = ("export_lerobot", "manifest", "recipe", "validate")
@@ -66,7 +66,7 @@ def make(python: Path, folder: Path, testset: Path) -> None:
     blocked = folder / "without torch"
     blocked.mkdir()
     (blocked / "torch.py").write_text("raise ImportError('torch is not to be imported here')\n")
-    preview = ["-m", "pipeline", "preview", "libero_goal/put_the_bowl_on_the_plate", "camera", "--config", str(config)]
+    preview = ["-m", "pipeline", "preview", "libero_goal/put_the_bowl_on_the_plate", "camera", str(config)]
     for arguments in (["-m", "pipeline", "--help"], preview):
         subprocess.run([python, *arguments], cwd=folder, check=True, stdout=subprocess.DEVNULL)
     for stages, path in ((WITHOUT_TORCH, str(blocked)), (WITH_TORCH, "")):

@@ -84,6 +84,7 @@ def render(
             geometry.stream_id: Geometry(np.eye(3, dtype=np.float32), np.eye(4, dtype=np.float32))
             for geometry in {stream.geometry for stream in streams}
         },
+        quality=trajectory.quality,
     )
 
 

@@ -47,7 +47,7 @@ def main() -> None:
     with TemporaryDirectory() as temporary:
         root = Path(temporary)
         trajectories = root / "trajectories"
-        Replays(config.demos, config.replay, trajectories, loop).of(rows)
+        Replays(config.demos, config.replay, trajectories, loop, config.filter).of(rows)
 
         def rendered(run: Workers, name: str) -> float:
             start = time.perf_counter()

@@ -21,7 +21,7 @@ def run(config: Config) -> None:
     TrajectoryStore(folder).keep(row.trajectory_id for row in rows)
     kept = sum(verdict.kept for verdict in verdicts.values())
     write_json(config.data / "replay.json", {"replayed": len(verdicts), "kept": kept})
-    print(f"replayed {len(verdicts)} trajectories, {kept} reach their goal")
+    print(f"replayed {len(verdicts)} trajectories, {kept} are kept")
 
 
 if __name__ == "__main__":

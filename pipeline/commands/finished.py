@@ -45,7 +45,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _regenerate_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("episode_id", metavar="EPISODE_ID", help="as in the manifest and in both datasets")
+    command.add_argument("episode_id", metavar="EPISODE_ID", help="as in the manifest and in the datasets")
     add_config(command)
     command.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for what is rebuilt")
     command.add_argument(

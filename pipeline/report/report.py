@@ -173,7 +173,9 @@ def _quality(kept: Rows) -> list[Panel]:
 def _worst(kept: Rows, load: EpisodeLoader) -> list[Video]:
     """The trajectories that moved an object farthest which the goal does not name, beside their clean twins."""
     by_id = {row["episode_id"]: row for row in kept}
-    of_trajectory = {row["trajectory_id"]: row for row in kept if row["twin_id"] in by_id}
+    twins = {row["trajectory_id"] for row in kept if row["role"] == "twin"}
+    paired = [row for row in kept if row["twin_id"] in by_id and row["trajectory_id"] not in twins]
+    of_trajectory = {row["trajectory_id"]: row for row in paired}
     moving = [row for row in of_trajectory.values() if row["non_target_moved_m"]]
     shown = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
     return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in shown]

@@ -130,7 +130,11 @@ def untouched(target: AnyFormat) -> bool:
 
 def notice_changes(target: AnyFormat) -> None:
     """Where files of a finished dataset are gone or have changed, have it count as not there."""
-    if not target.record_file.exists() or untouched(target):
+    if not target.record_file.exists():
+        if target.stage_record != target.record_file and target.folder.exists():
+            target.stage_record.unlink(missing_ok=True)
+        return
+    if untouched(target):
         return
     try:
         same = all(checksum(target.folder / name) == sha256 for name, sha256 in target.record().files.items())

@@ -99,10 +99,10 @@ def _follow(config: Config) -> Iterator[tuple[str, str]]:
     stale = False
     for one in formats_of(config.data, config.export, config.render.extras):
         if not export.untouched(one):
-            yield f"export_{one.name}", "there is no dataset, or files of it have changed"
+            yield f"export_{one.stage_record.stem}", f"{one.title}: there is no dataset, or files of it have changed"
         elif one.record().identity != export.identity(one, episodes):
             why = next(iter(export.outdated(one, episodes)), "files of other episodes or options")
-            yield f"export_{one.name}", f"the dataset has {why}"
+            yield f"export_{one.stage_record.stem}", f"{one.title}: the dataset has {why}"
         else:
             continue
         stale = True

@@ -17,7 +17,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 
 def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
-    """Read every stored file of a run: trajectories, frames and both datasets.
+    """Read every stored file of a run: trajectories, frames and the datasets.
 
     Returns:
         JSON-serialisable: what was read to how many files were ``checked``, and which are ``damaged``, each with what
