@@ -41,7 +41,9 @@ class Numpy:
 sys.meta_path.insert(0, Numpy())
 for script in sys.argv[1:]:
     if os.fork() == 0:
-        sys.path[0] = os.path.dirname(script)
+        folder = os.path.dirname(script)
+        # A campaign of the tests puts the folder above it there too, as it is run.
+        sys.path[:1] = [folder, os.path.dirname(folder)]
         runpy.run_path(script, run_name="imported")
         os._exit(0)
     os.wait()

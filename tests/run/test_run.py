@@ -267,7 +267,11 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path, 
     cases: list[tuple[tuple[str, ...], Any, set[str]]] = [
         # The report quotes the whole configuration, but for where it ran.
         (("export", "rlds", "shards"), 3, {"export_rlds", "manifest", "validate", "recipe", "card", "report"}),
-        (("export", "lerobot", "frames"), "images", {"export_lerobot", "validate", "recipe", "card", "report"}),
+        (
+            ("export", "lerobot", "frames"),
+            "images",
+            {"export_lerobot", "manifest", "validate", "recipe", "card", "report"},
+        ),
         (
             ("export", "where"),
             {"level": [0, 1]},
