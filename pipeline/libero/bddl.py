@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -103,9 +103,13 @@ class Bddl:
 
     @property
     def things_of_interest(self) -> tuple[str, ...]:
-        """The ``things`` that the task is about. A region, such as a drawer of a cabinet or the burner of a stove,
-        stands for the thing that it belongs to."""
-        named = [f"{name}_" for name in self.of_interest]
+        """The ``things`` that the task is about."""
+        return self.things_named(self.of_interest)
+
+    def things_named(self, names: Iterable[str]) -> tuple[str, ...]:
+        """The ``things`` among some names. A region, such as a drawer of a cabinet or the burner of a stove, stands for
+        the thing that it belongs to."""
+        named = [f"{name}_" for name in names]
         return tuple(thing for thing in self.things if any(name.startswith(f"{thing}_") for name in named))
 
     @property

@@ -62,10 +62,9 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
 
 
 def of_goal(known: Bddl) -> Set[str]:
-    """The objects and fixtures that a solution may touch and move: those that the goal names (a region stands for the
-    thing that has it), and what stands on or in an object that it puts somewhere or in a drawer that it opens."""
-    named = [f"{name}_" for fact in known.goal for name in fact[1:]]
-    found = {thing for thing in known.things if any(name.startswith(f"{thing}_") for name in named)}
+    """The objects and fixtures that a solution may touch and move: those that the goal names, and what stands on or in
+    an object that it puts somewhere or in a drawer that it opens."""
+    found = {*known.things_named(name for fact in known.goal for name in fact[1:])}
     carriers = {*known.targets, *(fact[1] for fact in known.goal if len(fact) == 2)}
     while carried := {name for name, place in known.places.items() if place in carriers} - carriers:
         carriers |= carried

@@ -116,17 +116,16 @@ def read(config: Config) -> Outcome:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
                 judged[row.episode_id] = Verdict(False, LEFT_OUT)
     missing = dict.fromkeys(
-        store.folder(row.trajectory_id)
-        for row in rows
-        if judged[row.episode_id].kept
-        and not (row.trajectory_id in frames and frames[row.trajectory_id].streams >= _streams(row))
+        store.folder(row.trajectory_id) for row in rows if judged[row.episode_id].kept and not rendered(row, frames)
     )
     _refuse_missing([*missing], "render")
     return Outcome(rows, trajectories, frames, judged)
 
 
-def _streams(row: plan.Row) -> set[str]:
-    return {stream.stream_id for stream in streams_of(row.perturbations).values()}
+def rendered(row: plan.Row, frames: Mapping[str, Shown]) -> bool:
+    """Whether the frames that an episode shows are stored."""
+    needed = {stream.stream_id for stream in streams_of(row.perturbations).values()}
+    return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams
 
 
 def _refuse_missing(missing: Sequence[Path], stage: str) -> None:

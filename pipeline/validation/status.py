@@ -14,7 +14,6 @@ from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats.registry import formats_of
 from pipeline.planning import plan
-from pipeline.planning.streams import streams_of
 from pipeline.run import cleaning, export, finished, inputs, outcome
 from pipeline.run.remake import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
@@ -53,18 +52,13 @@ def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict],
             "wanted": config.plan.episodes.get(axis, planned),
             "planned": planned,
             "kept": len(kept),
-            "rendered": sum(_rendered(row, frames) for row in kept),
+            "rendered": sum(outcome.rendered(row, frames) for row in kept),
         }
         total.update(cells)
         table.add_row(axis.replace("+", "+ "), *map(str, cells.values()))
     table.add_section()
     table.add_row("all", *(str(total[name]) for name in ("wanted", "planned", "kept", "rendered")))
     return table
-
-
-def _rendered(row: plan.Row, frames: Mapping[str, Shown]) -> bool:
-    needed = {stream.stream_id for stream in streams_of(row.perturbations).values()}
-    return row.trajectory_id in frames and needed <= frames[row.trajectory_id].streams
 
 
 def _steps(
@@ -85,7 +79,7 @@ def _steps(
     if needed := plan.pending(rows, verdicts, rejected):
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
     judged = plan.select(rows, verdicts, rejected)
-    if missing := [row for row in rows if judged[row.episode_id].kept and not _rendered(row, frames)]:
+    if missing := [row for row in rows if judged[row.episode_id].kept and not outcome.rendered(row, frames)]:
         yield "render", f"the frames of {len(missing)} episodes are not there" + _of(made_anew, "files of frames")
     if needed or missing or of_plan:
         yield "exports and all that follows", "their episodes are not all there" if needed or missing else "a new plan"
