@@ -24,7 +24,6 @@ from pipeline.run.export import export
 from pipeline.types import Episode, Subtask
 
 LEROBOT = Version(version("lerobot"))
-with_language = pytest.mark.skipif(Version("0.6") > LEROBOT, reason="lerobot has no language columns before 0.6")
 
 REWRITES = ("kindly put the bowl on the plate", "the plate is where the bowl goes")
 SUBTASKS = (Subtask(0, "approach the bowl"), Subtask(5, "grasp the bowl"), Subtask(10, "move the bowl to the plate"))
@@ -105,43 +104,45 @@ def test_without_it_nothing_changes(tmp_path: Path) -> None:
     assert "language_persistent" not in pq.read_schema(file).names
 
 
-@pytest.mark.skipif(Version("0.6") <= LEROBOT, reason="lerobot reads language columns from 0.6 on")
-def test_a_lerobot_that_cannot_read_it_is_said_before_any_work(tmp_path: Path) -> None:
-    file = tmp_path / "told.yaml"
-    file.write_text("{name: told, plan: {episodes: {camera: 1}}, export: {lerobot: {language: true}}}")
-    with pytest.raises(PipelineError, match=r"export\.lerobot\.language: .*lerobot 0\.4\.4.*Python 3\.12"):
-        load(file)
+# lerobot has language columns from 0.6 on.
+if Version("0.6") > LEROBOT:
 
+    def test_a_lerobot_that_cannot_read_it_is_said_before_any_work(tmp_path: Path) -> None:
+        file = tmp_path / "told.yaml"
+        file.write_text("{name: told, plan: {episodes: {camera: 1}}, export: {lerobot: {language: true}}}")
+        with pytest.raises(PipelineError, match=r"export\.lerobot\.language: .*lerobot 0\.4\.4.*Python 3\.12"):
+            load(file)
 
-@with_language
-def test_lerobot_renders_a_rewrite_and_the_active_subtask(root: Path) -> None:
-    from lerobot.configs.recipe import MessageTurn, TrainingRecipe
-    from lerobot.datasets.language import language_persistent_column_feature
-    from lerobot.datasets.language_render import active_at, emitted_at, render_sample
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+else:
 
-    data = LeRobotDataset(root.name, root=root, video_backend="pyav")
-    assert data.hf_dataset.features["language_persistent"] == language_persistent_column_feature()
-    recipe = TrainingRecipe(
-        messages=[
-            MessageTurn(role="user", content="${task}", stream="high_level"),
-            MessageTurn(role="assistant", content="${subtask}", stream="low_level", target=True),
-        ],
-    )
-    prompts: dict[bool, set[str]] = {True: set(), False: set()}
-    for index in range(len(data)):
-        item = data[index]
-        said, at_s, step = item["language_persistent"], float(item["timestamp"]), int(item["frame_index"])
-        expected = [one for one in SUBTASKS if one.step <= step][-1].text
-        assert active_at(at_s, persistent=said, style="subtask")["content"] == expected
-        emitted_at(at_s, persistent=said, events=[], style="subtask")  # fails where two are as near
-        context = {"task": item["task"]}
-        shown = render_sample(
-            recipe=recipe, persistent=said, events=None, t=at_s, sample_idx=index, dataset_ctx=context
+    def test_lerobot_renders_a_rewrite_and_the_active_subtask(root: Path) -> None:
+        from lerobot.configs.recipe import MessageTurn, TrainingRecipe
+        from lerobot.datasets.language import language_persistent_column_feature
+        from lerobot.datasets.language_render import active_at, emitted_at, render_sample
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        data = LeRobotDataset(root.name, root=root, video_backend="pyav")
+        assert data.hf_dataset.features["language_persistent"] == language_persistent_column_feature()
+        recipe = TrainingRecipe(
+            messages=[
+                MessageTurn(role="user", content="${task}", stream="high_level"),
+                MessageTurn(role="assistant", content="${subtask}", stream="low_level", target=True),
+            ],
         )
-        prompt, answer = shown["messages"]
-        assert answer["content"] == expected
-        prompts[int(item["episode_index"]) < 4].add(prompt["content"])
-    instructions = {episode(one).instruction for one in IDS}
-    assert {*REWRITES} <= prompts[True] <= {*REWRITES, *instructions}
-    assert prompts[False] <= instructions
+        prompts: dict[bool, set[str]] = {True: set(), False: set()}
+        for index in range(len(data)):
+            item = data[index]
+            said, at_s, step = item["language_persistent"], float(item["timestamp"]), int(item["frame_index"])
+            expected = [one for one in SUBTASKS if one.step <= step][-1].text
+            assert active_at(at_s, persistent=said, style="subtask")["content"] == expected
+            emitted_at(at_s, persistent=said, events=[], style="subtask")  # fails where two are as near
+            context = {"task": item["task"]}
+            shown = render_sample(
+                recipe=recipe, persistent=said, events=None, t=at_s, sample_idx=index, dataset_ctx=context
+            )
+            prompt, answer = shown["messages"]
+            assert answer["content"] == expected
+            prompts[int(item["episode_index"]) < 4].add(prompt["content"])
+        instructions = {episode(one).instruction for one in IDS}
+        assert {*REWRITES} <= prompts[True] <= {*REWRITES, *instructions}
+        assert prompts[False] <= instructions
