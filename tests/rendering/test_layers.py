@@ -96,7 +96,7 @@ def pair(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
 @pytest.mark.parametrize("pair", [False, True], ids=["lights", "shadows"], indirect=True)
 def test_the_same_pixels_whatever_moves(pair: Pair) -> None:
     rng, data = seeding.rng("test_layers", "moves"), pair.opened.data
-    for step in range(80):
+    for step in range(40):
         # Now one of them moves, now several, now none; the last is the camera's body.
         for body in rng.choice(BODIES, rng.integers(0, 3), replace=False):
             data.mocap_pos[body] += rng.normal(0, 0.05, 3)
