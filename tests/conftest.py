@@ -80,6 +80,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
 
 
+def pytest_collection_finish() -> None:
+    """robosuite collects garbage with every scene that it drops: spare it the half a million objects of the imports."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(scope="module")
 def opened() -> Iterator[LastScene]:
     """What the tests of a file render with."""
