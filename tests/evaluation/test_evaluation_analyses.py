@@ -30,6 +30,7 @@ from pipeline.evaluation.tasks import EvaluationTask, find_replacement, replacem
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
+from pipeline.types import Floats
 
 
 def analyse(*arguments: str) -> int:
@@ -260,7 +261,7 @@ def test_liberos_environment_judges_the_new_goal_and_not_the_old(evaluated: Epis
     clean = select(Selection(suites=("libero_goal",), tasks=(name,)))[0]
     asked = select(Selection(source="goals", suites=("libero_goal",), tasks=(f"{name}_goal_*_cream_cheese_*",)))[0]
 
-    starts = []
+    starts: list[Floats] = []
 
     def dropped(task: EvaluationTask, thing: str) -> bool:
         """Whether the episode succeeds when ``thing`` is let go above the plate."""
