@@ -157,7 +157,8 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     for perturbation in drawn:
         caption = describe(perturbation)
         try:
-            frames = stage.frames(views, perturbation)
+            # What changes words alone is not rendered anew.
+            frames = stage.frames(views, perturbation) if perturbation.views else original
         except RefusedError as refused:
             caption = f"refused, {refused.reason}: {caption}"
             frames = [np.full_like(frame, REFUSED_GREY) for frame in original]

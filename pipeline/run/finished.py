@@ -107,6 +107,13 @@ def of_summary(config: Config) -> Memory:
     return Memory(config.data, "summary", made_by, ["sheets", "previews"])
 
 
+def of_previews(config: Config) -> Memory:
+    """Of the previews alone, which show no episode: what is kept and exported changes none."""
+    settings = [settings_of(config.demos), settings_of(config.plan), settings_of(config.replay)]
+    made_by = fingerprint("pictures", *settings, _contents([config.data / "inputs.json"], config.data))
+    return Memory(config.data, "previews", made_by, ["previews"])
+
+
 def of_report(config: Config) -> Memory:
     """Of the report."""
     frames = FrameStore(config.data / "frames", config.render)
