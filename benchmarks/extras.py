@@ -23,7 +23,7 @@ from pipeline.physics.replay import replay
 from pipeline.planning.streams import streams_of
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.render import render
-from pipeline.types import RenderedExtra, Rendered, Task, Trajectory
+from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
 
 ASKED: tuple[tuple[RenderedExtra, ...], ...] = (
     (),

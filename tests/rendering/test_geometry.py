@@ -40,7 +40,7 @@ from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import RenderedExtra, Rendered, Task, Trajectory
+from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
 
 EXTRAS: tuple[RenderedExtra, ...] = ("depth", "object_poses", "segmentation")
