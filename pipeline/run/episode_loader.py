@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,11 +11,12 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import provenance_of
 from pipeline.files import Edition, edition
 from pipeline.identity import versions
+from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Episode, Extra
+from pipeline.types import Episode, Extra, Subtask
 
 
 @dataclass(frozen=True)
@@ -25,11 +27,13 @@ class EpisodeLoader:
         data: folder with the plan and the frame store.
         config: how its frames are encoded.
         extras: ``outcome`` for failures.
+        rewrites: episode id to other wordings of its task, where episodes come with them and with their subtasks.
     """
 
     data: Path
     config: RenderConfig
     extras: tuple[Extra, ...] = ()
+    rewrites: Mapping[str, Sequence[str]] | None = None
 
     def __call__(self, episode_id: str) -> Episode:
         row = _rows_by_id(edition(self.data / "plan.parquet"))[episode_id]
@@ -43,7 +47,7 @@ class EpisodeLoader:
         if "outcome" in self.extras:
             verdict = TrajectoryStore(self.data / "trajectories").load(row.trajectory_id).verdict
             known |= {"success": verdict.kept, "reason": verdict.reason}
-        return Episode(
+        episode = Episode(
             episode_id=episode_id,
             frames={view: rendered.streams[stream.stream_id] for view, stream in shown.items()},
             state=rendered.state,
@@ -55,8 +59,20 @@ class EpisodeLoader:
             object_poses=rendered.object_poses,
             instances=rendered.instances,
         )
+        if self.rewrites is None:
+            return episode
+        done = _subtasks(self.data / "trajectories", row.trajectory_id, row.suite, row.task)
+        return replace(episode, rewrites=self.rewrites[episode_id], subtasks=done)
 
 
 @lru_cache(maxsize=1)
 def _rows_by_id(plan_file: Edition) -> dict[str, plan.Row]:
     return {row.episode_id: row for row in plan.read(plan_file.path)}
+
+
+@lru_cache(maxsize=10_000)
+def _subtasks(trajectories: Path, trajectory_id: str, suite: str, task: str) -> tuple[Subtask, ...]:
+    """Episodes share trajectories, and come in no order."""
+    from pipeline.physics.subtasks import subtasks  # others need no simulator
+
+    return subtasks(TrajectoryStore(trajectories).load(trajectory_id), find_task(suite, task))

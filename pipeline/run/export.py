@@ -10,11 +10,12 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
@@ -24,9 +25,13 @@ from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.formats.registry import failures_of
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
+from pipeline.libero.tasks import find_task
+from pipeline.planning import plan
 from pipeline.run import outcome
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.seeding import digest
+from pipeline.testset import benchmark
+from pipeline.types import Extra
 
 AnyFormat = Format[Any]
 
@@ -55,6 +60,7 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> 
         target.record_file.unlink(missing_ok=True)
         print(f"no replay missed its goal: nothing is in {target.folder}")
         return
+    episodes = asked(target, config, episodes)
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
         return
@@ -84,6 +90,26 @@ def _known(run: outcome.Outcome, episode_ids: Sequence[str]) -> dict[str, Known]
         steps = run.trajectories[row.trajectory_id]["steps"]
         known[episode_id] = Known(row.suite, run.content(episode_id), row.demo_id, row.instruction, steps)
     return known
+
+
+def asked(target: AnyFormat, config: Config, episodes: Episodes) -> Episodes:
+    """Episodes with what a format takes beside: where it takes ``language``, rewrites and subtasks.
+
+    Rewrites are those that the run's language axis may draw for the episode, or its default ranges.
+    """
+    if not target.language:
+        return episodes
+    axis, test = config.plan.axes.language or LanguageAxis(), benchmark.load()
+
+    @cache
+    def wordings(suite: str, task: str, name: str) -> tuple[str, ...]:
+        return axis.wordings(find_task(suite, task), name.split("+"), test)
+
+    rows = {row.episode_id: row for row in plan.read(config.data / "plan.parquet")}
+    rewrites = {one: wordings(rows[one].suite, rows[one].task, rows[one].axis) for one in episodes.known}
+    known = {one: of._replace(content=digest(of.content, rewrites[one])[:16]) for one, of in episodes.known.items()}
+    extras: tuple[Extra, ...] = ("outcome",) if "outcome" in target.extras else ()
+    return Episodes(known, EpisodeLoader(config.data, config.render, extras, rewrites))
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:

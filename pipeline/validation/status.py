@@ -92,15 +92,18 @@ def _steps(
 def _follow(config: Config) -> Iterator[tuple[str, str]]:
     """The stages after the frames."""
     kept, failed = export.kept_episodes(config), export.failed_episodes(config)
-    asked = (config.data, config.export, config.render.extras)
+    sets = (config.data, config.export, config.render.extras)
     stale = False
-    datasets = [(one, kept) for one in formats_of(*asked)]
-    datasets += [(one, failed) for one in failures_of(*asked) if failed.ids]
+    datasets = [(one, kept) for one in formats_of(*sets)]
+    datasets += [(one, failed) for one in failures_of(*sets) if failed.ids]
     for one, episodes in datasets:
         if not export.untouched(one):
             yield f"export_{one.stage_record.stem}", f"{one.title}: there is no dataset, or files of it have changed"
-        elif one.record().identity != export.identity(one, episodes):
-            why = next(iter(export.outdated(one, episodes)), "files of other episodes or options")
+            stale = True
+            continue
+        asked = export.asked(one, config, episodes)
+        if one.record().identity != export.identity(one, asked):
+            why = next(iter(export.outdated(one, asked)), "files of other episodes or options")
             yield f"export_{one.stage_record.stem}", f"{one.title}: the dataset has {why}"
         else:
             continue
