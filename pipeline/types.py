@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 """(H, W, 3) RGB."""
-Extra = Literal["depth", "segmentation", "object_poses"]
+RenderedExtra = Literal["depth", "segmentation", "object_poses"]
 """What the render stage makes beside the frames when it is asked to."""
+Extra = Literal[RenderedExtra, "outcome"]
+"""What a dataset has beside the frames; ``outcome``, that of failures says of each episode why it is one."""
 
 
 class State(NamedTuple):
