@@ -39,7 +39,7 @@ __path__: list[str] = []  # lerobot looks for modules inside what it is told to 
 
 @EnvConfig.register_subclass("perturbed_libero")
 @dataclass
-class PerturbedLibero(EnvConfig):
+class PerturbedLibero(EnvConfig):  # type: ignore[misc]
     """Tasks as a ``Selection`` chooses them, under ``EpisodeSettings``; the fields are theirs.
 
     Attributes:
