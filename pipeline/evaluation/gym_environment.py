@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -53,7 +53,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         archive: see ``EpisodeEnvironment``.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
     render_mode = "rgb_array"
 
     def __init__(
@@ -119,7 +119,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         done = {"done": progress.over, "is_success": progress.success, "task": self.task}
         return seen, float(progress.success), progress.over and not limited, limited, done
 
-    def render(self) -> Frame:  # type: ignore[override]
+    def render(self) -> Frame:
         """(256, 256, 3) the agent view, upright."""
         return self._environment.image("agentview")
 
