@@ -91,6 +91,9 @@ def repeated(env: Any, trajectory: Trajectory) -> str | None:
     if not np.array_equal(env.get_sim_state(), trajectory.states[0]):
         return f"another first look after {settled} steps"
     for number, (action, state) in enumerate(zip(trajectory.actions, trajectory.states[1:], strict=True), 1):
+        if (push := trajectory.scene.push) is not None:
+            acts = push.first_step < number <= push.first_step + push.steps
+            env.sim.data.xfrc_applied[env.sim.model.body_name2id(push.body)] = push.wrench if acts else 0.0
         env.step(action)
         if not np.array_equal(env.get_sim_state(), state):
             return f"another state after {number} of {len(trajectory.actions)} actions"

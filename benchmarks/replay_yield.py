@@ -42,6 +42,7 @@ AXES: dict[str, tuple[str, dict[str, Any]]] = {
     "target": ("pose", {"components": ["target"]}),
     "scene": ("pose", {"components": ["scene"]}),
     "layout": ("layout", {}),
+    "disturbance": ("disturbance", {}),
 }
 """What is measured to its axis and the options of that."""
 SATURATED = 0.93
