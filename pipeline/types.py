@@ -124,7 +124,7 @@ class Scene:
         gripper: where the gripper's command stands: -1 open, 1 closed, 0 as after LIBERO's reset. The next action is
             added to it, so it takes four control steps from 0 to -1.
         posture_rad: (7,) joint angles of the reset that came before the state was put in. To these the controller's
-            null space draws the arm, and it keeps their orientation of the hand until an action turns that. None where
+            null space pulls the arm, and it keeps their orientation of the hand until an action turns that. None where
             it holds the arm as the state has it.
         push: what pushes the robot in the course of the episode, whatever is done meanwhile.
     """

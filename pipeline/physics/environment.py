@@ -162,7 +162,7 @@ class Environment:
             env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
             env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
         env.sim.forward()
-        # As after a reset in an evaluation: the controller knows where the arm is, and its null space draws the arm to
+        # As after a reset in an evaluation: the controller knows where the arm is, and its null space pulls the arm to
         # the posture that it is in, not to robosuite's home posture.
         robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
         if scene.posture_rad is not None:

@@ -261,9 +261,9 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
             opened.data.mocap_pos[-1] += rng.normal(0, 0.05, 3)
             mujoco.mj_forward(opened.model, opened.data)
             for camera in ("fixed", "moving"):
-                ours._skins.drawn[:] = 0
+                ours._skins.rendered[:] = 0
                 frame = opened.frame(camera)
-                drawn.append(ours._skins.drawn.copy())
+                drawn.append(ours._skins.rendered.copy())
                 assert np.array_equal(frame, plain.frame(opened.data, camera)), camera
         whole = opened.model.mesh("painted").facenum[0]
     faces = np.sum(drawn, axis=0)
