@@ -80,8 +80,8 @@ class Stage:
         state, site_alpha = first_look(scene, self.demo.task, self.replay), renderer.model.site_rgba[:, 3].copy()
         return frames_of(renderer, state, site_alpha, [Stream(view, changes) for view in views], 0)
 
-    def strip(self, views: Sequence[str], perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
-        """Steps of a pushed replay, and what the views show at each.
+    def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
+        """Steps of a pushed replay, and the agent view at each, without the push and with it.
 
         Raises:
             RefusedError: when the demonstration refuses the push, or does not reach its goal without one.
@@ -95,13 +95,15 @@ class Stage:
         pushed = replay(environment, self.demo, "pushed", self.replay, changes, lambda: reference)
         if (push := pushed.scene.push) is None:
             raise RefusedError(pushed.verdict.reason)
-        renderer = self.opened.renderer(pushed.model_xml)
-        end, last = push.first_step + push.steps, len(pushed.actions)
-        steps = [push.first_step, *(min(end + after, last) for after in STRIP_STEPS)]
-        streams = [Stream(view, ()) for view in views]
-        return [
-            (step, frames_of(renderer, pushed.states[step], pushed.site_alpha[step], streams, step)) for step in steps
-        ]
+        renderer, stream = self.opened.renderer(pushed.model_xml), Stream("image", ())
+        shown = []
+        for step in (push.first_step, *(push.first_step + push.steps + after for after in STRIP_STEPS)):
+            frames: list[Frame] = []
+            for one in (twin, pushed):
+                at = min(step, len(one.actions))
+                frames += frames_of(renderer, one.states[at], one.site_alpha[at], [stream], at)
+            shown.append((step, frames))
+        return shown
 
 
 def staged(tasks: Iterable[Task], config: Config) -> Stage:
@@ -182,7 +184,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     side = SIDE_PX[len(views)]
     original = stage.frames(views)
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
-    if strips := [tile for push in drawn for tile in _strip(stage, push, views, side)]:
+    if strips := [tile for push in drawn for tile in _strip(stage, push)]:
         tiles, drawn = strips, []
     for perturbation in drawn:
         caption = describe(perturbation)
@@ -195,15 +197,16 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     return sheet(f"{demo.demo_id}, first state; axis {name}, seed {seed}; {', '.join(views)}", tiles)
 
 
-def _strip(stage: Stage, push: Perturbation, views: Sequence[str], side: int) -> list[Tile]:
-    """What a push does, step by step; nothing where it is refused."""
+def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
+    """What a push does, step by step, beside the replay without it; nothing where it is refused."""
     if not isinstance(push, DisturbancePerturbation):
         return []
     try:
-        shown = stage.strip(views, push)
+        shown = stage.strip(push)
     except RefusedError:
         return []
-    return [Tile(side_by_side(frames, side), f"step {step}: {describe(push)}") for step, frames in shown]
+    caption = f"without and with {describe(push)}"
+    return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in shown]
 
 
 def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
