@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from pipeline.axes.base import Axis, ByLevel, PhysicsPerturbation, pick
+from pipeline.axes.base import Axis, ByLevel, Intervals, PhysicsPerturbation, pick
 from pipeline.errors import RefusedError
 from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Push, RollOut, Scene, Task
@@ -26,6 +26,7 @@ RISE = 0.5
 
 Wrench = tuple[float, float, float, float, float, float]
 Steps = Annotated[int, Field(ge=0, le=1000)]
+Duration = Annotated[int, Field(ge=1, le=100)]
 
 
 class DisturbancePerturbation(PhysicsPerturbation):
@@ -93,8 +94,8 @@ class DisturbanceAxis(Axis):
 
     Attributes:
         impulse_n_s: force times duration at each level. The defaults displace the hand by about 1 to 5 cm.
-        steps: control steps that a push takes, least and most: 0.1 to 0.4 s.
-        first_step: the stretches of the episode that it begins in, first and last step of each.
+        steps: control steps that a push takes, 0.1 to 0.4 s by default.
+        first_step: executed actions before it; each of the stretches is drawn as often as the others.
         away_steps: control steps between a push and where the demonstration opens or closes the gripper; at 0 it may
             come right before or after.
     """
@@ -102,14 +103,13 @@ class DisturbanceAxis(Axis):
     draws: ClassVar = (DisturbancePerturbation,)
 
     impulse_n_s: ByLevel[Annotated[float, Field(gt=0.0, le=100.0)]] = (4.0, 8.0, 12.0, 16.0, 20.0)
-    steps: tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]] = (2, 8)
-    first_step: Annotated[tuple[tuple[Steps, Steps], ...], Field(min_length=1)] = ((5, 18), (58, 66))
+    steps: Intervals[Duration] = ((2, 8),)
+    first_step: Intervals[Steps] = ((5, 18), (58, 66))
     away_steps: Steps = 5
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> DisturbancePerturbation:
         level = self.draw_level(rng)
-        steps = int(rng.integers(self.steps[0], self.steps[1] + 1))
-        first, last = pick(rng, self.first_step)
+        steps, first_step = _step(rng, self.steps), _step(rng, self.first_step)
         bearing_rad, rise = rng.uniform(-math.pi, math.pi), rng.uniform(-RISE, RISE)
         level_part = math.sqrt(1 - rise**2)
         direction = np.array([level_part * math.cos(bearing_rad), level_part * math.sin(bearing_rad), rise])
@@ -118,7 +118,13 @@ class DisturbanceAxis(Axis):
             level=level,
             body=HAND,
             wrench=(*force_n.round(4).tolist(), 0.0, 0.0, 0.0),
-            first_step=int(rng.integers(first, last + 1)),
+            first_step=first_step,
             steps=steps,
             away_steps=self.away_steps,
         )
+
+
+def _step(rng: np.random.Generator, stretches: Intervals[int]) -> int:
+    """One step of one of the stretches, both ends among them."""
+    first, last = pick(rng, stretches)
+    return int(rng.integers(first, last + 1))

@@ -1,6 +1,6 @@
 """Preview: what the axes do to a task, as a contact sheet in the manner of the paper's appendix.
 
-Every picture shows the demonstration's first state, without a replay; of a push, the course of its replay. The draws
+Every picture shows the demonstration's first state, without a replay; of a push, the replay that it acts in. The draws
 are those that a plan with the same seed makes for the demonstration.
 """
 
@@ -77,7 +77,11 @@ class Stage:
         for physics in of_layer(changes, PhysicsPerturbation):
             scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
-        state, site_alpha = first_look(scene, self.demo.task, self.replay), renderer.model.site_rgba[:, 3].copy()
+        site_alpha = renderer.model.site_rgba[:, 3].copy()
+        if (push := scene.push) is None:
+            state = first_look(scene, self.demo.task, self.replay)
+        else:
+            state = roll_out(scene, self.demo, self.replay)[push.first_step + push.steps]
         return frames_of(renderer, state, site_alpha, [Stream(view, changes) for view in views], 0)
 
     def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
