@@ -102,7 +102,7 @@ class DisturbanceAxis(Axis):
 
     draws: ClassVar = (DisturbancePerturbation,)
 
-    impulse_n_s: ByLevel[Annotated[float, Field(gt=0.0, le=100.0)]] = (4.0, 8.0, 12.0, 16.0, 20.0)
+    impulse_n_s: ByLevel[Annotated[float, Field(gt=0.0, le=100.0)]] = (4.0, 7.0, 10.0, 13.0, 16.0)
     steps: Intervals[Duration] = ((2, 8),)
     first_step: Intervals[Steps] = ((5, 18), (58, 66))
     away_steps: Steps = 5

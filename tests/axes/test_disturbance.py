@@ -33,13 +33,13 @@ def draws(axis: DisturbanceAxis, count: int) -> list[DisturbancePerturbation]:
     return [axis.sample(rng(1, "disturbance", variant), BOWL, variant) for variant in range(count)]
 
 
-def pushed_at(first_step: int, level: int = 3, away_steps: int = 5) -> DisturbancePerturbation:
-    """80 N to the right of the robot for 0.2 s at level 4."""
+def pushed_at(first_step: int, force_n: float = 50.0, away_steps: int = 5) -> DisturbancePerturbation:
+    """To the left of the robot for 0.2 s."""
     return DisturbancePerturbation.model_validate(
         {
-            "level": level,
+            "level": 3,
             "body": "robot0_right_hand",
-            "wrench": (0.0, 20.0 * level, 0.0, 0.0, 0.0, 0.0),
+            "wrench": (0.0, force_n, 0.0, 0.0, 0.0, 0.0),
             "first_step": first_step,
             "steps": 4,
             "away_steps": away_steps,
@@ -53,7 +53,7 @@ def test_draws_are_keyed_and_as_strong_as_their_level_says() -> None:
     assert {one.level for one in drawn} == {1, 2, 3, 4, 5}
     assert {one.steps for one in drawn} == {2, 3, 4, 5, 6, 7, 8}
     for one in drawn:
-        assert np.linalg.norm(one.wrench[:3]) * one.steps * 0.05 == pytest.approx(4 * one.level, abs=1e-3)
+        assert np.linalg.norm(one.wrench[:3]) * one.steps * 0.05 == pytest.approx(1 + 3 * one.level, abs=1e-3)
         assert abs(one.wrench[2]) <= np.linalg.norm(one.wrench[:3]) / 2 + 1e-3
         assert DisturbancePerturbation.model_validate_json(one.model_dump_json()) == one
 
@@ -75,7 +75,7 @@ def test_a_push_at_a_grasp_or_after_the_end_is_refused() -> None:
 
 
 def test_draws_are_apart_by_their_impulse_where_they_begin_at_the_same_step() -> None:
-    one, stronger, later = pushed_at(8, 1), pushed_at(8, 3), pushed_at(9, 1)
+    one, stronger, later = pushed_at(8, 20), pushed_at(8, 60), pushed_at(9, 20)
     apart = one.apart([one, stronger, later])
     assert apart[:2] == pytest.approx([0.0, 8.0])
     assert np.isnan(apart[2])
@@ -108,27 +108,28 @@ def test_the_hand_is_pushed_off_and_comes_back_to_the_goal(
     first_step: int, environment: Environment, whole: dict[Task, Trajectory], tmp_path: Path
 ) -> None:
     twin = whole[BOWL]
-    strongest_m = []
-    for level in (1, 5):
-        kept = replayed(environment, twin, pushed_at(first_step, level))
+    # The impulses of levels 1 and 5.
+    farthest_m = []
+    for force_n in (20.0, 80.0):
+        kept = replayed(environment, twin, pushed_at(first_step, force_n))
         assert kept.verdict.kept
         assert kept.mode == "tracked"
-        # Feedback differs from the recorded actions by little before the push, and not at all in what is done.
+        # Tracking differs from the open-loop twin by little before the push.
         steps = range(first_step, first_step + 12)
         away_m = np.linalg.norm(hands_m(kept, steps) - hands_m(twin, steps), axis=1)
         assert away_m[0] < 0.003
-        strongest_m.append(away_m.max())
+        farthest_m.append(away_m.max())
         changed = kept.actions[first_step + 1 : first_step + 12, 1]
         assert changed.min() < twin.actions[first_step + 1 : first_step + 12, 1].min(), "it works against the push"
-    assert 0.004 < strongest_m[0] < 0.02
-    assert 0.02 < strongest_m[1] < 0.08
+    assert 0.004 < farthest_m[0] < 0.02
+    assert 0.02 < farthest_m[1] < 0.1
     # What is stored is what was done.
     store = TrajectoryStore(tmp_path)
     store.save(kept)
     loaded = store.load("pushed")
     assert loaded.scene.push == kept.scene.push
     assert loaded.scene.resolved["disturbance"]["first_step"] == first_step
-    assert np.array_equal(replayed(environment, twin, pushed_at(first_step, 5)).states, loaded.states)
+    assert np.array_equal(replayed(environment, twin, pushed_at(first_step, 80.0)).states, loaded.states)
 
 
 @pytest.mark.slow
@@ -137,7 +138,7 @@ def test_liberos_own_environment_does_the_same_under_the_same_wrench(
 ) -> None:
     from benchmarks.repeat_in_libero import opened, put_in
 
-    kept = replayed(environment, whole[BOWL], pushed_at(12, 4))
+    kept = replayed(environment, whole[BOWL], pushed_at(12, 80.0))
     libero: Any = opened(BOWL)
     put_in(libero, kept.scene)
     for _ in range(10):
