@@ -126,6 +126,7 @@ class Simulator(Environment):
                 drives the arm to them.
         """
         env = self._env.env
+        self._push = None
         if self._rewind is None or (seed, posture_rad) != (self._rewind.seed, self._rewind.posture_rad):
             self._reset(seed, posture_rad)
         else:
@@ -181,6 +182,7 @@ class Simulator(Environment):
         """
         data = self._env.sim.data._data
         qpos = data.qpos.copy()
+        self._act_from_outside()
         try:
             for _ in self._control_step.substeps(action):
                 if self._clock.tick():
