@@ -135,6 +135,9 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
         env.step(DUMMY_ACTION)
     frames: dict[str, list[bytes]] = {view: [] for view in SCHEMA.views}
     for step, action in enumerate(trajectory.actions):
+        # A step ends with positions that are integrated, and bodies and cameras that are a substep behind them.
+        mujoco.mj_kinematics(model, env.sim.data._data)
+        mujoco.mj_camlight(model, env.sim.data._data)
         for view, spec in SCHEMA.views.items():
             frame = env.sim.render(width=width, height=height, camera_name=spec.camera)
             for noise in of_layer(perturbations, PixelPerturbation):
@@ -142,9 +145,6 @@ def naive(row: plan.Row, trajectory: Trajectory, config: Config) -> dict[str, li
                     frame = noise.apply(frame, step)
             frames[view].append(encode(to_policy(frame), config.render))
         env.step(action)
-        # A step ends with positions that are integrated, and bodies and cameras that are a substep behind them.
-        mujoco.mj_kinematics(model, env.sim.data._data)
-        mujoco.mj_camlight(model, env.sim.data._data)
     env.close()
     return frames
 

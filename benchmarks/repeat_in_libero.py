@@ -1,10 +1,12 @@
 """Every kept trajectory of a run once more in LIBERO's own environment: the same states, bit for bit, and the goal.
 
     nice -n 10 python benchmarks/repeat_in_libero.py data/starter [--limit 10]
+    nice -n 10 python benchmarks/repeat_in_libero.py data/demos
 
-Each is put where its replay started, settles, and is sent the stored actions by LIBERO's own ``step``; nothing of
-``pipeline/physics/`` takes part, and nothing is rendered. A name is printed for each trajectory that differs. The last
-line is JSON: how many there are by what is perturbed, and how many were repeated. 30 took 1.5 minutes of CPU.
+The folder is a finished run's, or one that ``demos expand`` wrote, of which the HDF5 files are read. Each is put where
+its replay started, settles, and is sent the stored actions by LIBERO's own ``step``; nothing of ``pipeline/physics/``
+takes part, and nothing is rendered. A name is printed for each trajectory that differs. The last line is JSON: how many
+there are by what is perturbed, and how many were repeated. 30 took 1.5 minutes of CPU.
 """
 
 from __future__ import annotations
@@ -13,19 +15,23 @@ import argparse
 import json
 import sys
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
 # isort: split
 import numpy as np
 
+from pipeline.libero.demonstrations import HDF5Source
+from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Scene, Task, Trajectory
+from pipeline.types import Floats, Scene, Task
 
 STEP_S = 0.05
 """What a control step takes, by which the states tell how many steps the scene settled."""
@@ -33,33 +39,59 @@ STEP_S = 0.05
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("data", type=Path, help="a finished run's folder")
+    parser.add_argument("data", type=Path, help="a finished run's folder, or one of demonstrations")
     parser.add_argument("--limit", type=int, help="trajectories; all when left out")
     arguments = parser.parse_args()
-    store = TrajectoryStore(arguments.data / "trajectories")
-    replayed = store.rows()
-    rows = {row.trajectory_id: row for row in plan.read(arguments.data / "plan.parquet")}
-    kept = sorted(
-        (row for name, row in rows.items() if name in replayed and replayed[name]["kept"]),
-        key=lambda row: (row.suite, row.task),
+    found = (
+        _of_run(arguments.data) if (arguments.data / "plan.parquet").exists() else _of_demonstrations(arguments.data)
     )
     tried: Counter[str] = Counter()
     equal: Counter[str] = Counter()
     env, task = None, None
-    for row in kept[: arguments.limit]:
-        if task != (task := find_task(row.suite, row.task)):
+    for done in islice(found, arguments.limit):
+        if task != (task := done.task):
             env = opened(task)
+        tried[done.what] += 1
+        if (difference := repeated(env, done)) is None:
+            equal[done.what] += 1
+        else:
+            print(f"{done.name} ({done.what}, {task.suite}/{task.name}): {difference}")
+        print(f"{tried.total()} done", file=sys.stderr)
+    print(json.dumps({"trajectories": dict(tried), "tried": tried.total(), "repeated": equal.total()}))
+    sys.exit(tried != equal)
+
+
+class Done(NamedTuple):
+    """What was done once: actions (K, 7) from a scene; states (K+1, S), or (K, S) without the one after the last."""
+
+    task: Task
+    what: str
+    name: str
+    scene: Scene
+    states: Floats
+    actions: Floats
+
+
+def _of_run(folder: Path) -> Iterator[Done]:
+    store = TrajectoryStore(folder / "trajectories")
+    replayed = store.rows()
+    rows = {row.trajectory_id: row for row in plan.read(folder / "plan.parquet")}
+    kept = (row for name, row in rows.items() if name in replayed and replayed[name]["kept"])
+    for row in sorted(kept, key=lambda row: (row.suite, row.task)):
         trajectory = store.load(row.trajectory_id)
         # Episodes that change no physics share the clean twin's trajectory.
         what = row.component if trajectory.resolved != "{}" else "clean"
-        tried[what] += 1
-        if (difference := repeated(env, trajectory)) is None:
-            equal[what] += 1
-        else:
-            print(f"{row.trajectory_id} ({what}, {row.suite}/{row.task}): {difference}")
-        print(f"{sum(tried.values())} of {len(kept[: arguments.limit])}", file=sys.stderr)
-    print(json.dumps({"trajectories": dict(tried), "tried": tried.total(), "repeated": equal.total()}))
-    sys.exit(tried != equal)
+        task, done = find_task(row.suite, row.task), (trajectory.scene, trajectory.states, trajectory.actions)
+        yield Done(task, what, row.trajectory_id, *done)
+
+
+def _of_demonstrations(root: Path) -> Iterator[Done]:
+    source, files = HDF5Source(root), sorted(root.glob("*/*_demo.hdf5"))
+    for task in (find_task(file.parent.name, file.name.removesuffix("_demo.hdf5")) for file in files):
+        for entry in source.index([task]).entries:
+            demo = source.load(entry.demo_id)
+            scene = recorded_start(demo, str(demo.model_xml), settles=False)
+            yield Done(task, entry.origin, entry.demo_id, scene, np.array(demo.states), demo.actions)
 
 
 def opened(task: Task) -> Any:
@@ -77,23 +109,18 @@ def opened(task: Task) -> Any:
             )
 
 
-def repeated(env: Any, trajectory: Trajectory) -> str | None:
-    """Do what a trajectory did; what was otherwise, or None.
-
-    Args:
-        env: LIBERO's ``ControlEnv`` of its task.
-        trajectory: what to repeat.
-    """
-    put_in(env, trajectory.scene)
-    settled = round((trajectory.states[0, 0] - trajectory.scene.state[0]) / STEP_S)
+def repeated(env: Any, done: Done) -> str | None:
+    """Do it again in LIBERO's ``ControlEnv`` of its task; what was otherwise, or None."""
+    put_in(env, done.scene)
+    settled = round((done.states[0, 0] - done.scene.state[0]) / STEP_S)
     for _ in range(settled):
         env.step([0.0] * 6 + [-1.0])
-    if not np.array_equal(env.get_sim_state(), trajectory.states[0]):
+    if not np.array_equal(env.get_sim_state(), done.states[0]):
         return f"another first look after {settled} steps"
-    for number, (action, state) in enumerate(zip(trajectory.actions, trajectory.states[1:], strict=True), 1):
+    for number, action in enumerate(done.actions, 1):
         env.step(action)
-        if not np.array_equal(env.get_sim_state(), state):
-            return f"another state after {number} of {len(trajectory.actions)} actions"
+        if number < len(done.states) and not np.array_equal(env.get_sim_state(), done.states[number]):
+            return f"another state after {number} of {len(done.actions)} actions"
     return None if env.check_success() else "the goal is not reached"
 
 

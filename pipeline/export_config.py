@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import version
 from itertools import count
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from packaging.version import Version
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from pipeline.errors import PipelineError
 
@@ -72,6 +74,8 @@ class LeRobotConfig(_Frozen):
         shards: files of each kind, at least; more where one would have more than 200 MB.
         frames: ``video`` for H.264, ``images`` for the very JPEG files of RLDS, three times as large.
         validation: share of each task's demonstrations whose episodes come last, as the split ``val``.
+        language: whether frames also have their task's rewrites and what is being done, in lerobot's language column.
+            lerobot before 0.6 cannot read a set with it.
     """
 
     name: Name = ""
@@ -79,6 +83,18 @@ class LeRobotConfig(_Frozen):
     shards: Count | None = Field(default=None, serialization_alias="parts")
     frames: Literal["video", "images"] = "video"
     validation: Share = 0.0
+    # Left out where it says nothing, as ``lerobot_v21``.
+    language: bool = Field(default=False, exclude_if=lambda language: not language)
+
+    @field_validator("language")
+    @classmethod
+    def _readable(cls, language: bool) -> bool:
+        if language and Version(installed := version("lerobot")) < Version("0.6"):
+            raise ValueError(
+                f"lerobot {installed}, which checks the set here, cannot read language columns; expected 0.6 or later, "
+                "which the installation on Python 3.12 or later has"
+            )
+        return language
 
     @model_validator(mode="before")
     @classmethod

@@ -51,7 +51,7 @@ are, and frames begin where the scene has settled. 5: the sky shows past a room'
 a ``meta/modality.json``. 5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode.
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
 2 of it: joint angles are held against the replay's. 3: figures of quality too, against the manifest's.
-``pictures``: what ``summary`` draws, and the report.
+``pictures``: what ``summary`` shows, and the report.
 2 of it: a contact sheet is spread over the run, and shows other starts at the first frame."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {

@@ -108,7 +108,7 @@ class Scene:
         gripper: where the gripper's command stands: -1 open, 1 closed, 0 as after LIBERO's reset. The next action is
             added to it, so it takes four control steps from 0 to -1.
         posture_rad: (7,) joint angles of the reset that came before the state was put in. To these the controller's
-            null space draws the arm, and it keeps their orientation of the hand until an action turns that. None where
+            null space pulls the arm, and it keeps their orientation of the hand until an action turns that. None where
             it holds the arm as the state has it.
     """
 
@@ -225,6 +225,13 @@ class Rendered:
     quality: Quality | None = None
 
 
+class Subtask(NamedTuple):
+    """What is being done, in plain words, from the moment before the action ``step`` on."""
+
+    step: int
+    text: str
+
+
 @dataclass(frozen=True)
 class Episode:
     """What a policy sees, ready for the writers; names, units and signs are those of ``schemas/episode.json``.
@@ -240,6 +247,8 @@ class Episode:
         geometry: view name to where it is seen from.
         object_poses: (T, 24, 7) float32, None where they were not asked for.
         instances: names of the things that segmentation and poses number; none without those.
+        rewrites: other wordings of its task, for training; none where they were not asked for.
+        subtasks: what is done one after the other; none where they were not asked for.
     """
 
     episode_id: str
@@ -252,6 +261,8 @@ class Episode:
     geometry: Mapping[str, Geometry]
     object_poses: NDArray[np.float32] | None = None
     instances: Sequence[str] = ()
+    rewrites: Sequence[str] = ()
+    subtasks: Sequence[Subtask] = ()
 
     def __len__(self) -> int:
         return len(self.action)

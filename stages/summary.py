@@ -1,4 +1,4 @@
-"""Stage summary: draw contact sheets, of the run and of one task per suite, and print what the run made."""
+"""Stage summary: make contact sheets, of the run and of one task per suite, and print what the run made."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -26,7 +26,7 @@ def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
     from pipeline.run.episode_loader import EpisodeLoader
 
     load = EpisodeLoader(config.data, config.render)
-    sheets.draw(rows, load, config.data / "sheets")
+    sheets.write(rows, load, config.data / "sheets")
     with runner(config.compute, config.data, gl.WorkerSetup) as workers:
         preview.for_run(config, config.data / "previews", workers)
 

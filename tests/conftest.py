@@ -57,7 +57,7 @@ SHORT = {STOVE: 12, BOWL: 11, MILK: 18}
 """How many of the last actions are kept; the goal is reached within them."""
 
 
-SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage", "expanded", "everything"}
+SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage", "expanded", "at_resets", "everything"}
 """Whoever asks for one of these, or for what is made from it, is no quick test: see ``-m "not slow"``."""
 
 

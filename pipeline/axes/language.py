@@ -116,12 +116,12 @@ class LanguageAxis(Axis):
         Raises:
             ValueError: when none of ``classes`` is left.
         """
-        if "layout" not in axes:
-            return self
-        classes = tuple(component for component in self.classes if component in NAMED)
-        if not classes:
+        if not (classes := self._classes(axes)):
             raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")
         return self.model_copy(update={"classes": classes})
+
+    def _classes(self, axes: Collection[str]) -> tuple[Component, ...]:
+        return tuple(one for one in self.classes if one in NAMED) if "layout" in axes else self.classes
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
         """The rewrite at ``place`` of the task's list, which starts again once all were drawn.
@@ -133,6 +133,17 @@ class LanguageAxis(Axis):
         """
         rewrites = deal(task, self.classes, self.levels, self.bank)
         return rewrites[place % len(rewrites)]
+
+    def wordings(self, task: Task, axes: Collection[str], test: TestSet) -> tuple[str, ...]:
+        """All that it can draw for a task beside other axes, as far as it keeps clear of the benchmark's instructions.
+
+        None where no bank has any.
+
+        Raises:
+            PipelineError: when one of them does not pass ``lint``.
+        """
+        rewrites = _dealt(task, self._classes(axes), self.levels, self.bank)
+        return tuple(one.text for one in rewrites if one.nearest(test, task).distance >= one.clearance)
 
 
 @cache
@@ -153,28 +164,38 @@ def load_bank(file: Path = BANK_FILE) -> Bank:
         ) from error
 
 
-@cache
 def deal(
     task: Task,
     classes: tuple[Component, ...] = CLASSES,
     levels: tuple[Level, ...] = get_args(Level),
     bank: Path | None = None,
 ) -> tuple[LanguagePerturbation, ...]:
-    """All rewrites of a task in the order they are drawn: shuffled by task, one class after the other in turn."""
+    """All rewrites of a task in the order they are drawn: shuffled by task, one class after the other in turn.
+
+    Raises:
+        PipelineError: when there are none, or one of them does not pass ``lint``.
+    """
+    if dealt := _dealt(task, classes, levels, bank):
+        return dealt
+    raise PipelineError(
+        f"task {task.suite}/{task.name} has no rewrites of class {' or '.join(classes)} "
+        f"at level {' or '.join(map(str, levels))}",
+        where=bank or BANK_FILE,
+        expected=f"a task of {', '.join(load_bank())}",
+        remedy="add rewrites of the task to the bank, or take language out of the configured axes",
+    )
+
+
+@cache
+def _dealt(
+    task: Task, classes: tuple[Component, ...], levels: tuple[Level, ...], bank: Path | None
+) -> tuple[LanguagePerturbation, ...]:
     banks = (load_bank(), load_bank(bank)) if bank else (load_bank(),)
     of_task = [one.get(task.suite, {}).get(task.name, {}) for one in banks]
     stored = {component: tuple(text for one in of_task for text in one.get(component, ())) for component in CLASSES}
     turn = seeding.rng("language", task.suite, task.name).permutation(list(dict.fromkeys(classes)))
     columns = [_shuffled(task, component, stored[component], levels) for component in turn.tolist()]
     dealt = tuple(card for row in zip_longest(*columns) for card in row if card is not None)
-    if not dealt:
-        raise PipelineError(
-            f"task {task.suite}/{task.name} has no rewrites of class {' or '.join(classes)} "
-            f"at level {' or '.join(map(str, levels))}",
-            where=bank or BANK_FILE,
-            expected=f"a task of {', '.join(load_bank())}",
-            remedy="add rewrites of the task to the bank, or take language out of the configured axes",
-        )
     for card in dealt:
         if fault := lint(card.text, task, card.component):
             raise PipelineError(

@@ -26,8 +26,8 @@ Component = Literal["diffuse", "direction", "specular", "shadows", "combined"]
 Multiple = Annotated[float, Field(ge=0.0, le=100.0)]
 
 SHADOWED_DIFFUSE, SHADOWED_SPECULAR = 0.7, 0.5
-"""Most light that lamps with shadows may add up to. Without shadows all lamps are drawn in one pass, which cuts their
-sum off at the colour of what they shine on; with shadows each has a pass of its own, nothing is cut off, and the
+"""Most light that lamps with shadows may add up to. Without shadows all lamps are rendered in one pass, which cuts
+their sum off at the colour of what they shine on; with shadows each has a pass of its own, nothing is cut off, and the
 kitchen's three lamps of 0.8 each would make its table white."""
 
 SHOWN_DIFFUSE = 0.8

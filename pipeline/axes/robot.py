@@ -1,4 +1,4 @@
-"""Robot: the posture that the arm starts in or is drawn to. Physics layer."""
+"""Robot: the posture that the arm starts in or is pulled to. Physics layer."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
     ``initial_joints`` puts the arm there, and the controller holds it there. ``controller_posture`` does what
     LIBERO-Plus's robot tasks do: there the reset has another posture, and then the recorded state is put in. So the arm
-    starts where it was recorded, and the controller draws it, while the scene settles and all through the episode, to
+    starts where it was recorded, and the controller pulls it, while the scene settles and all through the episode, to
     the posture by its null space, and to the posture's hand orientation until an action turns the hand.
 
     The offset is added to the same of the clean twin: ``initial_joints`` to the recorded start, which LIBERO's reset
@@ -66,8 +66,8 @@ class RobotPerturbation(PhysicsPerturbation):
         before = compiled.touching().keys()
         joints = [model.joint(f"robot0_joint{n}") for n in range(1, 8)]
         arm = [joint.qposadr[0] for joint in joints]
-        drawn = self.component == "controller_posture" and scene.posture_rad is not None
-        posture = (scene.posture_rad if drawn else data.qpos[arm]) + np.array(self.joint_offsets_rad)
+        pulled = self.component == "controller_posture" and scene.posture_rad is not None
+        posture = (scene.posture_rad if pulled else data.qpos[arm]) + np.array(self.joint_offsets_rad)
         low, high = np.array([joint.range for joint in joints]).T
         if (posture < low + LIMIT_MARGIN_RAD).any() or (posture > high - LIMIT_MARGIN_RAD).any():
             raise RefusedError("joint_limit")

@@ -44,7 +44,7 @@ def axes(arguments: argparse.Namespace) -> int:
         views = " and ".join(sorted(kind.views)) or "instruction"
         table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
     Console(highlight=False).print(table)
-    print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` draws what an axis does.")
+    print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` shows what an axis does.")
     return 0
 
 
@@ -91,7 +91,7 @@ def preview(arguments: argparse.Namespace) -> int:
         if arguments.axis == EVERY:
             picture = preview.overview(stage, config, benchmark.load())
         else:
-            picture = preview.draw(stage, arguments.axis, config, benchmark.load())
+            picture = preview.axis_sheet(stage, arguments.axis, config, benchmark.load())
         picture.save(temporary, format="JPEG" if arguments.out.suffix == ".jpg" else "PNG", quality=90)
         of = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
         print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")

@@ -53,23 +53,33 @@ def _expand_arguments(command: argparse.ArgumentParser) -> None:
         metavar="PATTERN",
         help="patterns of <suite>/<task> (default: the four suites)",
     )
+    command.add_argument(
+        "--starts",
+        choices=("wide", "reset"),
+        default="wide",
+        help="wide: arm and target further away than in LIBERO's own (default); reset: each start is a reset of "
+        "LIBERO's environment",
+    )
     command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
 
 
 def expand(arguments: argparse.Namespace) -> int:
     """make many demonstrations of each task from the starter set's one, where the hub cannot be reached
 
-    Replays each human demonstration from other starts of the arm, with the target elsewhere, and writes those that
-    reach the goal in LIBERO's own HDF5 layout (states, actions and scenes; no images). They are marked as expanded in
-    the files and in every dataset made from them.
+    Replays each human demonstration from other starts and writes those that reach the goal in LIBERO's own HDF5 layout
+    (states, actions and scenes; no images). They are marked as expanded in the files and in every dataset made from
+    them.
     """
     from pipeline.compute.pool import runner
     from pipeline.config import ComputeConfig, DemosConfig
-    from pipeline.run.expand import candidates, expand
+    from pipeline.run.expand import candidates, expand, resets
     from pipeline.testset import benchmark
 
     demos = DemosConfig(tasks=tuple(arguments.tasks))
-    rows = candidates(demos, arguments.per_task, arguments.seed, benchmark.load())
+    if arguments.starts == "reset":
+        rows = resets(demos, arguments.per_task, arguments.seed)
+    else:
+        rows = candidates(demos, arguments.per_task, arguments.seed, benchmark.load())
     with runner(ComputeConfig(), arguments.out) as workers:
         made = expand(arguments.out, demos, rows, arguments.per_task, workers)
     print(

@@ -1,4 +1,4 @@
-"""A finished run: ``check``, ``regenerate`` and ``push``."""
+"""A finished run, or a dataset from elsewhere: ``check``, ``audit``, ``regenerate`` and ``push``."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ TITLE = "a finished run"
 
 def add_commands(commands: Any) -> None:
     add(commands, check, add_config)
+    add(commands, audit, _audit_arguments)
     add(commands, regenerate, _regenerate_arguments)
     add(commands, push, _push_arguments)
 
@@ -42,6 +43,38 @@ def check(arguments: argparse.Namespace) -> int:
         print(what)
     print(json.dumps({**stored, "openvla_oft": trained}))
     return int(bool(damaged or misleading))
+
+
+def _audit_arguments(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "dataset", type=Path, metavar="DATASET", help="folder of an RLDS or LeRobot set, whoever made it"
+    )
+    command.add_argument(
+        "--manifest", type=Path, metavar="FILE", help="labels of episodes that lost theirs and kept their episode_id"
+    )
+
+
+def audit(arguments: argparse.Namespace) -> int:
+    """say how near a dataset comes to the benchmark's test tasks, and what cannot be known of it
+
+    Compares the instruction of every episode, the matrices of its agent view where the dataset has them, and this
+    project's labels where it has these, also after it was edited, merged or filtered. The last line is JSON. Ends with
+    1 where an episode overlaps with a test task.
+    """
+    from dataclasses import asdict
+
+    import rich
+
+    from pipeline.planning import leakage
+    from pipeline.testset import benchmark
+    from pipeline.validation.audit import audit
+
+    found = audit(arguments.dataset, benchmark.load(), arguments.manifest)
+    rich.print(leakage.report(found.axes))
+    for axis, episodes in found.unknown.items():
+        print(f"{axis}: not known of {episodes:,} of {found.episodes:,} episodes, which have no labels")
+    print(json.dumps(asdict(found) | {"unknown": found.unknown}))
+    return int(any(finding.overlaps for finding in found.axes.values()))
 
 
 def _regenerate_arguments(command: argparse.ArgumentParser) -> None:

@@ -177,7 +177,7 @@ def matrix(measured: Sequence[Pair]) -> tuple[list[str], Floats]:
 
 
 def heatmap(measured: Sequence[Pair], file: Path) -> None:
-    """Draw the matrix as the paper does."""
+    """Plot the matrix as the paper does."""
     names, shown = matrix(measured)
     figure = Figure(figsize=(1.6 + 0.9 * len(names), 1.2 + 0.8 * len(names)), layout="constrained")
     axes = figure.add_subplot()

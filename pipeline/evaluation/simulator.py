@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.axes import Perturbation
 from pipeline.errors import PipelineError, RefusedError
-from pipeline.physics.control_env import control_env, seeded
+from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
 from pipeline.planning.streams import Stream
@@ -146,16 +146,7 @@ class Simulator(Environment):
 
     def _reset(self, seed: int, posture_rad: tuple[float, ...] | None) -> None:
         env = self._env.env
-        # As in ``place_fixtures``: every reset would draw from the samplers of all resets before.
-        del env.object_property_initializers[self._openings :]
-        self._scene = None
-        # Each reset makes the robot anew, from this.
-        env.robot_configs[0]["initial_qpos"] = None if posture_rad is None else np.array(posture_rad)
-        try:
-            with seeded(seed):
-                self._reset_until_placed()
-        finally:
-            env.robot_configs[0]["initial_qpos"] = None
+        self._reset_under(seed, initial_qpos=None if posture_rad is None else np.array(posture_rad))
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
         mujoco.mj_getState(self.model, env.sim.data._data, physics, _PHYSICS)
         self._rewind = _Rewind(

@@ -87,6 +87,11 @@ class Format(ABC, Generic[Options]):
         return self.folder
 
     @property
+    def language(self) -> bool:
+        """Whether it takes an episode's rewrites and subtasks."""
+        return False
+
+    @property
     def record_file(self) -> Path:
         return self.data / f"{self.name}.json"
 

@@ -34,6 +34,10 @@ class LeRobot(Format[LeRobotConfig]):
     clients = ("lerobot_act", "lerobot_smolvla")
 
     @property
+    def language(self) -> bool:
+        return self.options.language
+
+    @property
     def root(self) -> Path:
         """For ``LeRobotDataset(repo_id, root=root)``."""
         return self.folder / self.options.name
@@ -58,19 +62,21 @@ class LeRobot(Format[LeRobotConfig]):
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats import lerobot_write
 
-        lerobot_write.write_piece(path, piece, load, self.options.frames, self.extras)
+        lerobot_write.write_piece(path, piece, load, self.options.frames, self.extras, self.language)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, int]]:
         from pipeline.formats import lerobot_write
 
-        lerobot_write.finish(work, work / "dataset" / self.options.name, pieces, self.options.frames, self.extras)
+        root, options = work / "dataset" / self.options.name, self.options
+        lerobot_write.finish(work, root, pieces, options.frames, self.extras, self.language)
         ids = [episode_id for piece in pieces for episode_id in piece.ids]
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import lerobot_columns, lerobot_read
 
-        return lerobot_read.check(self.root, cache, kept, lerobot_columns.features(self.options.frames, self.extras))
+        columns = lerobot_columns.features(self.options.frames, self.extras, self.language)
+        return lerobot_read.check(self.root, cache, kept, columns)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_read

@@ -22,6 +22,9 @@ INSTANCES, OBJECT_POSES = "instances", "object_poses"
 FILE_MB = 200
 """About as large as a file of data or video may become."""
 
+LANGUAGE = "language_persistent"
+"""lerobot's column of what is said of an episode: all of it in every frame, from lerobot 0.6 on."""
+
 COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 """lerobot's own columns of every frame, beside ``timestamp``."""
 
@@ -39,7 +42,7 @@ def matrix_columns() -> dict[str, MatrixSpec]:
     return {camera_column(view, name): getattr(SCHEMA, name) for view in SCHEMA.views for name in MATRICES}
 
 
-def features(frames: Frames, extras: Collection[Extra] = ()) -> dict[str, dict[str, Any]]:
+def features(frames: Frames, extras: Collection[Extra] = (), language: bool = False) -> dict[str, dict[str, Any]]:
     """The columns of every frame, as ``meta/info.json`` describes them."""
     dtype = {"video": "video", "images": "image"}[frames]
     frame = {"dtype": dtype, "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
@@ -52,6 +55,8 @@ def features(frames: Frames, extras: Collection[Extra] = ()) -> dict[str, dict[s
     columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in MAPS if name in extras}
     if "object_poses" in extras:
         columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
+    if language:
+        columns[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
     columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}
     return columns | {name: {"dtype": "int64", "shape": (1,), "names": None} for name in COUNTERS}
 

@@ -19,7 +19,14 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
-from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, camera_column, matrix_columns
+from pipeline.formats.lerobot_columns import (
+    EPISODE_ID,
+    INSTANCES,
+    LANGUAGE,
+    OBJECT_POSES,
+    camera_column,
+    matrix_columns,
+)
 from pipeline.formats.lerobot_video import Video
 from pipeline.formats.motion_statistics import describe
 from pipeline.images.jpeg import decode
@@ -32,12 +39,28 @@ Numbers = Mapping[str, NDArray[Any]]
 """Column to what it has at each step, (T,) or (T, D)."""
 
 
+_TEXT = datasets.Value("string")
+_LANGUAGE = datasets.List(
+    {
+        "role": _TEXT,
+        "content": _TEXT,
+        "style": _TEXT,
+        "timestamp": datasets.Value("float32"),
+        "camera": _TEXT,
+        "tool_calls": datasets.List(datasets.Json()),
+    }
+)
+"""``language_persistent_column_feature`` in ``datasets/language.py`` of lerobot 0.6.1, which older ones do not have."""
+
+
 def schema(columns: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
     """Of the data files, with what ``datasets`` and the hub's viewer know images by."""
     stored: dict[str, Any] = {}
     for name, of in columns.items():
         if of["dtype"] == "image":
             stored[name] = datasets.Image()
+        elif of["dtype"] == "language":
+            stored[name] = _LANGUAGE
         elif of["dtype"] != "video":
             value = datasets.Value(of["dtype"])
             stored[name] = value if of["shape"] == (1,) else datasets.Sequence(value, length=of["shape"][0])
@@ -97,6 +120,27 @@ def columns(episode: Episode, found: Numbers) -> dict[str, pa.Array]:
     }
     stored = {name: pa.array(list(values)) for name, values in found.items()}
     return stored | {name: pa.array(values) for name, values in texts.items()} | images
+
+
+def language(episode: Episode, train: bool) -> dict[str, pa.Array]:
+    """The language column of an episode, the same in each of its frames, as lerobot's own annotations have it.
+
+    ``active_at`` of lerobot's ``language_render.py`` finds the subtask by its time; ``task_aug`` is for training alone,
+    and the first of it the episode's own instruction.
+    """
+    said = [("assistant", "subtask", step, text) for step, text in episode.subtasks]
+    if train and episode.rewrites:
+        wordings = dict.fromkeys([episode.instruction, *episode.rewrites])
+        said = [*(("user", "task_aug", 0, text) for text in wordings), *said]
+    rows = [
+        {"role": role, "content": text, "style": style, "timestamp": np.float32(step / SCHEMA.fps_hz)}
+        for role, style, step, text in said
+    ]
+    # pyarrow makes no JSON from Python; what casts a table to the schema makes it of texts.
+    kinds = {name: pa.string() for name in ("role", "content", "style", "camera")}
+    kinds |= {"timestamp": pa.float32(), "tool_calls": pa.list_(pa.string())}
+    once = pa.array([rows], pa.list_(pa.struct([(name, kinds[name]) for name in _LANGUAGE.feature])))
+    return {LANGUAGE: pa.concat_arrays([once] * len(episode))}
 
 
 def figures(found: Numbers, shown: Mapping[str, Counts]) -> dict[str, dict[str, NDArray[Any]]]:

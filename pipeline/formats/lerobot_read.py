@@ -209,7 +209,9 @@ def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: t
     return Episode(
         episode_id=row[EPISODE_ID],
         frames={},
-        **{name: _matrix(table, getattr(SCHEMA, name).lerobot_key) for name in MOTION},
+        state=_matrix(table, SCHEMA.state.lerobot_key),
+        joint_state=_matrix(table, SCHEMA.joint_state.lerobot_key),
+        action=_matrix(table, SCHEMA.action.lerobot_key),
         instruction=instruction,
         provenance=row,
         geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},

@@ -51,7 +51,9 @@ def file_path(kind: str, number: int, suffix: str) -> str:
     return f"{kind}/{PLACE.format(chunk_index=chunk, file_index=file)}{suffix}"
 
 
-def write_piece(path: Path, piece: Piece, load: Load, frames: Frames, extras: tuple[Extra, ...]) -> None:
+def write_piece(
+    path: Path, piece: Piece, load: Load, frames: Frames, extras: tuple[Extra, ...], language: bool
+) -> None:
     """Write the files of some episodes into a new folder; one episode at a time is in memory.
 
     The bytes, videos included, depend on the episodes, their order and the encoder's version alone.
@@ -63,15 +65,16 @@ def write_piece(path: Path, piece: Piece, load: Load, frames: Frames, extras: tu
     levels: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
     rows, provenance = [], []
     first_step = piece.first_step
+    schema = of_episode.schema(features(frames, extras, language))
     with ExitStack() as opened:
-        data = opened.enter_context(pq.ParquetWriter(path / DATA, of_episode.schema(features(frames, extras))))
+        data = opened.enter_context(pq.ParquetWriter(path / DATA, schema))
         videos = {view: opened.enter_context(Video(path / f"{view}.mp4")) for view in SCHEMA.views if frames == "video"}
         for index, episode_id in enumerate(piece.ids, piece.first_episode):
             episode = load(episode_id)
             check(episode, extras)
             shown = {view: of_episode.show(episode, view, videos.get(view)) for view in SCHEMA.views}
             numbers = of_episode.numbers(episode, index, first_step, piece.tasks[episode.instruction])
-            columns = of_episode.columns(episode, numbers)
+            columns = of_episode.columns(episode, numbers) | of_episode.language(episode, piece.split == "train")
             # A row group for each episode, so that one is read without the others.
             data.write_table(pa.table({name: columns[name] for name in data.schema.names}).cast(data.schema))
             # An episode's statistics are there because lerobot's tools for editing put them together again.
@@ -86,7 +89,9 @@ def write_piece(path: Path, piece: Piece, load: Load, frames: Frames, extras: tu
     (path / LEVELS).write_text(json.dumps({view: counts.tolist() for view, counts in levels.items()}))
 
 
-def finish(work: Path, root: Path, pieces: Sequence[Piece], frames: Frames, extras: tuple[Extra, ...]) -> None:
+def finish(
+    work: Path, root: Path, pieces: Sequence[Piece], frames: Frames, extras: tuple[Extra, ...], language: bool
+) -> None:
     """Put the files of all pieces in their places below ``root``, and write what is about all of them."""
     for piece in pieces:
         places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
@@ -100,7 +105,7 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], frames: Frames, extr
     tasks = {task: number for piece in pieces for task, number in piece.tasks.items()}
     numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
     pq.write_table(pa.table(numbered).replace_schema_metadata({"pandas": INDEX}), root / "meta" / "tasks.parquet")
-    columns = features(frames, extras)
+    columns = features(frames, extras, language)
     levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
     counts = {view: np.sum([of_piece[view] for of_piece in levels], axis=0) for view in SCHEMA.views}
     figures = {of.lerobot_key: statistics(counts[view]) for view, of in SCHEMA.views.items()}

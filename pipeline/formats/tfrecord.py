@@ -111,7 +111,7 @@ def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:
         raise PipelineError(
             f"a record has no feature {error}", expected="what features.json names", remedy="write the dataset again"
         ) from error
-    return dict(_flat(example["steps"])) | dict(_flat(example["episode_metadata"], METADATA))
+    return dict(_flat(example["steps"])) | dict(_flat(example.get("episode_metadata", {}), METADATA))
 
 
 def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, NDArray[Any]]]:

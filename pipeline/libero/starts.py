@@ -13,12 +13,15 @@ SCATTER_RAD = 0.16
 """No start of LIBERO's is further from home: at most 0.154 in the 130 starter demonstrations, 0.100 in the 2,000
 initial states that the four suites are evaluated from."""
 
+LEFT_OUT_STEPS = 5
+"""Control steps after a reset that LIBERO cuts off a recording (``cap_index`` of its ``create_dataset.py``)."""
+
 
 def recorded_start(demo: Demo, model_xml: str, settles: bool = True) -> Scene:
     """Where a demonstration starts.
 
-    LIBERO cuts the first five steps of a recording, in which the gripper's command came to what the first action that
-    is left asks for. What settles does so as in an evaluation, which puts a state in after a reset: the controller has
+    In the steps that LIBERO cuts off a recording, the gripper's command came to what the first action that is left
+    asks for. What settles does so as in an evaluation, which puts a state in after a reset: the controller has
     the reset's posture. What does not, and what starts too far from home for a reset, such as the demonstrations of
     ``demos expand``, is held where it is.
 

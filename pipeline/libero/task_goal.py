@@ -1,4 +1,6 @@
-"""What a task asks for, as its BDDL file defines it: what goes where, and what is opened, closed, turned on or off."""
+"""What a task asks for, as its BDDL file defines it: what goes where, and what is opened, closed, turned on or off.
+
+And what one calls the things and places of it, in plain words."""
 
 from __future__ import annotations
 
@@ -9,10 +11,33 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.libero.bddl import Bddl, read
+from pipeline.libero.bddl import Bddl, Fact, read
 
 PARTS = ("top", "middle", "bottom", "left", "right", "front", "back", "center")
 """Words in the names of regions that say which drawer, compartment, side or spot."""
+
+NAMES = {
+    "akita_black_bowl": "black bowl",
+    "black_book": "book",
+    "chefmate_8_frypan": "frying pan",
+    "desk_caddy": "caddy",
+    "flat_stove": "stove",
+    "new_salad_dressing": "salad dressing",
+    "porcelain_mug": "white mug",
+    "red_coffee_mug": "red mug",
+    "white_cabinet": "cabinet",
+    "white_yellow_mug": "yellow and white mug",
+    "wooden_cabinet": "cabinet",
+    "wooden_tray": "tray",
+    "wooden_two_layer_shelf": "shelf",
+}
+"""Kinds that LIBERO's instructions call otherwise."""
+
+SIDES = ("left", "right", "front", "back", "middle")
+"""By which things of one kind are told apart."""
+
+INSIDE = {"cabinet": "drawer", "caddy": "compartment"}
+"""What a part of a thing is called."""
 
 
 class Aim(NamedTuple):
@@ -81,6 +106,32 @@ def read_goal(bddl_file: Path) -> TaskGoal:
         changes=tuple(StateChange(fact[0], *scene.part(fact[1])) for fact in facts if len(fact) == 2),
         pairs=tuple(kind for kind, count in counts.items() if count > 1),
     )
+
+
+def called(bddl: Bddl, name: str) -> str:
+    """What one calls a thing or a part of it: wooden_cabinet_1_middle_region is the middle drawer of the cabinet."""
+    return _words(*_Scene(bddl).part(name))
+
+
+def where(bddl: Bddl, fact: Fact) -> tuple[str, str]:
+    """How one says to which place, and at which, a fact of the goal puts something: to the plate, on the plate."""
+    aim = next(_Scene(bddl).aims(*fact), None)
+    if aim is None:
+        return "to its place", "at its place"
+    if aim.place is None or aim.relation in PARTS:
+        there = f"to the {aim.relation} of {_words(aim.place)}" if aim.place else f"to the {aim.part}"
+        return there, there
+    place = _words(aim.place, aim.part)
+    # LIBERO has no inside of bowls.
+    into = aim.place.endswith("bowl") and not aim.thing.endswith("bowl")
+    return f"to {place}", f"{'in' if into else aim.relation} {place}"
+
+
+def _words(kind: str, part: str | None = None) -> str:
+    noun = NAMES.get(kind, kind.replace("_", " "))
+    if part and noun in INSIDE:
+        return f"the {part} {INSIDE[noun]} of the {noun}"
+    return f"the {part} {noun}" if part in SIDES else f"the {noun}"
 
 
 class _Scene:

@@ -91,18 +91,45 @@ class Environment:
         says, but fixtures (cabinet, stove, rack, microwave) are not part of it and stay where the reset put them.
         """
         if seed not in self._placed:
-            # Each reset adds its samplers of open drawers and doors to those of all resets before, and draws from
-            # every one of them: without this, the second placement under a seed differs from the first.
-            del self._env.env.object_property_initializers[self._openings :]
-            self._scene = None
-            with seeded(seed), self._compiling():
-                self._reset_until_placed()
-            self._control_step = ControlStep(self._env.env)
-            scene = ET.fromstring(self._env.sim.model.get_xml())
-            put_images(scene, self._images or {})
-            as_evaluated(scene)
-            self._placed[seed] = ET.tostring(scene, encoding="unicode")
+            self._reset_under(seed)
+            self._placed[seed] = self._as_mjcf()
         return self._placed[seed]
+
+    def reset(self, seed: int) -> str:
+        """LIBERO's own first reset under ``seed``, as the one that made its initial states; 1.3 s.
+
+        Fixtures and objects stand where ``place_fixtures`` and the BDDL file have them, and the arm at home with
+        robosuite's default noise, which LIBERO's ``ControlEnv`` leaves out. The environment stays there.
+
+        Returns:
+            The scene as MJCF.
+        """
+        self._reset_under(seed, initialization_noise="default")
+        return self._as_mjcf()
+
+    def _reset_under(self, seed: int, **robot: object) -> None:
+        """Reset by LIBERO's own draws under a seed, with other settings of robosuite's robot than usual."""
+        env = self._env.env
+        # Each reset adds its samplers of open drawers and doors to those of all resets before, and draws from every
+        # one of them: without this, the second placement under a seed differs from the first.
+        del env.object_property_initializers[self._openings :]
+        self._scene = None
+        # Each reset makes the robot anew, from this.
+        usual = env.robot_configs[0]
+        env.robot_configs[0] = {**usual, **robot}
+        try:
+            with seeded(seed), self._compiling():
+                until_placed(env.reset, self.task)
+        finally:
+            env.robot_configs[0] = usual
+        self._control_step = ControlStep(env)
+
+    def _as_mjcf(self) -> str:
+        """The scene that LIBERO's last reset compiled, with its images and the masses of an evaluation."""
+        scene = ET.fromstring(self._env.sim.model.get_xml())
+        put_images(scene, self._images or {})
+        as_evaluated(scene)
+        return ET.tostring(scene, encoding="unicode")
 
     @contextmanager
     def _compiling(self) -> Iterator[None]:
@@ -122,9 +149,6 @@ class Environment:
             yield
         finally:
             MjSim.from_xml_string = compiled
-
-    def _reset_until_placed(self) -> None:
-        until_placed(self._env.env.reset, self.task)
 
     def restore(self, scene: Scene) -> None:
         """Put the environment where a scene starts; nothing from before has an effect on what follows.
@@ -160,7 +184,7 @@ class Environment:
             env.sim.data.qpos[robot._ref_joint_pos_indexes] = scene.posture_rad
             env.sim.data.qvel[robot._ref_joint_vel_indexes] = 0.0
         env.sim.forward()
-        # As after a reset in an evaluation: the controller knows where the arm is, and its null space draws the arm to
+        # As after a reset in an evaluation: the controller knows where the arm is, and its null space pulls the arm to
         # the posture that it is in, not to robosuite's home posture.
         robot.controller.update_initial_joints(env.sim.data.qpos[robot._ref_joint_pos_indexes])
         if scene.posture_rad is not None:

@@ -14,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from rich import box
@@ -26,9 +27,23 @@ from pipeline.axes.base import Nearest
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
 from pipeline.libero.tasks import find_task
-from pipeline.planning.plan import Row
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
+
+
+class Compared(Protocol):
+    """An episode that is compared with the test tasks, such as a row of the plan; its fields are named as there."""
+
+    @property
+    def episode_id(self) -> str: ...
+    @property
+    def suite(self) -> str: ...
+    @property
+    def task(self) -> str: ...
+    @property
+    def perturbations(self) -> str: ...
+    @property
+    def wanted(self) -> bool: ...
 
 
 @dataclass(frozen=True)
@@ -78,7 +93,7 @@ class AxisDistance:
     coverage: dict[str, Coverage]
 
 
-def check(rows: Sequence[Row], test: TestSet) -> dict[str, AxisDistance]:
+def check(rows: Sequence[Compared], test: TestSet) -> dict[str, AxisDistance]:
     """Axis to finding, in the order of the plan."""
     found: dict[str, list[tuple[Nearest, str, Perturbation]]] = defaultdict(list)
     wanted: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import count, islice
 from math import ceil
@@ -32,6 +32,9 @@ from pipeline.types import Task, Verdict
 
 _ATTEMPTS = 100
 
+RESET = "reset"
+"""What stands for the axis where nothing is perturbed and the start is a reset of LIBERO's environment."""
+
 
 @dataclass(frozen=True)
 class Row:
@@ -57,6 +60,13 @@ class Row:
     wanted: Annotated[bool, "false for a reserve, used only where a candidate before it fails"]
     seed: Annotated[int, "the run's seed; with axis, demo_id and variant the key of the draw"]
     variant: Annotated[int, "how many draws of this axis this demonstration had before"]
+
+    @property
+    def reset_seed(self) -> int | None:
+        """Of the reset of LIBERO's environment that the replay starts from; None where it starts as recorded."""
+        if self.axis != RESET:
+            return None
+        return int(rng(self.seed, self.axis, self.demo_id, self.variant).integers(2**32))
 
 
 def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, test: TestSet) -> list[Row]:
@@ -92,6 +102,26 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
 def twins(demos: Sequence[DemoEntry], seed: int, replay: ReplayConfig) -> list[Row]:
     """The clean twin of each demonstration of a task."""
     return [_Planner(seed, replay).row(demo, (), rank) for rank, demo in enumerate(demos)]
+
+
+def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, replay: ReplayConfig) -> list[Row]:
+    """The clean twin of each demonstration of a task, and candidates that start from resets, each one's in turn."""
+    twins_of_task = twins(demos, seed, replay)
+    rows = [*twins_of_task]
+    for rank in range(wanted + ceil(wanted * reserve)):
+        variant, number = divmod(rank, len(demos))
+        row = replace(
+            twins_of_task[number],
+            role="perturbed",
+            axis=RESET,
+            component=RESET,
+            rank=rank,
+            wanted=rank < wanted,
+            variant=variant,
+        )
+        name = digest(RESET, row.trajectory_id, row.reset_seed)[:16]
+        rows.append(replace(row, episode_id=name, trajectory_id=name))
+    return rows
 
 
 def demonstrations(rows: Sequence[Row]) -> int:

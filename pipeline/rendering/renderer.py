@@ -22,7 +22,7 @@ class Renderer:
 
     Args:
         scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
-        drawing: draws the model already; by default one is made.
+        drawing: renders the model already; by default one is made.
 
     Raises:
         PipelineError: when nothing renders on this machine.

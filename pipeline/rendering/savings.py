@@ -63,4 +63,4 @@ def why_plain() -> str | None:
 
 @functools.cache
 def _say(reason: str) -> None:
-    logging.getLogger(__name__).warning("drawn by MuJoCo as it is: %s", reason)
+    logging.getLogger(__name__).warning("rendered by MuJoCo as it is: %s", reason)

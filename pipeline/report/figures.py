@@ -1,6 +1,6 @@
 """Small plots as inline SVG: one panel each, as wide as a phone's screen, in the colour of the page's text.
 
-A page lays panels out as its width allows. Text stays text, and whatever is drawn in ``INK`` takes the page's own
+A page lays panels out as its width allows. Text stays text, and whatever is plotted in ``INK`` takes the page's own
 colour, so that one figure reads in light and in dark.
 """
 
@@ -23,7 +23,7 @@ from pipeline.axes import AXES
 
 Values = NDArray[Any]
 Groups = Mapping[str, Values]
-"""What is drawn in one colour, by name; those of ``REFERENCES`` are drawn behind the others, in grey."""
+"""What is plotted in one colour, by name; those of ``REFERENCES`` are plotted behind the others, in grey."""
 
 REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
@@ -66,27 +66,27 @@ def colour(group: str) -> str:
     return GREY if group in REFERENCES else COLOURS.get(group, OTHER)
 
 
-def panel(title: str, draw: Callable[[Axes], None], height_in: float = HEIGHT_IN) -> Panel:
-    """One pair of axes, drawn on by ``draw``."""
+def panel(title: str, plot: Callable[[Axes], None], height_in: float = HEIGHT_IN) -> Panel:
+    """One pair of axes, plotted on by ``plot``."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained", dpi=DOTS_DPI)
-        draw(figure.add_subplot())
+        plot(figure.add_subplot())
         written = io.StringIO()
         # Without a date the same data give the same bytes.
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        # As savefig does, which draws everything once more before.
+        # As savefig does, which plots everything once more before.
         FigureCanvasSVG(figure).print_svg(written, metadata=nothing)  # type: ignore[no-untyped-call]
-    drawn = written.getvalue()
-    drawn = drawn[drawn.index("<svg") :].replace(INK, "currentColor")
+    plotted = written.getvalue()
+    plotted = plotted[plotted.index("<svg") :].replace(INK, "currentColor")
     # HTML knows the namespaces, and numbered names would clash between the figures of a page.
-    drawn = re.sub(r' xmlns(:xlink)?="[^"]*"| id="[a-z0-9_.]+_\d+"', "", drawn)
-    return Panel(title, drawn.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1))
+    plotted = re.sub(r' xmlns(:xlink)?="[^"]*"| id="[a-z0-9_.]+_\d+"', "", plotted)
+    return Panel(title, plotted.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1))
 
 
 def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = False) -> Panel:
     """Share of each group's values in each bin: references filled, the others as lines; empty groups are left out."""
 
-    def draw(axes: Axes) -> None:
+    def plot(axes: Axes) -> None:
         for name, values in _references_first(groups):
             if not len(values):
                 continue
@@ -104,13 +104,13 @@ def histogram(title: str, groups: Groups, bins: Values, label: str, log: bool = 
             # than all else.
             axes.yaxis.set(major_formatter="{x:g}", minor_locator=NullLocator())
 
-    return panel(title, draw)
+    return panel(title, plot)
 
 
 def scatter(title: str, groups: Groups, x_label: str, y_label: str, equal: bool = False) -> Panel:
     """Points (N, 2) in a plane; ``equal`` keeps both scales the same."""
 
-    def draw(axes: Axes) -> None:
+    def plot(axes: Axes) -> None:
         for name, points in _references_first(groups):
             at = np.asarray(points, float).reshape(-1, 2)
             _dots(axes, at[:, 0], at[:, 1], name, behind=name in REFERENCES)
@@ -118,7 +118,7 @@ def scatter(title: str, groups: Groups, x_label: str, y_label: str, equal: bool 
         if equal:
             axes.set_aspect("equal", adjustable="datalim")
 
-    return panel(title, draw, HEIGHT_IN * 1.15)
+    return panel(title, plot, HEIGHT_IN * 1.15)
 
 
 def _dots(axes: Axes, x: Values, y: Values, group: str, behind: bool) -> None:
@@ -131,13 +131,13 @@ def _dots(axes: Axes, x: Values, y: Values, group: str, behind: bool) -> None:
 def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
     """A line for each row with its groups' values along it, references below what is compared with them."""
 
-    def draw(axes: Axes) -> None:
+    def plot(axes: Axes) -> None:
         for height, groups in enumerate(rows.values()):
             for name, values in groups.items():
                 alone = len(groups) == 1
                 behind = name in REFERENCES and not alone
                 middle = height + (0.0 if alone else 0.2 if behind else -0.2)
-                # Equal values are drawn beside each other.
+                # Equal values are plotted beside each other.
                 ordered = np.sort(values)
                 spread = 0.16 * np.sin(2.4 * (np.arange(len(ordered)) - np.searchsorted(ordered, ordered)))
                 _dots(axes, ordered, middle + spread, name, behind)
@@ -145,21 +145,23 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
         axes.set_yticks(range(len(rows)), [name.replace("+", "+\n") for name in rows])
         axes.set(xlabel=label, ylim=(len(rows) - 0.5, -0.5))
         axes.grid(visible=False, axis="y")
-        drawn = np.concatenate([values for groups in rows.values() for values in groups.values()])
-        axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((drawn == drawn.round()).all())))
-        if len(drawn) and drawn.min() == drawn.max():
+        plotted = np.concatenate([values for groups in rows.values() for values in groups.values()])
+        axes.xaxis.set_major_locator(
+            MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((plotted == plotted.round()).all()))
+        )
+        if len(plotted) and plotted.min() == plotted.max():
             # A scale around one single value would show thousandths.
-            axes.set_xlim(drawn[0] - 1, drawn[0] + 1)
+            axes.set_xlim(plotted[0] - 1, plotted[0] + 1)
 
     lines = max(1 + name.count("+") for name in rows)
-    return panel(title, draw, 0.8 + max(0.32, 0.15 * lines) * len(rows))
+    return panel(title, plot, 0.8 + max(0.32, 0.15 * lines) * len(rows))
 
 
 def bars(title: str, counts: Mapping[str, int], group: str, label: str) -> Panel:
     """A bar for each name, largest first."""
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
-    def draw(axes: Axes) -> None:
+    def plot(axes: Axes) -> None:
         names, lengths = [name for name, _ in ordered], [count for _, count in ordered]
         axes.barh(names, lengths, color=colour(group), height=0.7)
         axes.invert_yaxis()
@@ -167,11 +169,11 @@ def bars(title: str, counts: Mapping[str, int], group: str, label: str) -> Panel
         axes.set(xlabel=label)
         axes.grid(visible=False, axis="y")
 
-    return panel(title, draw, 0.8 + 0.2 * len(ordered))
+    return panel(title, plot, 0.8 + 0.2 * len(ordered))
 
 
 class Share(NamedTuple):
-    """A share in [0, 1] with its interval, and the colour that it is drawn in."""
+    """A share in [0, 1] with its interval, and the colour that it is plotted in."""
 
     share: float
     low: float
@@ -183,7 +185,7 @@ def intervals(title: str, rows: Mapping[str, Sequence[Share]], label: str) -> Pa
     """A line for each row with its shares and their intervals, below each other."""
     most = max(map(len, rows.values()))
 
-    def draw(axes: Axes) -> None:
+    def plot(axes: Axes) -> None:
         for height, shares in enumerate(rows.values()):
             for place, shown in enumerate(shares):
                 at = height + 0.6 * ((place + 0.5) / most - 0.5)
@@ -193,7 +195,7 @@ def intervals(title: str, rows: Mapping[str, Sequence[Share]], label: str) -> Pa
         axes.set(xlabel=label, xlim=(-0.02, 1.02), ylim=(len(rows) - 0.5, -0.5))
         axes.grid(visible=False, axis="y")
 
-    return panel(title, draw, 0.8 + (0.14 + 0.12 * most) * len(rows))
+    return panel(title, plot, 0.8 + (0.14 + 0.12 * most) * len(rows))
 
 
 def _references_first(groups: Groups) -> list[tuple[str, Values]]:

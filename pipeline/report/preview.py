@@ -136,7 +136,7 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
     return sorted(chosen, key=lambda p: (p.component, p.level))
 
 
-def draw(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
+def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.Image:
     """The sheet of one axis: the original top left, then the variants with what was drawn.
 
     What a scene refuses is a grey tile with the reason.
@@ -202,7 +202,7 @@ def _strongest(stage: Stage, drawn: Sequence[Perturbation], view: str) -> Tile:
 
 
 def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:
-    """Draw every configured axis that applies on the first task of each suite that the run is about.
+    """Show every configured axis that applies on the first task of each suite that the run is about.
 
     Returns:
         Suite to the folder of its sheets, ``<folder>/<suite>/<axis>.png``.
@@ -228,4 +228,4 @@ def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:
     # Deepest last: what adds objects opens a scene for each draw, after which the demonstration's would be opened anew.
     for name, axis in reversed(config.plan.axes.drawn().items()):
         if axis.applies(stage.demo.task):
-            draw(stage, name, config, test).save(folder / f"{name}.png")
+            axis_sheet(stage, name, config, test).save(folder / f"{name}.png")

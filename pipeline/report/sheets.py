@@ -43,8 +43,8 @@ class Tile:
     caption: str
 
 
-def draw(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], folder: Path) -> dict[str, Path]:
-    """Draw one sheet for each perturbed axis of a run.
+def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], folder: Path) -> dict[str, Path]:
+    """Write one sheet for each perturbed axis of a run.
 
     Args:
         manifest: rows of the manifest.
@@ -58,14 +58,14 @@ def draw(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], 
     for row in manifest:
         if row["kept"] and row["role"] == "perturbed":
             by_axis.setdefault(row["axis"], []).append(row)
-    drawn = {}
+    written = {}
     with replaced(folder) as temporary:
         temporary.mkdir()
         for axis, rows in by_axis.items():
             tiles = [_pair(row, load) for row in spread(rows, 4 * COLUMNS)]
             sheet(f"{axis}; {HEADER}", tiles).save(temporary / f"{axis}.png")
-            drawn[axis] = folder / f"{axis}.png"
-    return drawn
+            written[axis] = folder / f"{axis}.png"
+    return written
 
 
 def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,10 +11,12 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import Edition, edition
 from pipeline.identity import versions
+from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.stores.frame_store import FrameStore
-from pipeline.types import Episode
+from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.types import Episode, Subtask
 
 
 @dataclass(frozen=True)
@@ -23,10 +26,12 @@ class EpisodeLoader:
     Attributes:
         data: folder with the plan and the frame store.
         config: how its frames are encoded.
+        rewrites: episode id to other wordings of its task, where episodes come with them and with their subtasks.
     """
 
     data: Path
     config: RenderConfig
+    rewrites: Mapping[str, Sequence[str]] | None = None
 
     def __call__(self, episode_id: str) -> Episode:
         row = _rows_by_id(edition(self.data / "plan.parquet"))[episode_id]
@@ -37,7 +42,7 @@ class EpisodeLoader:
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
         known |= asdict(rendered.quality) if rendered.quality else {}
         known |= {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
-        return Episode(
+        episode = Episode(
             episode_id=episode_id,
             frames={view: rendered.streams[stream.stream_id] for view, stream in shown.items()},
             state=rendered.state,
@@ -49,8 +54,20 @@ class EpisodeLoader:
             object_poses=rendered.object_poses,
             instances=rendered.instances,
         )
+        if self.rewrites is None:
+            return episode
+        done = _subtasks(self.data / "trajectories", row.trajectory_id, row.suite, row.task)
+        return replace(episode, rewrites=self.rewrites[episode_id], subtasks=done)
 
 
 @lru_cache(maxsize=1)
 def _rows_by_id(plan_file: Edition) -> dict[str, plan.Row]:
     return {row.episode_id: row for row in plan.read(plan_file.path)}
+
+
+@lru_cache(maxsize=10_000)
+def _subtasks(trajectories: Path, trajectory_id: str, suite: str, task: str) -> tuple[Subtask, ...]:
+    """Episodes share trajectories, and come in no order."""
+    from pipeline.physics.subtasks import subtasks  # others need no simulator
+
+    return subtasks(TrajectoryStore(trajectories).load(trajectory_id), find_task(suite, task))

@@ -1,4 +1,4 @@
-"""New demonstrations from old ones: other starts of the arm, other places of the target, in LIBERO's own HDF5 layout.
+"""New demonstrations from old ones: other starts of the arm, other places of things, in LIBERO's own HDF5 layout.
 
 For whoever cannot reach the hub's 50 demonstrations of each task: the starter set's one human demonstration becomes
 many, made by the planner and the replay that also make the datasets, and marked as expanded wherever they are used.
@@ -23,13 +23,14 @@ from pipeline.compute.pool import Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.identity import refuse_unasked
 from pipeline.libero import hdf5
+from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan
 from pipeline.run.replay_stage import Replays
 from pipeline.scenes.compiled import CompiledScene, proprioception
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Floats, Scene, Trajectory
+from pipeline.types import Floats, Scene, Task, Trajectory
 
 RESERVE = 2.0
 """Candidates drawn beyond those wanted, as a share: poses that collide are refused, and not every replay succeeds."""
@@ -71,7 +72,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     Args:
         out: folder to write to.
         demos: what the candidates are made from.
-        rows: what ``candidates`` drew for as many demonstrations.
+        rows: what ``candidates`` or ``resets`` drew for as many demonstrations.
         per_task: how many to write.
         workers: do the work.
 
@@ -125,6 +126,14 @@ def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> l
             wanted = PlanConfig(seed=seed, axes=drawn_from, episodes={name: per_task * len(tasks)}, reserve=RESERVE)
             rows += plan.make(group, wanted, REPLAY, test)
     return rows
+
+
+def resets(demos: DemosConfig, per_task: int, seed: int) -> list[plan.Row]:
+    """A plan for ``expand``: every candidate starts as LIBERO's recordings do, from a reset of its environment."""
+    by_task: dict[Task, list[DemoEntry]] = defaultdict(list)
+    for entry in demos.index().entries:
+        by_task[entry.task].append(entry)
+    return [row for group in by_task.values() for row in plan.resets(group, per_task, RESERVE, seed, REPLAY)]
 
 
 def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: TrajectoryStore) -> dict[str, str]:
@@ -203,5 +212,6 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
             "perturbations": row.perturbations,
             "resolved": trajectory.resolved,
             "replay_mode": trajectory.mode,
+            **({} if row.reset_seed is None else {"reset_seed": str(row.reset_seed)}),
         },
     )

@@ -10,11 +10,12 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
@@ -23,9 +24,12 @@ from pipeline.files import checksum, keep_below, put_in_place, remove, remove_if
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
+from pipeline.libero.tasks import find_task
+from pipeline.planning import plan
 from pipeline.run import outcome
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.seeding import digest
+from pipeline.testset import benchmark
 
 AnyFormat = Format[Any]
 
@@ -43,7 +47,7 @@ def export_run(kind: type[AnyFormat], config: Config) -> None:
         print(f"{kind.title} is not asked for: export.{kind.name} is null")
         return
     target = kind(config.data, options, config.render.extras)
-    episodes = kept_episodes(config)
+    episodes = asked(target, config, kept_episodes(config))
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
         return
@@ -62,6 +66,25 @@ def kept_episodes(config: Config) -> Episodes:
         steps = run.trajectories[row.trajectory_id]["steps"]
         known[episode_id] = Known(row.suite, contents[episode_id], row.demo_id, row.instruction, steps)
     return Episodes(known, EpisodeLoader(config.data, config.render))
+
+
+def asked(target: AnyFormat, config: Config, episodes: Episodes) -> Episodes:
+    """The kept episodes with what a format takes beside: where it takes ``language``, rewrites and subtasks.
+
+    Rewrites are those that the run's language axis may draw for the episode, or its default ranges.
+    """
+    if not target.language:
+        return episodes
+    axis, test = config.plan.axes.language or LanguageAxis(), benchmark.load()
+
+    @cache
+    def wordings(suite: str, task: str, name: str) -> tuple[str, ...]:
+        return axis.wordings(find_task(suite, task), name.split("+"), test)
+
+    rows = {row.episode_id: row for row in plan.read(config.data / "plan.parquet")}
+    rewrites = {one: wordings(rows[one].suite, rows[one].task, rows[one].axis) for one in episodes.known}
+    known = {one: of._replace(content=digest(of.content, rewrites[one])[:16]) for one, of in episodes.known.items()}
+    return Episodes(known, EpisodeLoader(config.data, config.render, rewrites))
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:

@@ -13,6 +13,7 @@ from pipeline.compute.pool import LOST
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
+from pipeline.libero.starts import LEFT_OUT_STEPS
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.quality import measure
 from pipeline.physics.reference import Reference
@@ -57,7 +58,11 @@ class ReplayJob:
         physics = of_layer(from_json(self.row.perturbations), PhysicsPerturbation)
         environment = shared(demo.task)
         reference = partial(self._reference, environment, demo)
-        trajectory = replay(environment, demo, self.row.trajectory_id, self.config, physics, reference)
+        start, config = demo, self.config
+        if (seed := self.row.reset_seed) is not None:
+            # Sent as they were, the actions would hit by luck and teach that where things stand does not matter.
+            start, config = _at_reset(environment, demo, seed), config.model_copy(update={"mode": "tracked"})
+        trajectory = replay(environment, start, self.row.trajectory_id, config, physics, reference)
         if trajectory.verdict.kept:
             trajectory = replace(trajectory, quality=measure(trajectory, demo.task))
         TrajectoryStore(self.folder).save(trajectory)
@@ -96,6 +101,13 @@ class ReplayJob:
         )
         TrajectoryStore(self.folder).save(trajectory)
         return trajectory.verdict
+
+
+def _at_reset(environment: Environment, demo: Demo, seed: int) -> Demo:
+    """The demonstration as if recorded from another reset: LIBERO's recordings begin once the gripper has opened."""
+    model_xml = environment.reset(seed)
+    environment.settle(LEFT_OUT_STEPS)
+    return replace(demo, init_state=environment.state, states=None, model_xml=model_xml)
 
 
 @lru_cache(maxsize=1)

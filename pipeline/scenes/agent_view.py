@@ -11,7 +11,7 @@ from pipeline.types import Floats
 
 _HALF_PX = SCHEMA.frame.shape[0] / 2
 _DRAWN = np.array([0, 1, 0, 0, 0, 0], np.uint8)
-"""The groups of geoms that are drawn; collision geometry is not."""
+"""The groups of geoms that are rendered; collision geometry is not."""
 
 Pixels = NDArray[np.intp]
 """(P, 2) columns and rows, from the upper left of a frame that stands upright."""

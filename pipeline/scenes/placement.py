@@ -32,7 +32,7 @@ HIDDEN = 1 / 3
 left is twice what is lost, so each is still known by its colour and its outline."""
 SEEN_PX, PLACED_PX = 20, 30
 """Pixels of 256 x 256 on which an added object must show in the first frame of the agent view, and where it is placed:
-more, because it is placed by rays, which meet somewhat other pixels at outlines than are drawn."""
+more, because it is placed by rays, which meet somewhat other pixels at outlines than are rendered."""
 _SETTLE_S, _REST_S = 1.0, 0.25
 _STILL_M, _TILT_DEG, _SLID_M = 2e-4, 15.0, 0.03
 _DISTURBED_M = 1e-3
@@ -202,7 +202,7 @@ class _Placement:
             corners = np.array(list(itertools.product((-1, 1), (-1, 1), (0, 2)))) * half
             turn = np.empty(9)
             mujoco.mju_quat2Mat(turn, pose[3:])
-            # The bounds are those of what collides; what is drawn may be somewhat larger.
+            # The bounds are those of what collides; what is rendered may be somewhat larger.
             pixels = self._view.pixels_near(corners @ turn.reshape(3, 3).T + pose[:3])
             counts.append(int((self._view.shown(pixels) == body).sum()))
         return counts

@@ -94,8 +94,11 @@ def _follow(config: Config) -> Iterator[tuple[str, str]]:
     for one in formats_of(config.data, config.export, config.render.extras):
         if not export.untouched(one):
             yield f"export_{one.stage_record.stem}", f"{one.title}: there is no dataset, or files of it have changed"
-        elif one.record().identity != export.identity(one, episodes):
-            why = next(iter(export.outdated(one, episodes)), "files of other episodes or options")
+            stale = True
+            continue
+        asked = export.asked(one, config, episodes)
+        if one.record().identity != export.identity(one, asked):
+            why = next(iter(export.outdated(one, asked)), "files of other episodes or options")
             yield f"export_{one.stage_record.stem}", f"{one.title}: the dataset has {why}"
         else:
             continue

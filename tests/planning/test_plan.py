@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from pathlib import Path
 
 import pytest
-from conftest import read_with_flipped_bits
+import yaml
+from conftest import REPOSITORY, read_with_flipped_bits
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,6 +24,7 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.planning import plan
 from pipeline.seeding import rng
+from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Verdict
 
@@ -280,3 +283,17 @@ def test_perturbations_are_readable_and_complete() -> None:
         assert row.axis == (changed.axis if changed else "clean")
         assert row.component == (changed.component if changed else "clean")
         assert row.level == (str(changed.level) if changed else "0")
+
+
+def test_the_ranges_of_the_documentation_can_be_planned() -> None:
+    """The page has an example for each axis, and what is sampled lies in it."""
+    page = (REPOSITORY / "docs" / "configuration.md").read_text()
+    blocks = [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)]
+    ranges = next(block["axes"] for block in blocks if "axes" in block)
+    assert ranges.keys() == {"camera", "light", "background", "noise", "language", "layout", "pose", "robot"}
+    shown = config(axes=ranges, episodes=dict.fromkeys(ranges, 3), reserve=0)
+    rows = [row for row in plan.make(entries(1), shown, REPLAY, benchmark.load()) if row.role == "perturbed"]
+    assert Counter(row.axis for row in rows) == dict.fromkeys(ranges, 3)
+    components = {axis: {row.component for row in rows if row.axis == axis} for axis in ranges}
+    assert components["camera"] <= {"distance", "spherical"}
+    assert (components["background"], components["robot"]) == ({"theme"}, {"initial_joints"})

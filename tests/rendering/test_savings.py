@@ -78,7 +78,7 @@ def test_other_pixels_of_the_small_scene_draw_plainly(
 
     def wrong(*arguments: object) -> object:
         skinned = put(*arguments)  # type: ignore[arg-type]
-        arguments[0]._skins.drawn[:] //= 2  # type: ignore[attr-defined]
+        arguments[0]._skins.rendered[:] //= 2  # type: ignore[attr-defined]
         return skinned
 
     monkeypatch.setattr(SkinnedMeshes, "put", wrong)

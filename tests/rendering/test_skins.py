@@ -262,9 +262,9 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
             opened.data.mocap_pos[-1] += rng.normal(0, 0.05, 3)
             mujoco.mj_forward(opened.model, opened.data)
             for camera in ("fixed", "moving"):
-                ours._skins.drawn[:] = 0
+                ours._skins.rendered[:] = 0
                 frame = opened.frame(camera)
-                drawn.append(ours._skins.drawn.copy())
+                drawn.append(ours._skins.rendered.copy())
                 assert np.array_equal(frame, plain.frame(opened.data, camera)), camera
         whole = opened.model.mesh("painted").facenum[0]
     faces = np.sum(drawn, axis=0)
@@ -292,5 +292,5 @@ def test_display_lists_may_be_numbered_downwards(monkeypatch: pytest.MonkeyPatch
         for _ in range(12):
             for camera in ("fixed", "moving"):
                 assert np.array_equal(opened.frame(camera), plain.frame(opened.data, camera)), camera
-        assert ours._skins.drawn.any()
+        assert ours._skins.rendered.any()
     assert lowest

@@ -159,7 +159,7 @@ def test_what_is_shown_is_what_the_plan_draws(name: str, monkeypatch: pytest.Mon
 
 def test_a_sheet_of_both_views(stage: preview.Stage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Dimming))
-    original, *variants = tiles(preview.draw(stage, "dimming", STARTER, NO_TESTS), 2)
+    original, *variants = tiles(preview.axis_sheet(stage, "dimming", STARTER, NO_TESTS), 2)
     # Two components at five levels are all that there is.
     brightness = [variant.mean() for variant in variants[:10]]
     assert brightness[0] < original.mean()
@@ -178,7 +178,7 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
         return sheets.Tile(picture, caption[:20])
 
     monkeypatch.setattr(preview, "Tile", tile)
-    sheet = preview.draw(stage, "lift", STARTER, NO_TESTS)
+    sheet = preview.axis_sheet(stage, "lift", STARTER, NO_TESTS)
     assert captions[1:] == [
         "lamp, level 1",
         "refused, too_high: lamp, level 5",

@@ -1,4 +1,7 @@
-"""Expansion: new demonstrations of a task that differ, succeed, and read back through the ordinary source."""
+"""Expansion: new demonstrations of a task that differ, succeed, and read back through the ordinary source.
+
+Most tests are of ``--starts wide``; what resets have in common with it is tested there.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,15 @@ import pytest
 from conftest import STOVE, link_testset, starter_demo
 from machine_paths import told
 
-from pipeline.compute.pool import loop
-from pipeline.config import DemosConfig, ReplayConfig
+from pipeline.__main__ import main
+from pipeline.compute.pool import loop, runner
+from pipeline.config import ComputeConfig, DemosConfig, ReplayConfig
 from pipeline.libero.assets import libero_assets
 from pipeline.libero.demonstrations import HDF5Source
+from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
-from pipeline.run.expand import APART_RAD, Expansion, candidates, expand
+from pipeline.run.expand import APART_RAD, Expansion, candidates, expand, resets
 from pipeline.testset import benchmark
 
 TASKS = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
@@ -91,3 +96,53 @@ def test_the_file_tells_nobody_s_folders_and_liberos_own_reader_finds_its_assets
     ours = mujoco.MjModel.from_xml_string(str(demo.model_xml))
     for name in ("mesh_vert", "tex_data", "body_mass"):
         assert np.array_equal(getattr(theirs, name), getattr(ours, name)), name
+
+
+@pytest.fixture(scope="module")
+def at_resets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("at_resets")
+    with runner(ComputeConfig(workers=2), folder) as workers:
+        made = expand(folder, TASKS, resets(TASKS, 2, 1), 2, workers)
+    assert (made.written, made.short) == (2, {})
+    return made.files[0]
+
+
+def test_a_start_is_a_reset_of_liberos_own_environment(at_resets: Path) -> None:
+    """As its demonstrations and initial states were made: with the arm's noise, which ``ControlEnv`` leaves out."""
+    env = control_env()(
+        str(STOVE.bddl_file), initialization_noise="default", use_camera_obs=False, has_offscreen_renderer=False
+    )
+    with h5py.File(at_resets) as file:
+        recorded = file["data/demo_1"]
+        env.seed(int(recorded.attrs["reset_seed"]))
+        env.reset()
+        for _ in range(5):
+            env.step([0.0] * 6 + [-1.0])
+        assert np.array_equal(env.get_sim_state(), recorded["states"][0])
+        assert (recorded.attrs["perturbations"], recorded.attrs["replay_mode"]) == ("[]", "tracked")
+    demo = HDF5Source(at_resets.parents[1]).load(f"{STOVE.suite}/{STOVE.name}/demo_1")
+    written, theirs = mujoco.MjModel.from_xml_string(str(demo.model_xml)), env.sim.model._model
+    for name in ("body_pos", "body_quat", "site_pos", "geom_pos", "body_mass"):
+        # MJCF has six digits.
+        assert np.allclose(getattr(written, name), getattr(theirs, name), rtol=1e-5, atol=1e-6), name
+    assert not np.allclose(
+        written.body_pos, mujoco.MjModel.from_xml_string(Environment(STOVE).place_fixtures(0)).body_pos
+    )
+
+
+def test_how_many_start_at_resets_and_who_makes_them_changes_none(at_resets: Path, tmp_path: Path) -> None:
+    alone = expand(tmp_path, TASKS, resets(TASKS, 1, 1), 1, loop).files[0]
+    with h5py.File(alone) as one, h5py.File(at_resets) as other:
+        for name in ("reset_seed", "model_file"):
+            assert one["data/demo_0"].attrs[name] == other["data/demo_0"].attrs[name]
+        for name in ("states", "actions", "obs/ee_pos"):
+            assert np.array_equal(one[f"data/demo_0/{name}"], other[f"data/demo_0/{name}"])
+
+
+def test_starts_that_there_are_not_are_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["pipeline", "demos", "expand", "out", "--starts", "far"])
+    with pytest.raises(SystemExit):
+        main()
+    assert "--starts: invalid choice: 'far' (choose from" in capsys.readouterr().err

@@ -22,14 +22,20 @@ from PIL import Image
 from synthetic import records
 
 from pipeline.axes import from_json
+from pipeline.axes.language import BANK_FILE
 from pipeline.clients import oft_check
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
+from pipeline.export_config import LeRobotConfig
+from pipeline.formats.lerobot import LeRobot
 from pipeline.images.jpeg import decode
+from pipeline.libero.tasks import find_task
+from pipeline.physics.subtasks import subtasks
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.export import asked, kept_episodes
 from pipeline.run.finished import FOLDER
 from pipeline.stores.trajectory_store import TrajectoryStore
 
@@ -297,3 +303,26 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(finished: Path, 
         file.write_text(yaml.safe_dump(config))
         assert dvc(clone, "repro", "inputs").returncode == 0
         assert stages_to_run(clone) == expected | {"inputs", "doctor"}, keys
+
+
+def test_a_format_that_takes_language_gets_rewrites_and_subtasks(
+    finished: Path, rows: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(finished.parents[1])
+    config = load(Path("configs/tiny.yaml"))
+    plain = LeRobot(config.data, config.export.lerobot or LeRobotConfig())
+    # Where lerobot is older, reading a configuration refuses it.
+    told = LeRobot(config.data, plain.options.model_copy(update={"language": True}))
+    episodes = kept_episodes(config)
+    assert asked(plain, config, episodes) is episodes
+    given = asked(told, config, episodes)
+    assert not {one.content for one in given.known.values()} & {one.content for one in episodes.known.values()}
+    bank = yaml.safe_load(BANK_FILE.read_text())
+    for row in (row for row in rows if row["kept"]):
+        episode, before = given.load(row["episode_id"]), episodes.load(row["episode_id"])
+        assert (before.rewrites, before.subtasks) == ((), ())
+        classes = bank[row["suite"]][row["task"]]
+        assert {*episode.rewrites} == {text for texts in classes.values() for text in texts}
+        trajectory = TrajectoryStore(finished / "trajectories").load(row["trajectory_id"])
+        assert episode.subtasks == subtasks(trajectory, find_task(row["suite"], row["task"]))
+        assert episode.subtasks or row["task"] != STOVE.name

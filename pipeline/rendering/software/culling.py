@@ -67,7 +67,7 @@ class Culling:
     """Tests the bounding boxes of a model's geoms against a camera's view. All planes must have bounds.
 
     Args:
-        hidden_groups: groups of geoms that are not drawn.
+        hidden_groups: groups of geoms that are not rendered.
     """
 
     def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int]):
@@ -132,7 +132,7 @@ class Culling:
         lamp: int,
     ) -> Lamp:
         model, origin_m, clear = self._model, data.light_xpos[lamp], self._see_through()
-        # What can be seen through is drawn in the last pass, with what is drawn there of meshes.
+        # What can be seen through is rendered in the last pass, with what is rendered there of meshes.
         if model.light_directional[lamp]:
             return Lamp(self.shown, seen | clear)
         middles_m = corners_m.mean(axis=1)
@@ -149,7 +149,7 @@ class Culling:
         return Lamp(self.shown & casts & lights.any(), lights)
 
     def _mirror(self, data: mujoco.MjData, view: _View, clear: NDArray[np.bool_]) -> tuple[int | None, bool]:
-        """The geom whose mirror images MuJoCo draws: the first that reflects, if the camera is before it.
+        """The geom whose mirror images MuJoCo renders: the first that reflects, if the camera is before it.
 
         The second value is false when the camera is about in its plane, or when it can be seen through: what MuJoCo
         does then is a matter of rounding.
@@ -189,7 +189,7 @@ class Culling:
     def _sites(self, shadows: bool) -> NDArray[np.bool_]:
         """(nsite,) which sites may show.
 
-        robosuite hides some by a negative opacity: MuJoCo draws them, and only where lamps cast shadows they show.
+        robosuite hides some by a negative opacity: MuJoCo renders them, and only where lamps cast shadows they show.
         """
         return np.asarray((self._model.site_rgba[:, 3] > 0) | shadows)
 

@@ -23,7 +23,7 @@ from pipeline.rendering.software.culling import Culling, Picture
 from pipeline.rendering.software.mujoco_3_2_7 import context as private
 from pipeline.rendering.software.mujoco_3_2_7.context import HeldTextures
 from pipeline.rendering.software.mujoco_3_2_7.meshes import Meshes
-from pipeline.rendering.software.mujoco_3_2_7.passes import Draws, Pass
+from pipeline.rendering.software.mujoco_3_2_7.passes import Pass, Purpose
 from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay
 from pipeline.rendering.software.samples import SAMPLES
@@ -87,8 +87,8 @@ class SoftwareDrawing(PlainDrawing):
         self._model, self._painted = model, np.zeros(model.ngeom, np.bool_)
         self._culling = Culling(model, np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist())
         shown = self._culling.shown
-        drawn = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
-        self._meshes = Meshes(self._context, model, drawn, self._meshes)
+        rendered = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
+        self._meshes = Meshes(self._context, model, rendered, self._meshes)
         self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, shown, self._skinned)
         self._forget_underlays()
 
@@ -134,14 +134,14 @@ class SoftwareDrawing(PlainDrawing):
         view, places = self._view(shot), np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1)
         places = places.astype(np.float32)
 
-        def underlay(name: str, geoms: NDArray[np.bool_], draw: Callable[[], None]) -> Underlay:
+        def underlay(name: str, geoms: NDArray[np.bool_], render: Callable[[], None]) -> Underlay:
             """An underlay of the camera's pictures, rendered anew if its content has changed."""
             if (shot.camera, name) not in self._underlays:
                 height, width = self._rectangle.height, self._rectangle.width
                 self._underlays[shot.camera, name] = Underlay(self._context, height, width)
             found, content = self._underlays[shot.camera, name], view + geoms.tobytes() + places[geoms].tobytes()
             if found.content != content:
-                draw()
+                render()
                 found.keep(content)
             return found
 
@@ -168,34 +168,34 @@ class SoftwareDrawing(PlainDrawing):
         """
         picture = shot.picture
         if not last:
-            self._draw_passes(shot, opaque, [Pass(Draws.CAMERA, picture.seen & opaque)], underlay, last)
+            self._render_passes(shot, opaque, [Pass(Purpose.CAMERA, picture.seen & opaque)], underlay, last)
             return
-        drawn, passes = opaque | picture.mirror | picture.clear, []
+        rendered, passes = opaque | picture.mirror | picture.clear, []
         if picture.mirror.any():
-            # A geom that is there for its image alone is not drawn before the camera.
-            drawn = drawn | picture.images
-            passes.append(Pass(Draws.MIRROR, picture.images | picture.clear))
-        passes.append(Pass(Draws.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear))
+            # A geom that is there for its image alone is not rendered before the camera.
+            rendered = rendered | picture.images
+            passes.append(Pass(Purpose.MIRROR, picture.images | picture.clear))
+        passes.append(Pass(Purpose.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear))
         for lamp in picture.lamps:
-            passes += [Pass(Draws.LAMP_MAP, lamp.casts), Pass(Draws.LAMP_LIGHT, lamp.lights)]
-        self._draw_passes(shot, drawn, passes, underlay, last)
+            passes += [Pass(Purpose.LAMP_MAP, lamp.casts), Pass(Purpose.LAMP_LIGHT, lamp.lights)]
+        self._render_passes(shot, rendered, passes, underlay, last)
 
-    def _draw_passes(
-        self, shot: Shot, drawn: NDArray[np.bool_], passes: Sequence[Pass], underlay: Underlay | None, last: bool
+    def _render_passes(
+        self, shot: Shot, rendered: NDArray[np.bool_], passes: Sequence[Pass], underlay: Underlay | None, last: bool
     ) -> None:
         """Render geoms (ngeom,); each pass renders the meshes that it needs."""
         model, picture, flags = self._model, shot.picture, self._scene.flags
         groups, site_groups = model.geom_group.copy(), model.site_group.copy()
         try:
-            model.geom_group[:] = np.where(drawn, groups, CULLED)
+            model.geom_group[:] = np.where(rendered, groups, CULLED)
             model.site_group[:] = np.where(last & picture.sites, site_groups, CULLED)
-            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = passes[0].draws is Draws.MIRROR
+            flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = passes[0].purpose is Purpose.MIRROR
             # The sky is behind all underlays.
             flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = last
             super()._update(shot.data, shot.camera)
             skinned = None
             if picture.projection is not None:
-                wanted = np.logical_or.reduce([each.geoms for each in passes if each.draws.by_camera])
+                wanted = np.logical_or.reduce([each.geoms for each in passes if each.purpose.by_camera])
                 skinned = self._skinned.put(self._scene, shot.data, picture.projection, wanted)
             self._meshes.show((shot.camera, last), passes, self._scene, skinned, underlay)
             self._render()
@@ -207,7 +207,7 @@ class SoftwareDrawing(PlainDrawing):
     def _update(self, data: mujoco.MjData, camera: str) -> None:
         """Include everything, as surfaces need."""
         super()._update(data, camera)
-        everything = Pass(Draws.CAMERA, np.ones(self._model.ngeom, np.bool_))
+        everything = Pass(Purpose.CAMERA, np.ones(self._model.ngeom, np.bool_))
         self._meshes.show("everything", [everything], self._scene)
 
     def _view(self, shot: Shot) -> bytes:

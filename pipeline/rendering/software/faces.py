@@ -22,7 +22,7 @@ PARTS = {
 
 
 class Faces(NamedTuple):
-    """A mesh by its vertices, each a place with what is drawn there; faces that meet mostly differ in the normal.
+    """A mesh by its vertices, each a place with what is rendered there; faces that meet mostly differ in the normal.
 
     Attributes:
         vertices_m, normals: (V, 3) in the frame of the mesh's geoms.
@@ -53,16 +53,16 @@ def faces_of(model: mujoco.MjModel, mesh: int) -> Faces:
         ]
     else:
         columns.append(_flattened(vertices_m, normals).reshape(-1, 3))
-    drawn = np.ascontiguousarray(np.concatenate(columns, axis=1, dtype=np.float32))
-    vertices, vertex_of_corner = _kinds(drawn)
-    places, place_of_corner = _kinds(drawn[:, :3])
-    kept = drawn[vertices]
+    rendered = np.ascontiguousarray(np.concatenate(columns, axis=1, dtype=np.float32))
+    vertices, vertex_of_corner = _kinds(rendered)
+    places, place_of_corner = _kinds(rendered[:, :3])
+    kept = rendered[vertices]
     return Faces(
         vertices_m=np.ascontiguousarray(kept[:, :3]),
         normals=np.ascontiguousarray(kept[:, 3:6]),
         texture=np.ascontiguousarray(kept[:, 6:]) if kept.shape[1] > 6 else None,
         corners=vertex_of_corner.reshape(-1, 3),
-        places_m=drawn[places, :3],
+        places_m=rendered[places, :3],
         place_of_corner=place_of_corner.reshape(-1, 3),
     )
 

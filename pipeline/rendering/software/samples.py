@@ -32,7 +32,7 @@ class Projection(NamedTuple):
 
     Attributes:
         matrix: (3, 4) of a place, in m, to its column, its row from below, and 1, all times its depth.
-        near_m, far_m: depths before and beyond which nothing is drawn.
+        near_m, far_m: depths before and beyond which nothing is rendered.
         size_px: width and height.
     """
 

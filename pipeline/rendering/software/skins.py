@@ -24,7 +24,7 @@ class SkinnedMeshes:
         skins: of a context.
         samples: (SAMPLES, 2) place of each sample in its pixel.
         meshes: display lists of a model.
-        shown: (ngeom,) which geoms of it can be drawn.
+        shown: (ngeom,) which geoms of it can be rendered.
         former: those of the model that the context was for before.
     """
 
@@ -43,8 +43,8 @@ class SkinnedMeshes:
         self._faces_of_geom: dict[int, Faces] = {}
         known = former._faces if former else {}
         textured, plain = iter(range(SKINS)), iter(range(SKINS, 2 * SKINS))
-        drawn = np.flatnonzero(shown & (self._mesh >= 0))
-        for geom, mesh in zip(drawn.tolist(), self._mesh[drawn].tolist(), strict=True):
+        rendered = np.flatnonzero(shown & (self._mesh >= 0))
+        for geom, mesh in zip(rendered.tolist(), self._mesh[rendered].tolist(), strict=True):
             if model.mesh_facenum[mesh] >= LEAST_FACES:
                 content = meshes.contents[mesh]
                 faces = self._faces.get(content) or known.get(content) or faces_of(model, mesh)
@@ -52,8 +52,8 @@ class SkinnedMeshes:
                 self._skin[geom] = next(plain if faces.texture is None else textured, -1)
                 if self._skin[geom] >= 0:
                     skins.fill_vertices(int(self._skin[geom]), faces, content)
-        # All geoms of a mesh are drawn in one way.
-        self._skin[np.isin(self._mesh, self._mesh[drawn[self._skin[drawn] < 0]])] = -1
+        # All geoms of a mesh are rendered in one way.
+        self._skin[np.isin(self._mesh, self._mesh[rendered[self._skin[rendered] < 0]])] = -1
         most = max((room(len(faces.corners)) for faces in self._faces.values()), default=0)
         self._found: NDArray[np.uint32] = np.empty(most, np.uint32)
 
@@ -63,7 +63,7 @@ class SkinnedMeshes:
         """Have the skins follow their meshes in a scene, with the faces that a picture can show.
 
         Args:
-            scene: of all that is drawn.
+            scene: of all that is rendered.
             data: says where the meshes are.
             projection: of the picture.
             wanted: (ngeom,) which geoms are looked at.
@@ -74,7 +74,7 @@ class SkinnedMeshes:
         shown, of_mesh = self._skins.meshes_of_scene()
         geoms = np.where(of_mesh, shown["objid"], 0)
         skins = np.where(of_mesh, self._skin[geoms], -1)
-        # MuJoCo draws what can be seen through last, and in an order of its own.
+        # MuJoCo renders what can be seen through last, and in an order of its own.
         skins[np.isin(self._mesh[geoms], self._mesh[geoms[of_mesh & (shown["rgba"][:, 3] < OPAQUE)]])] = -1
         if len(shown) + 2 * np.count_nonzero(skins >= 0) >= scene.maxgeom:
             skins[:] = -1

@@ -24,13 +24,13 @@ class Still:
         self._wait: NDArray[np.intp] = np.ones(model.ngeom, np.intp)
         self._view = b""
 
-    def geoms(self, view: bytes, places: NDArray[np.float32], drawn: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def geoms(self, view: bytes, places: NDArray[np.float32], rendered: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(ngeom,) the geoms of the underlay for the next picture.
 
         Args:
             view: what a picture depends on beside the geoms: the camera, and where the lamps are.
-            places: (ngeom, 12) positions and rotations of the geoms, as they are drawn.
-            drawn: (ngeom,) which geoms are to be drawn.
+            places: (ngeom, 12) positions and rotations of the geoms, as they are rendered.
+            rendered: (ngeom,) which geoms are to be rendered.
         """
         if view != self._view:
             self._view, self._places = view, places
@@ -43,7 +43,7 @@ class Still:
         left = self._geoms & ~stood
         self._wait[left] = np.minimum(2 * self._wait[left], LONGEST_WAIT)
         self._age = np.where(stood, self._age + 1, 0)
-        ready = drawn & (self._age >= self._wait)
+        ready = rendered & (self._age >= self._wait)
         self._beside += int(self._faces[ready & ~self._geoms].sum())
         if left.any() or self._beside > self._faces[ready].sum():
             self._geoms, self._beside = ready, 0

@@ -17,7 +17,7 @@ STATES = 4
 
 ANGLES, HEIGHTS = 2.4 * np.arange(400), np.linspace(-0.99, 0.99, 400)
 BALL = np.column_stack([np.sqrt(1 - HEIGHTS**2) * wave(ANGLES) for wave in (np.cos, np.sin)] + [HEIGHTS])
-"""(400, 3) vertices of a mesh of 796 faces: more than llvmpipe draws at once."""
+"""(400, 3) vertices of a mesh of 796 faces: more than llvmpipe renders at once."""
 
 SCENE = f"""
 <mujoco>
@@ -56,7 +56,7 @@ def fault() -> str | None:
 
 
 def frames(kind: type[PlainDrawing]) -> list[Frame]:
-    """The scene in all states, drawn in one way."""
+    """The scene in all states, rendered in one way."""
     model = mujoco.MjModel.from_xml_string(SCENE)
     data, shown = mujoco.MjData(model), []
     with closing(kind(model)) as drawing:

@@ -52,7 +52,7 @@ def samples(count: int) -> NDArray[np.float32]:
     """(count, 2) where in a pixel of the current context its samples are, 0 to 1 to the right and up.
 
     Raises:
-        PipelineError: when OpenGL cannot draw each of them by itself.
+        PipelineError: when OpenGL cannot render each of them by itself.
     """
     opengl = calls()
     if opengl.glGetIntegerv(opengl.GL_MAJOR_VERSION) < 4:

@@ -1,4 +1,4 @@
-"""The display lists of meshes in MuJoCo 3.2.7's context: which meshes each pass of ``mjr_render`` draws."""
+"""The display lists of meshes in MuJoCo 3.2.7's context: which meshes each pass of ``mjr_render`` renders."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.rendering.opengl import calls, check
 from pipeline.rendering.software.faces import PARTS
-from pipeline.rendering.software.mujoco_3_2_7.passes import Draws, Pass
+from pipeline.rendering.software.mujoco_3_2_7.passes import Pass, Purpose
 from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay, recorded
 
 
@@ -21,7 +21,7 @@ class _Lists:
     Attributes:
         base, end, closing: numbers of the first mesh's list, of the end list, and of the first closing list.
         ends: what the end list does: the list base that it sets, and a list that it calls before.
-        drawn: (nmesh,) meshes whose faces are rendered.
+        rendered: (nmesh,) meshes whose faces are rendered.
         opened: (nmesh,) meshes that a skin follows.
         shut: (nmesh,) meshes whose skin is not rendered.
     """
@@ -30,7 +30,7 @@ class _Lists:
         self.base = calls().glGenLists(2 * meshes + 1)
         self.end, self.closing = self.base + meshes, self.base + meshes + 1
         self.ends = (0, 0)
-        self.drawn, self.opened, self.shut = np.zeros((3, meshes), np.bool_)
+        self.rendered, self.opened, self.shut = np.zeros((3, meshes), np.bool_)
 
 
 class Meshes:
@@ -50,35 +50,35 @@ class Meshes:
     Args:
         context: whose meshes they become.
         model: whose meshes they are.
-        drawn: numbers of the meshes that are rendered.
+        rendered: numbers of the meshes that are rendered.
         former: the display lists of the model before; unusable afterwards. Lists of meshes that both have are kept.
     """
 
     def __init__(
-        self, context: mujoco.MjrContext, model: mujoco.MjModel, drawn: Sequence[int], former: Meshes | None = None
+        self, context: mujoco.MjrContext, model: mujoco.MjModel, rendered: Sequence[int], former: Meshes | None = None
     ):
-        self.model, self._context, self._meshes = model, context, drawn
+        self.model, self._context, self._meshes = model, context, rendered
         self._of_geom = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
         kept = former._give_up() if former else {}
         calls().glDeleteLists(context.baseMesh, context.rangeMesh)
         # One block with those that MuJoCo calls beside them: it calls no list below its base, and OpenGL may number a
         # later block lower (Mesa 25 does, Mesa 22 does not).
-        context.rangeMesh = 2 * model.nmesh + 1 + len(drawn)
+        context.rangeMesh = 2 * model.nmesh + 1 + len(rendered)
         context.baseMesh = calls().glGenLists(context.rangeMesh)
         self._own = context.baseMesh + 2 * model.nmesh
-        self.contents = {mesh: _content(model, mesh) for mesh in drawn}
+        self.contents = {mesh: _content(model, mesh) for mesh in rendered}
         self._faces: dict[bytes, int] = {}
         for mesh, content in self.contents.items():
             if content not in self._faces:
                 self._faces[content] = kept.pop(content, 0) or _uploaded(model, context, mesh)
         for number in kept.values():
             calls().glDeleteLists(number, 2)
-        for place, mesh in enumerate(drawn):
+        for place, mesh in enumerate(rendered):
             _call_from_base(context.baseMesh + 2 * mesh, place)
-            _call_from_base(self._own + 1 + place, len(drawn) + 1 + place)
-        _call_from_base(self._own, len(drawn))
+            _call_from_base(self._own + 1 + place, len(rendered) + 1 + place)
+        _call_from_base(self._own, len(rendered))
         self.closing: NDArray[np.intp] = np.zeros(model.nmesh, np.intp)
-        self.closing[[*drawn]] = self._own + 1 + np.arange(len(drawn)) - context.baseMesh
+        self.closing[[*rendered]] = self._own + 1 + np.arange(len(rendered)) - context.baseMesh
         self._nothing = _query_of_nothing()
         self._passes: dict[Hashable, list[_Lists]] = {}
 
@@ -117,10 +117,10 @@ class Meshes:
         for number, (lists, one) in enumerate(zip(made, passes, strict=False)):
             self._write(lists, one, by_skin)
             then = made[min(number + 1, len(passes) - 1)]
-            ends = then.base, underlay.number if underlay and one.draws is Draws.CAMERA else 0
+            ends = then.base, underlay.number if underlay and one.purpose is Purpose.CAMERA else 0
             if lists.ends != ends:
                 with recorded(lists.end):
-                    if underlay and one.draws is Draws.CAMERA:
+                    if underlay and one.purpose is Purpose.CAMERA:
                         calls().glCallList(underlay.number)
                     calls().glListBase(then.base)
                 lists.ends = ends
@@ -129,14 +129,14 @@ class Meshes:
 
     def _write(self, lists: _Lists, one: Pass, by_skin: NDArray[np.bool_]) -> None:
         wanted = np.isin(self._meshes, self._of_geom[one.geoms])
-        drawn = wanted & ~(by_skin & one.draws.by_camera)
+        rendered = wanted & ~(by_skin & one.purpose.by_camera)
         # MuJoCo renders no skins into shadow maps, and mirror images must not show them.
-        opened = by_skin & (one.draws is not Draws.LAMP_MAP)
-        shut = opened & ((one.draws is Draws.MIRROR) | ~wanted)
-        changed = (drawn != lists.drawn) | (opened != lists.opened) | (shut != lists.shut)
+        opened = by_skin & (one.purpose is not Purpose.LAMP_MAP)
+        shut = opened & ((one.purpose is Purpose.MIRROR) | ~wanted)
+        changed = (rendered != lists.rendered) | (opened != lists.opened) | (shut != lists.shut)
         for mesh in np.flatnonzero(changed).tolist():
             with recorded(lists.base + mesh):
-                if drawn[mesh]:
+                if rendered[mesh]:
                     calls().glCallList(self._faces[self.contents[self._meshes[mesh]]])
                 if opened[mesh]:
                     calls().glPushMatrix()
@@ -147,7 +147,7 @@ class Meshes:
                     calls().glEndConditionalRender()
                 if opened[mesh]:
                     calls().glPopMatrix()
-        lists.drawn, lists.opened, lists.shut = drawn, opened, shut
+        lists.rendered, lists.opened, lists.shut = rendered, opened, shut
 
     def _add_last(self, scene: mujoco.MjvScene) -> None:
         """Append the extra mesh to the scene: MuJoCo renders it after all other opaque geoms."""

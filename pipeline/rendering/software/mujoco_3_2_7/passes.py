@@ -22,7 +22,7 @@ REFLECTING_SQUARE = np.array([[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]])
 """Corners of a box's upper z face, which is what reflects (``mjr_render``), in units of its half sizes."""
 
 
-class Draws(Enum):
+class Purpose(Enum):
     """The kinds of passes of ``mjr_render``, in their order; the last two come once for each light with shadows."""
 
     MIRROR = auto()
@@ -36,11 +36,11 @@ class Draws(Enum):
 
     @property
     def by_camera(self) -> bool:
-        return self in (Draws.CAMERA, Draws.LAMP_LIGHT)
+        return self in (Purpose.CAMERA, Purpose.LAMP_LIGHT)
 
 
 class Pass(NamedTuple):
     """One pass, and a mask (ngeom,) of the geoms whose meshes it has to render."""
 
-    draws: Draws
+    purpose: Purpose
     geoms: NDArray[np.bool_]

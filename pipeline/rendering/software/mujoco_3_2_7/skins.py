@@ -34,12 +34,12 @@ class Skins:
     the bare model, so ``nskin`` is set to 0, which hides them from that step.
 
     Attributes:
-        drawn: (2 ``SKINS``,) number of faces that each skin renders; the first ``SKINS`` have texture coordinates.
+        rendered: (2 ``SKINS``,) number of faces that each skin renders; the first ``SKINS`` have texture coordinates.
     """
 
     def __init__(self, context: mujoco.MjrContext, scene: mujoco.MjvScene):
         self._context, self._scene = context, scene
-        self.drawn: NDArray[np.int32] = scene.skinfacenum
+        self.rendered: NDArray[np.int32] = scene.skinfacenum
         scene.nskin = 0
         first = scene.geoms[0].size.ctypes.data - GEOM.fields["size"][1]  # type: ignore[index]
         memory = (ctypes.c_byte * (GEOM.itemsize * scene.maxgeom)).from_address(first)
@@ -68,7 +68,7 @@ class Skins:
 
     def fill_faces(self, skin: int, corners: NDArray[np.uint32]) -> None:
         """Upload the index buffer (3 F,) of the faces that a skin renders."""
-        self.drawn[skin] = len(corners) // 3
+        self.rendered[skin] = len(corners) // 3
         if len(corners):
             opengl = calls()
             opengl.glBindBuffer(opengl.GL_ELEMENT_ARRAY_BUFFER, self._context.skinfaceVBO[skin])

@@ -22,7 +22,7 @@ def recorded(number: int) -> Iterator[None]:
 
 _VERTICES = "#version 400 compatibility\nvoid main() { gl_Position = gl_Vertex; }"
 
-# The far end of MuJoCo's depth is 0: nothing was drawn there, and what was is the sky, which is in every picture.
+# The far end of MuJoCo's depth is 0: nothing was rendered there, and what was is the sky, which is in every picture.
 _SAMPLES = """#version 400 compatibility
 uniform sampler2DMS colours, depths;
 void main() {

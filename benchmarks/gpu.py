@@ -1,0 +1,172 @@
+"""What one OpenGL device gives: frames per second by 1 to 16 processes, its frames beside Mesa's, ours beside naive.
+
+    python benchmarks/gpu.py [--seconds 20] [--processes 1 2 4 8 16]
+
+Replays one demonstration. Then each number of processes renders its states with both cameras, JPEG included, for some
+seconds, plainly and with the savings that this device may use; a process waits until all others are ready. A process
+with Mesa's software renders the first states again for the comparison. `against_naive.py` follows with one task. Takes
+about ten minutes on a GPU. The last line is JSON: the device; for each number of processes frames per second, CPU time
+and memory of a process; how far the frames are from Mesa's; naive : ours.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import resource
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
+import numpy as np
+
+from pipeline import gl
+from pipeline.compute.pool import loop
+from pipeline.config import RenderConfig, load
+from pipeline.images.jpeg import encode, to_policy
+from pipeline.planning import plan
+from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.savings import PLAIN, why_plain
+from pipeline.run.replay_stage import Replays
+from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.testset import benchmark
+from pipeline.types import Frame
+
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+TASK = "libero_goal/put_the_bowl_on_the_plate"
+COMPARED = 20
+"""States whose frames are compared with Mesa's."""
+
+_ready: Barrier
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What one process did: frames in the seconds, CPU seconds, peak memory, and why it used no savings."""
+
+    frames: int
+    seconds: float
+    cpu_s: float
+    peak_gb: float
+    plain: str | None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--seconds", type=float, default=20)
+    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4, 8, 16])
+    arguments = parser.parse_args()
+    choice = gl.choose()
+    print(choice, flush=True)
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        name = _replayed(folder)
+        ways: dict[str, dict[int, Any]] = {}
+        for way, plain in (("plain", "1"), ("with savings", "")):
+            os.environ[PLAIN] = plain
+            ways[way] = {count: _by(count, folder, name, arguments.seconds) for count in arguments.processes}
+            print(way, ways[way], flush=True)
+        del os.environ[PLAIN]
+        here, mesa = _in_new_process(folder, name), _in_new_process(folder, name, **SOFTWARE)
+    away = np.abs(here.astype(int) - mesa)
+    naive = subprocess.run(
+        [sys.executable, str(Path(__file__).with_name("against_naive.py")), "--tasks", TASK],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    figures = {
+        "device": choice.device,
+        "cores": os.cpu_count(),
+        "frames_per_s": ways,
+        "compared_frames": len(away),
+        "same_frames": int((away.reshape(len(away), -1) == 0).all(axis=1).sum()),
+        "mean_levels": round(float(away.mean()), 4),
+        "pixels_off_by_more_than_8": round(float((away.max(axis=-1) > 8).mean()), 5),
+        "against_naive": json.loads(naive.stdout.splitlines()[-1]),
+    }
+    print(json.dumps(figures))
+
+
+SOFTWARE = {"LIBGL_ALWAYS_SOFTWARE": "1", "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
+
+
+def _replayed(folder: Path) -> str:
+    config = load(Path("configs/starter.yaml"))
+    demos = config.demos.model_copy(update={"tasks": (TASK,)})
+    rows = plan.make(demos.index().entries, config.plan, config.replay, benchmark.load())
+    twin = next(row for row in rows if row.role == "twin")
+    Replays(demos, config.replay, folder, loop).of([twin])
+    return twin.trajectory_id
+
+
+def _by(count: int, folder: Path, name: str, seconds: float) -> dict[str, Any]:
+    context = multiprocessing.get_context("spawn")
+    barrier = context.Barrier(count)
+    with ProcessPoolExecutor(count, mp_context=context, initializer=_take, initargs=(barrier,)) as pool:
+        done = list(pool.map(_render, [folder] * count, [name] * count, [seconds] * count))
+    return {
+        "frames_per_s": round(sum(one.frames / one.seconds for one in done), 1),
+        "cpu_ms_per_frame": round(1000 * sum(one.cpu_s for one in done) / sum(one.frames for one in done), 2),
+        "peak_gb": round(max(one.peak_gb for one in done), 2),
+        "plain_because": done[0].plain,
+    }
+
+
+def _take(barrier: Barrier) -> None:
+    global _ready
+    _ready = barrier
+
+
+def _render(folder: Path, name: str, seconds: float) -> Rendered:
+    trajectory = TrajectoryStore(folder).load(name)
+    with closing(Renderer(trajectory.model_xml)) as renderer:
+        for camera in CAMERAS:
+            renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+            renderer.frame(camera)
+        plain = why_plain()
+        _ready.wait()
+        start, start_cpu, frames = time.perf_counter(), time.process_time(), 0
+        while (spent := time.perf_counter() - start) < seconds:
+            step = frames // 2 % len(trajectory.actions)
+            renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+            for camera in CAMERAS:
+                encode(to_policy(renderer.frame(camera)), RenderConfig())
+                frames += 1
+    peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return Rendered(frames, spent, time.process_time() - start_cpu, peak_gb, plain)
+
+
+def _in_new_process(folder: Path, name: str, **environment: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
+    """(N, H, W, 3) frames of the first states, rendered plainly by a process of its own."""
+    file = folder / "frames.npy"
+    code = f"import sys, runpy; sys.argv = ['gpu.py']; runpy.run_path({__file__!r})['_save']({str(folder)!r}, {name!r})"
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {PLAIN: "1"} | environment)
+    frames: np.ndarray[Any, np.dtype[np.uint8]] = np.load(file)
+    return frames
+
+
+def _save(folder: str, name: str) -> None:
+    trajectory = TrajectoryStore(Path(folder)).load(name)
+    shown: list[Frame] = []
+    with closing(Renderer(trajectory.model_xml)) as renderer:
+        for step in np.linspace(0, len(trajectory.actions) - 1, COMPARED).round().astype(int):
+            renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+            shown += [renderer.frame(camera) for camera in CAMERAS]
+    np.save(Path(folder) / "frames.npy", np.stack(shown))
+
+
+if __name__ == "__main__":
+    main()

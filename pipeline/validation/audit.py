@@ -1,0 +1,320 @@
+"""How near a dataset comes to the benchmark's test tasks, whoever made it and whatever was done to it since.
+
+What an episode shows counts first: the instruction, and the matrices of the camera where the dataset has them. Of the
+other axes only this project's labels tell (``perturbations``), in the dataset or, by ``episode_id``, in a manifest.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import tensorflow_datasets as tfds
+from scipy.spatial.transform import Rotation
+
+from pipeline.axes import AXES, from_json, to_json
+from pipeline.axes.base import Perturbation
+from pipeline.axes.camera import ORBIT_CENTRE_M, CameraPerturbation
+from pipeline.axes.language import LanguagePerturbation, load_bank
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.formats.lerobot_columns import EPISODE_ID, camera_column
+from pipeline.formats.tfrecord import METADATA, columns, records
+from pipeline.libero import bddl
+from pipeline.libero.bddl import Arena
+from pipeline.libero.tasks import find_task, tasks
+from pipeline.planning.leakage import AxisDistance
+from pipeline.planning.leakage import check as compare
+from pipeline.tables import read_table
+from pipeline.testset.benchmark import TESTED_SUITES, TestSet
+from pipeline.types import Floats, Task
+
+_TURN_WXYZ = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
+_LOW_TURN_WXYZ = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
+AGENT_VIEWS: dict[Arena, tuple[tuple[float, float, float], tuple[float, float, float, float]]] = {
+    "tabletop": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
+    "kitchen": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
+    "study": ((0.4586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
+    "floor": ((0.8965773716836134, 0.0, 0.65), _LOW_TURN_WXYZ),
+    "living_room": ((0.6065773716836134, 0.0, 0.96), _LOW_TURN_WXYZ),
+}
+"""Where LIBERO's agent view stands in the world (m) and how it is turned, by arena (``_setup_camera`` of LIBERO's
+problems)."""
+
+UNMOVED = 0.05
+"""Degrees; a camera nearer than this to LIBERO's own was not moved. Matrices are stored in single precision."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a dataset tells of one episode.
+
+    Attributes:
+        episode_id: this project's name of it, or what the dataset calls it.
+        instruction: the text that a policy is prompted with.
+        extrinsics: (4, 4) from the agent view to the world (z forward, y down); None where the dataset has none.
+        suite, task: of LIBERO; None where nothing tells.
+        perturbations: the labels, as the manifest writes them; None where there are none.
+    """
+
+    episode_id: str
+    instruction: str
+    extrinsics: Floats | None = None
+    suite: str | None = None
+    task: str | None = None
+    perturbations: str | None = None
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """An episode as ``leakage.check`` compares it: a row of the plan, as far as that asks for it."""
+
+    episode_id: str
+    suite: str
+    task: str
+    perturbations: str
+    wanted: bool = True
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What an audit found.
+
+    Attributes:
+        episodes: of the dataset.
+        axes: axis to how close its episodes come to the test tasks.
+        unlabelled: episodes without labels, of which nothing is known but the instruction and the camera.
+        without_camera: unlabelled episodes without the camera's matrices.
+        without_task: episodes that no LIBERO task of the four suites was found for.
+    """
+
+    episodes: int
+    axes: dict[str, AxisDistance]
+    unlabelled: int
+    without_camera: int
+    without_task: int
+
+    @property
+    def unknown(self) -> dict[str, int]:
+        """Axis to the number of episodes of which nothing tells whether it perturbs them."""
+        counts = {axis: self.unlabelled for axis in AXES if axis != "language"}
+        if "camera" in counts:
+            counts["camera"] = self.without_camera
+        return {axis: count for axis, count in counts.items() if count}
+
+
+def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
+    """Compare every episode of a dataset with the benchmark's test tasks.
+
+    Args:
+        dataset: a folder with an RLDS set (as TFDS writes it) or a LeRobot set (v3.0 or v2.1), or several below it.
+        test: the benchmark's tasks.
+        manifest: gives the labels of episodes that have an ``episode_id`` and lost theirs.
+
+    Raises:
+        PipelineError: when there is no such dataset, or it cannot be read.
+    """
+    known = {} if manifest is None else _manifest(manifest)
+    episodes = [_labelled(one, known) for one in read(dataset)]
+    rows: list[Labelled] = []
+    strangers = 0
+    for one in episodes:
+        task = find_task(one.suite, one.task) if one.suite and one.task else _task_of(one.instruction)
+        if task is None:
+            strangers += 1
+        rows.append(_row(one, task, test))
+    return Audit(
+        len(episodes),
+        compare(rows, test),
+        sum(one.perturbations is None for one in episodes),
+        sum(one.perturbations is None and one.extrinsics is None for one in episodes),
+        strangers,
+    )
+
+
+def read(dataset: Path) -> Iterator[Found]:
+    """The episodes of a dataset, or of all those below a folder.
+
+    Raises:
+        PipelineError: when there is none, or it cannot be read.
+    """
+    rlds = sorted(file.parent for file in dataset.rglob("features.json"))
+    lerobot = sorted(file.parents[1] for file in dataset.rglob("meta/info.json"))
+    if not rlds and not lerobot:
+        raise PipelineError(
+            "no dataset below this folder",
+            where=dataset,
+            expected="features.json, as TFDS writes it, or meta/info.json, as lerobot does",
+        )
+    try:
+        for folder in rlds:
+            yield from _rlds(folder)
+        for folder in lerobot:
+            yield from _lerobot(folder)
+    except (OSError, ValueError, KeyError) as error:
+        raise PipelineError(f"cannot be read ({type(error).__name__}: {error})", where=dataset) from error
+
+
+def _rlds(folder: Path) -> Iterator[Found]:
+    features = tfds.builder_from_directory(folder).info.features
+    for shard in sorted(folder.glob("*.tfrecord*")):
+        for number, record in enumerate(records(shard)):
+            step = columns(record, features)
+            said = {name.removeprefix(METADATA): value for name, value in step.items() if name.startswith(METADATA)}
+            text = {
+                name: said[name][0].decode() if name in said else None
+                for name in ("episode_id", "suite", "task", "perturbations")
+            }
+            yield Found(
+                text["episode_id"] or f"{shard.name}:{number}",
+                step["language_instruction"][0].decode(),
+                said.get("image_extrinsics"),
+                text["suite"],
+                text["task"],
+                text["perturbations"],
+            )
+
+
+def _lerobot(folder: Path) -> Iterator[Found]:
+    if (lines := folder / "meta" / "episodes.jsonl").is_file():
+        episodes = [json.loads(line) for line in lines.read_text().splitlines()]
+    else:
+        files = sorted((folder / "meta" / "episodes").rglob("*.parquet"))
+        episodes = [row for file in files for row in pq.read_table(file, columns=_META).to_pylist()]
+    # Tools that delete, split or merge leave the provenance behind, and a folder may have both.
+    provenance = folder / "meta" / "provenance.parquet"
+    labels = (
+        {row["episode_index"]: row for row in pq.read_table(provenance).to_pylist()} if provenance.is_file() else {}
+    )
+    ids = {} if labels else _ids(folder)
+    for episode in episodes:
+        index = episode["episode_index"]
+        row = labels.get(index, {})
+        matrix = row.get(camera_column("image", "extrinsics"))
+        yield Found(
+            row.get(EPISODE_ID) or ids.get(index) or f"episode {index}",
+            episode["tasks"][0],
+            None if matrix is None else np.reshape(matrix, SCHEMA.extrinsics.shape),
+            row.get("suite"),
+            row.get("task"),
+            row.get("perturbations"),
+        )
+
+
+_META = ["episode_index", "tasks"]
+
+
+def _ids(folder: Path) -> dict[int, str]:
+    """Episode to this project's name of it, from the column of every frame."""
+    found: dict[int, str] = {}
+    for file in sorted((folder / "data").rglob("*.parquet")):
+        if EPISODE_ID in pq.read_schema(file).names:
+            table = pq.read_table(file, columns=["episode_index", EPISODE_ID])
+            found |= dict(zip(table["episode_index"].to_pylist(), table[EPISODE_ID].to_pylist(), strict=True))
+    return found
+
+
+def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
+    names = ["episode_id", "suite", "task", "perturbations"]
+    rows = read_table(file, names, remedy="name the manifest of the run that the dataset is from").select(names)
+    return {row["episode_id"]: row for row in rows.to_pylist()}
+
+
+def _labelled(one: Found, known: Mapping[str, Mapping[str, Any]]) -> Found:
+    row = known.get(one.episode_id)
+    if row is None or one.perturbations is not None:
+        return one
+    return replace(one, suite=row["suite"], task=row["task"], perturbations=row["perturbations"])
+
+
+def _row(one: Found, task: Task | None, test: TestSet) -> Labelled:
+    """What an episode shows in the axes' own parameters; what only labels tell is taken from these."""
+    labels = () if one.perturbations is None else from_json(one.perturbations)
+    seen: list[Perturbation] = [p for p in labels if p.axis != "language"]
+    if one.extrinsics is not None:
+        seen = [p for p in seen if p.axis != "camera"]
+        arenas = list(AGENT_VIEWS) if task is None else [bddl.read(task.bddl_file).arena]
+        cameras = [camera(one.extrinsics, arena) for arena in arenas]
+        if None not in cameras:
+            anywhere = tasks(TESTED_SUITES[0])[0]
+            seen.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
+    rewrites = [] if task is not None and _same(one.instruction, task.instruction) else [_rewrite(one.instruction)]
+    task = task or _nearest_task(rewrites[0], test)
+    return Labelled(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
+
+
+def camera(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
+    """The change of the agent view that leads to a pose; None where it was not moved.
+
+    A roll, which no test camera has, is left out: the distance to a test camera is then the least that it can be.
+
+    Args:
+        extrinsics: (4, 4) from the camera (z forward, y down) to the world.
+        arena: whose own agent view the pose is compared with.
+    """
+    own_m, own_wxyz = (np.array(part) for part in AGENT_VIEWS[arena])
+    offset_m, own_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, own_m - ORBIT_CENTRE_M
+    radius_m, own_radius_m = np.linalg.norm(offset_m), np.linalg.norm(own_offset_m)
+    azimuth = np.arctan2(offset_m[1], offset_m[0])
+    elevation = np.arcsin(offset_m[2] / radius_m) - np.arcsin(own_offset_m[2] / own_radius_m)
+    own = Rotation.from_quat(np.roll(own_wxyz, -1))
+    # MuJoCo's cameras look along -z, with y up.
+    turned = Rotation.from_matrix(extrinsics[:3, :3] * [1.0, -1.0, -1.0])
+    in_place = turned * (Rotation.from_euler("z", azimuth) * Rotation.from_euler("y", -elevation) * own).inv()
+    yaw, pitch, _ = in_place.as_euler("zyx")
+    azimuth_deg, elevation_deg, yaw_deg, pitch_deg = np.rad2deg([azimuth, elevation, yaw, -pitch]).tolist()
+    scale = float(radius_m / own_radius_m)
+    if max(map(abs, (azimuth_deg, elevation_deg, yaw_deg, pitch_deg, np.rad2deg(np.log(scale))))) < UNMOVED:
+        return None
+    return CameraPerturbation(
+        component="spherical",
+        level=1,
+        azimuth_deg=azimuth_deg,
+        elevation_deg=elevation_deg,
+        distance_scale=scale,
+        yaw_deg=yaw_deg,
+        pitch_deg=pitch_deg,
+    )
+
+
+def _rewrite(text: str) -> LanguagePerturbation:
+    return LanguagePerturbation(component="paraphrase", level=1, text=text)
+
+
+def _same(one: str, other: str) -> bool:
+    return _letters(one) == _letters(other)
+
+
+def _letters(text: str) -> str:
+    return "".join(c for c in text.lower() if c.isalnum())
+
+
+@cache
+def _tasks_by_text() -> dict[str, Task]:
+    """Own instructions and rewrites of the tasks that the benchmark perturbs, by their letters."""
+    by_text: dict[str, Task] = {}
+    bank = load_bank()
+    for suite in TESTED_SUITES:
+        for task in tasks(suite):
+            rewrites = [text for texts in bank.get(suite, {}).get(task.name, {}).values() for text in texts]
+            for text in (*rewrites, task.instruction):
+                by_text[_letters(text)] = task
+    return by_text
+
+
+def _task_of(instruction: str) -> Task | None:
+    return _tasks_by_text().get(_letters(instruction))
+
+
+def _nearest_task(rewrite: LanguagePerturbation, test: TestSet) -> Task:
+    """The task whose test instructions come nearest: an unknown episode is compared with all of them."""
+    return min(
+        (task for suite in TESTED_SUITES for task in tasks(suite)),
+        key=lambda task: rewrite.nearest(test, task).distance,
+    )

@@ -1,0 +1,148 @@
+"""lerobot's language column: as lerobot 0.6.1 defines it, and where that is installed, as it reads it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import datasets
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from packaging.version import Version
+from synthetic import IDS, NAME, episode, episodes, loop, write_lerobot
+
+from pipeline.config import load
+from pipeline.errors import PipelineError
+from pipeline.export_config import LeRobotConfig
+from pipeline.formats.lerobot import LeRobot
+from pipeline.run.export import export
+from pipeline.types import Episode, Subtask
+
+LEROBOT = Version(version("lerobot"))
+
+REWRITES = ("kindly put the bowl on the plate", "the plate is where the bowl goes")
+SUBTASKS = (Subtask(0, "approach the bowl"), Subtask(5, "grasp the bowl"), Subtask(10, "move the bowl to the plate"))
+
+
+def told(episode_id: str) -> Episode:
+    return replace(episode(episode_id), rewrites=REWRITES, subtasks=SUBTASKS)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set whose last two episodes are of the split ``val``."""
+    # Refused when it is read where lerobot is older; the writer asks nothing of lerobot.
+    options = LeRobotConfig(name=NAME, shards=3, validation=0.3).model_copy(update={"language": True})
+    target = LeRobot(tmp_path_factory.mktemp("language"), options)
+    source = episodes(told)
+    # Three demonstrations of a task, of two episodes each.
+    known = {
+        one: of._replace(demo=f"libero_spatial/task/demo_{k // 2}") for k, (one, of) in enumerate(source.known.items())
+    }
+    export(target, replace(source, known=known), loop)
+    return target.root
+
+
+def rows(root: Path) -> list[dict[str, Any]]:
+    return [row for file in sorted((root / "data").rglob("*.parquet")) for row in pq.read_table(file).to_pylist()]
+
+
+def test_the_column_is_lerobots(root: Path) -> None:
+    """``language_feature_info`` and ``language_persistent_column_feature`` of ``lerobot/datasets/language.py`` in
+    0.6.1, as ``datasets`` writes that in Arrow."""
+    info = json.loads((root / "meta" / "info.json").read_text())
+    assert info["features"]["language_persistent"] == {"dtype": "language", "shape": [1], "names": None}
+    text = pa.string()
+    row = pa.struct(
+        [
+            ("role", text),
+            ("content", text),
+            ("style", text),
+            ("timestamp", pa.float32()),
+            ("camera", text),
+            ("tool_calls", pa.list_(pa.json_())),
+        ]
+    )
+    for file in (root / "data").rglob("*.parquet"):
+        schema = pq.read_schema(file)
+        assert schema.field("language_persistent").type == pa.list_(row)
+        stored = datasets.Features.from_arrow_schema(schema)["language_persistent"]
+        assert stored.feature["tool_calls"] == datasets.List(datasets.Json())
+    assert "language_persistent" not in json.loads((root / "meta" / "stats.json").read_text())
+
+
+def test_every_frame_has_the_rewrites_and_subtasks_of_its_episode(root: Path) -> None:
+    train = int(json.loads((root / "meta" / "info.json").read_text())["splits"]["train"].split(":")[1])
+    assert train == 4
+    found = rows(root)
+    assert len(found) == sum(len(episode(one)) for one in IDS)
+    for row in found:
+        source = episode(row["episode_id"])
+        said = row["language_persistent"]
+        assert {(each["camera"], each["tool_calls"]) for each in said} == {(None, None)}
+        subtasks = [each for each in said if each["style"] == "subtask"]
+        assert [(each["role"], each["content"]) for each in subtasks] == [("assistant", one.text) for one in SUBTASKS]
+        times = [np.float32(one.step / 20) for one in SUBTASKS]
+        assert [np.float32(each["timestamp"]) for each in subtasks] == times
+        wordings = [each for each in said if each["style"] == "task_aug"]
+        expected = (source.instruction, *REWRITES) if row["episode_index"] < train else ()
+        assert [each["content"] for each in wordings] == list(expected)
+        assert {(each["role"], each["timestamp"]) for each in wordings} <= {("user", 0.0)}
+        assert len(said) == len(subtasks) + len(wordings)
+
+
+def test_without_it_nothing_changes(tmp_path: Path) -> None:
+    plain, same = write_lerobot(tmp_path / "plain"), write_lerobot(tmp_path / "same", told)
+    assert plain.record().files == same.record().files
+    assert "language" not in LeRobotConfig().model_dump()
+    (file, *_) = (plain.root / "data").rglob("*.parquet")
+    assert "language_persistent" not in pq.read_schema(file).names
+
+
+# lerobot has language columns from 0.6 on.
+if Version("0.6") > LEROBOT:
+
+    def test_a_lerobot_that_cannot_read_it_is_said_before_any_work(tmp_path: Path) -> None:
+        file = tmp_path / "told.yaml"
+        file.write_text("{name: told, plan: {episodes: {camera: 1}}, export: {lerobot: {language: true}}}")
+        with pytest.raises(PipelineError, match=r"export\.lerobot\.language: .*lerobot 0\.4\.4.*Python 3\.12"):
+            load(file)
+
+else:
+
+    def test_lerobot_renders_a_rewrite_and_the_active_subtask(root: Path) -> None:
+        from lerobot.configs.recipe import MessageTurn, TrainingRecipe
+        from lerobot.datasets.language import language_persistent_column_feature
+        from lerobot.datasets.language_render import active_at, emitted_at, render_sample
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        data = LeRobotDataset(root.name, root=root, video_backend="pyav")
+        assert data.hf_dataset.features["language_persistent"] == language_persistent_column_feature()
+        recipe = TrainingRecipe(
+            messages=[
+                MessageTurn(role="user", content="${task}", stream="high_level"),
+                MessageTurn(role="assistant", content="${subtask}", stream="low_level", target=True),
+            ],
+        )
+        prompts: dict[bool, set[str]] = {True: set(), False: set()}
+        for index in range(len(data)):
+            item = data[index]
+            said, at_s, step = item["language_persistent"], float(item["timestamp"]), int(item["frame_index"])
+            expected = [one for one in SUBTASKS if one.step <= step][-1].text
+            assert active_at(at_s, persistent=said, style="subtask")["content"] == expected
+            emitted_at(at_s, persistent=said, events=[], style="subtask")  # fails where two are as near
+            context = {"task": item["task"]}
+            shown = render_sample(
+                recipe=recipe, persistent=said, events=None, t=at_s, sample_idx=index, dataset_ctx=context
+            )
+            prompt, answer = shown["messages"]
+            assert answer["content"] == expected
+            prompts[int(item["episode_index"]) < 4].add(prompt["content"])
+        instructions = {episode(one).instruction for one in IDS}
+        assert {*REWRITES} <= prompts[True] <= {*REWRITES, *instructions}
+        assert prompts[False] <= instructions

@@ -1,0 +1,154 @@
+"""Subtasks by robosuite's grasps, MuJoCo's contacts and the predicates of LIBERO's goals, in LIBERO's environment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import BOWL, MILK, PLATE, STOVE, starter_demo
+from numpy.typing import NDArray
+
+from pipeline.config import ReplayConfig
+from pipeline.libero import bddl
+from pipeline.libero.task_goal import called, where
+from pipeline.libero.tasks import find_task, tasks
+from pipeline.physics.environment import Environment
+from pipeline.physics.replay import replay
+from pipeline.physics.subtasks import SHORTEST, subtasks
+from pipeline.types import Task, Trajectory
+
+DRAWER = find_task("libero_goal", "open_the_top_drawer_and_put_the_bowl_inside")
+PARTS = {STOVE: ("turn on the stove", ("turnon", "flat_stove_1"))}
+PARTS[DRAWER] = "open the top drawer of the cabinet", ("open", "wooden_cabinet_1_top_region")
+OBJECTS = {
+    BOWL: ("akita_black_bowl_1", "the black bowl", "to the plate", "on the plate"),
+    MILK: ("milk_1", "the milk", "to the basket", "in the basket"),
+    DRAWER: (
+        "akita_black_bowl_1",
+        "the black bowl",
+        "to the top drawer of the cabinet",
+        "in the top drawer of the cabinet",
+    ),
+}
+PUSHED = {PLATE: ("plate_1", "push the plate to the front of the stove")}
+
+
+@pytest.fixture(scope="module", params=[STOVE, BOWL, MILK, DRAWER, PLATE], ids=lambda task: task.name)
+def done(request: pytest.FixtureRequest, whole: dict[Task, Trajectory]) -> Iterator[tuple[Task, Trajectory, Any]]:
+    """A task, its demonstration replayed, and LIBERO's environment in that scene."""
+    task = request.param
+    environment = Environment(task)
+    trajectory = whole.get(task) or replay(environment, starter_demo(task), "short", ReplayConfig())
+    environment.restore(trajectory.scene)
+    yield task, trajectory, environment._env.env
+    environment.close()
+
+
+def seen(env: Any, trajectory: Trajectory, question: Any) -> NDArray[np.bool_]:
+    """(K+1,) what LIBERO's environment answers at each state."""
+    answers = []
+    for state in trajectory.states:
+        env.sim.set_state_from_flattened(state)
+        env.sim.forward()
+        answers.append(bool(question()))
+    return np.array(answers)
+
+
+def geoms_in_touch(env: Any) -> list[tuple[str, str]]:
+    name = env.sim.model.geom_id2name
+    contacts = [env.sim.data.contact[k] for k in range(env.sim.data.ncon)]
+    return [(name(c.geom1) or "", name(c.geom2) or "") for c in contacts if c.dist <= 0]
+
+
+def met_by(env: Any, mine: set[str], others: Any) -> bool:
+    """Whether one of these geoms touches one that ``others`` takes."""
+    pairs = [pair for pair in geoms_in_touch(env) if len(mine & {*pair}) == 1]
+    return any(others(*({*pair} - mine)) for pair in pairs)
+
+
+def is_robots(geom: str) -> bool:
+    return geom.startswith(("robot0", "gripper0", "mount0"))
+
+
+def test_subtasks_begin_at_the_start_follow_each_other_and_end_before_the_end(
+    done: tuple[Task, Trajectory, Any],
+) -> None:
+    task, trajectory, _ = done
+    found = subtasks(trajectory, task)
+    assert found[0].step == 0
+    assert found[0].text.startswith("approach the ")
+    assert min(after.step - before.step for before, after in pairwise(found)) >= SHORTEST
+    assert found[-1].step < len(trajectory.actions)
+    waiting = replace(trajectory, states=trajectory.states[:6], actions=trajectory.actions[:5])
+    assert subtasks(waiting, task) == ()
+
+
+def test_what_is_lifted_is_robosuites_grasp(done: tuple[Task, Trajectory, Any]) -> None:
+    task, trajectory, env = done
+    if task not in OBJECTS:
+        return
+    name, thing, to, at = OBJECTS[task]
+    step = {text: step for step, text in subtasks(trajectory, task)}
+    grasp, move, place = (step[text] for text in (f"grasp {thing}", f"move {thing} {to}", f"place {thing} {at}"))
+    model = env.objects_dict[name]
+    own = {*model.contact_geoms}
+    grasped = seen(env, trajectory, lambda: env._check_grasp(env.robots[0].gripper, model))
+    resting = seen(env, trajectory, lambda: met_by(env, own, lambda geom: not is_robots(geom)))
+    reached = seen(env, trajectory, lambda: env._eval_predicate(next(iter(bddl.read(task.bddl_file).goal))))
+    closing = trajectory.actions[:, 6] > 0
+    assert not grasped[:grasp].any()
+    assert not closing[grasp - 1], "it begins where the gripper is told to close"
+    assert closing[grasp:move].all()
+    assert grasped[move : move + 5].any(), "robosuite asks for contact with the pads of both fingers"
+    assert grasped[move:place].mean() > 0.9
+    assert resting[: move - 1].mean() > 0.95
+    assert not resting[move + 5 : place].any()
+    assert resting[place] or not closing[place], "it is put down, or let go"
+    # LIBERO's goals hold as soon as the object is where it is to be, still in the hand.
+    assert not reached[: (move + place) // 2].any()
+    assert reached[-1]
+
+
+def test_what_is_opened_and_turned_is_liberos_predicate(done: tuple[Task, Trajectory, Any]) -> None:
+    task, trajectory, env = done
+    if task not in PARTS:
+        return
+    text, fact = PARTS[task]
+    found = subtasks(trajectory, task)
+    place = [each.text for each in found].index(text)
+    begin = found[place].step
+    end = found[place + 1].step if place + 1 < len(found) else len(trajectory.actions)
+    holds = seen(env, trajectory, lambda: env._eval_predicate(fact))
+    assert not holds[: begin + 1].any()
+    assert holds[end:].all()
+    fixture = {*env.fixtures_dict[fact[1].replace("_top_region", "")].contact_geoms}
+    touched = seen(env, trajectory, lambda: met_by(env, fixture, is_robots))
+    assert not touched[: begin - 1].any()
+    assert touched[begin : begin + 5].any()
+
+
+def test_what_is_never_lifted_is_pushed(done: tuple[Task, Trajectory, Any]) -> None:
+    task, trajectory, env = done
+    if task not in PUSHED:
+        return
+    name, text = PUSHED[task]
+    approach, push = subtasks(trajectory, task)
+    assert (approach.text, push.text) == ("approach the plate", text)
+    own = {*env.objects_dict[name].contact_geoms}
+    touched = seen(env, trajectory, lambda: met_by(env, own, is_robots))
+    assert np.flatnonzero(touched)[0] == push.step
+
+
+def test_each_task_has_words_for_its_goal() -> None:
+    """No name of LIBERO's is left in them, and no two things of one goal go by the same words."""
+    for suite in ("libero_spatial", "libero_object", "libero_goal", "libero_10"):
+        for task in tasks(suite):
+            known = bddl.read(task.bddl_file)
+            words = [called(known, name) for name in known.targets]
+            assert len({*words}) == len(words), task.name
+            words += [word for fact in known.goal if len(fact) == 3 for word in where(known, fact)]
+            assert all(word.replace(" ", "").isalpha() and "place" not in word for word in words), task.name

@@ -1,0 +1,184 @@
+"""What an audit tells of datasets into which test tasks were planted, as they are and after their labels were lost."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from libero.libero.envs import TASK_MAPPING
+from scipy.spatial.transform import Rotation
+from synthetic import IDS, NAME, episode, loop
+
+from pipeline.__main__ import main
+from pipeline.errors import PipelineError
+from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.rlds import Rlds
+from pipeline.libero.bddl import Arena
+from pipeline.libero.tasks import find_task
+from pipeline.run.export import export
+from pipeline.tables import write_table
+from pipeline.testset import benchmark
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Episode, Floats
+from pipeline.validation.audit import AGENT_VIEWS, audit, camera
+
+TASK = find_task("libero_goal", "put_the_bowl_on_the_plate")
+OWN_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
+OWN = Rotation.from_quat([0.3048497438430786, 0.30484986305236816, 0.6380177736282349, 0.6380177736282349])
+CENTRE_M = np.array([0.0, 0.0, 0.8])
+CLEAN, CAMERA, WORDS, CLEAR, LABELLED, FAR = IDS
+
+
+def matrix(turn: Rotation, scale: float = 1.0) -> Floats:
+    """(4, 4) of LIBERO's tabletop camera moved about the orbit centre, then along the ray."""
+    pose = np.eye(4)
+    pose[:3, :3] = (turn * OWN).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, 3] = CENTRE_M + scale * turn.apply(OWN_M - CENTRE_M)
+    return pose
+
+
+@pytest.fixture(scope="module")
+def test() -> TestSet:
+    return benchmark.load()
+
+
+@pytest.fixture(scope="module")
+def datasets(test: TestSet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six episodes in three formats: one with a test camera, whose label hides it, one with a test instruction, and one
+    whose label names a test task's noise."""
+    tested = next(one for one in test.of("camera") if one.component == "spherical")
+    moved = Rotation.from_euler("z", float(tested.parameters["azimuth_deg"]), degrees=True) * Rotation.from_euler(
+        "y", -float(tested.parameters["elevation_deg"]), degrees=True
+    )
+    noise = test.on(TASK, "noise")[0]
+    effect = {name: value for name, value in noise.parameters.items() if name != "severity"}
+    blurred = {"axis": "noise", "component": noise.component, "level": 1, "seed": 0}
+    blurred |= {"effect": effect}
+    poses = dict.fromkeys(IDS, matrix(Rotation.identity()))
+    poses |= {CAMERA: matrix(moved), CLEAR: matrix(Rotation.from_euler("x", 40, degrees=True), 1.5)}
+    texts = dict.fromkeys(IDS, TASK.instruction)
+    texts |= {WORDS: str(test.on(TASK, "language")[0].parameters["text"])}
+
+    def load(episode_id: str) -> Episode:
+        made = episode(episode_id)
+        labels = json.dumps([blurred]) if episode_id == LABELLED else "[]"
+        said = {"suite": TASK.suite, "task": TASK.name, "perturbations": labels}
+        seen = {"image": replace(made.geometry["image"], extrinsics=poses[episode_id].astype(np.float32))}
+        return replace(
+            made,
+            instruction=texts[episode_id],
+            provenance={**made.provenance, **said},
+            geometry={**made.geometry, **seen},
+        )
+
+    out = tmp_path_factory.mktemp("planted")
+    known = {one: Known("libero_goal", "planted", "", texts[one], len(episode(one))) for one in IDS}
+    for target in (
+        Rlds(out, RldsConfig(name=NAME, shards=2)),
+        LeRobot(out, LeRobotConfig(name=NAME, shards=1)),
+        LeRobotV21(out, LeRobotV21Config(name=NAME, convention="ipec")),
+    ):
+        export(target, Episodes(known, load), loop)
+    return out
+
+
+@pytest.mark.parametrize(("name", "moved"), [("rlds", 2), ("lerobot", 2), ("lerobot_v21", 2)])
+def test_planted_tasks_are_found_whatever_the_labels_say(datasets: Path, test: TestSet, name: str, moved: int) -> None:
+    found = audit(datasets / name, test)
+    assert (found.episodes, found.unlabelled, found.unknown) == (6, 0, {})
+    assert {axis: (one.rows, one.overlaps, one.closest) for axis, one in found.axes.items()} == {
+        "camera": (moved, 1, CAMERA),
+        "language": (1, 1, WORDS),
+        "noise": (1, 1, LABELLED),
+    }
+    assert found.axes["camera"].smallest == pytest.approx(0.0, abs=1e-3)
+
+
+def test_what_lost_its_labels_is_known_by_its_instruction_and_by_a_manifest(
+    datasets: Path, test: TestSet, tmp_path: Path
+) -> None:
+    edited = tmp_path / "edited"
+    shutil.copytree(datasets / "lerobot", edited)
+    provenance = next(edited.rglob("provenance.parquet"))
+    manifest = tmp_path / "manifest.parquet"
+    write_table(pq.read_table(provenance), manifest)
+    provenance.unlink()
+    found = audit(edited, test)
+    assert {axis: (one.overlaps, one.closest) for axis, one in found.axes.items()} == {"language": (1, WORDS)}
+    assert (found.unlabelled, found.without_camera, found.unknown["robot"]) == (6, 6, 6)
+    found = audit(edited, test, manifest)
+    assert {axis: one.overlaps for axis, one in found.axes.items()} == {"language": 1, "noise": 1}
+    assert found.unlabelled == 0
+
+
+def test_a_set_of_instructions_alone(test: TestSet, tmp_path: Path) -> None:
+    meta = tmp_path / "meta" / "episodes" / "chunk-000"
+    meta.mkdir(parents=True)
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    tested = str(test.on(TASK, "language")[3].parameters["text"])
+    texts = [TASK.instruction, f" {tested.upper()}!", "fold the towel and hang it over the chair by the window"]
+    rows = [{"episode_index": index, "tasks": [text]} for index, text in enumerate(texts)]
+    pq.write_table(pa.Table.from_pylist(rows), meta / "file-000.parquet")
+    found = audit(tmp_path, test)
+    language = found.axes["language"]
+    assert (language.rows, language.overlaps, language.closest, language.smallest) == (2, 1, "episode 1", 0.0)
+    assert found.without_task == 2
+
+
+@pytest.mark.parametrize("arena", get_args(Arena))
+def test_the_agent_views_are_liberos(arena: Arena) -> None:
+    class Recorder:
+        """Stands for the arena that LIBERO sets up its cameras in."""
+
+        def set_camera(self, camera_name: str, pos: list[float], quat: list[float]) -> None:
+            if camera_name == "agentview":
+                self.pose = pos, quat
+
+    name = arena if arena in ("tabletop", "floor") else f"{arena}_tabletop"
+    recorder = Recorder()
+    TASK_MAPPING[f"libero_{name}_manipulation"]._setup_camera(None, recorder)
+    for ours, liberos in zip(AGENT_VIEWS[arena], recorder.pose, strict=True):
+        np.testing.assert_allclose(ours, liberos, atol=1e-6)
+
+
+@pytest.mark.parametrize("arena", get_args(Arena))
+def test_a_pose_is_read_back_as_the_change_that_made_it(arena: Arena) -> None:
+    own_m, own_wxyz = AGENT_VIEWS[arena]
+    own = Rotation.from_quat(np.roll(own_wxyz, -1))
+    rng = np.random.default_rng(5)
+    for azimuth, elevation, yaw, pitch in rng.uniform(-25, 25, (20, 4)):
+        scale = rng.uniform(0.8, 2.0)
+        turn = Rotation.from_euler("z", azimuth, degrees=True) * Rotation.from_euler("y", -elevation, degrees=True)
+        in_place = Rotation.from_euler("y", -pitch, degrees=True) * Rotation.from_euler("z", yaw, degrees=True)
+        pose = np.eye(4)
+        pose[:3, :3] = (in_place * turn * own).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+        pose[:3, 3] = CENTRE_M + scale * turn.apply(np.array(own_m) - CENTRE_M)
+        found = camera(pose.astype(np.float32), arena)
+        assert found is not None
+        parameters = found.azimuth_deg, found.elevation_deg, found.yaw_deg, found.pitch_deg, found.distance_scale
+        np.testing.assert_allclose(parameters, (azimuth, elevation, yaw, pitch, scale), atol=2e-3)
+
+
+def test_the_command_ends_with_1_where_something_overlaps(
+    datasets: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pipeline", "audit", str(datasets / "rlds")])
+    assert main() == 1
+    said = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert said["axes"]["camera"]["overlaps"] == 1
+
+
+def test_a_folder_without_a_dataset_is_refused(tmp_path: Path, test: TestSet) -> None:
+    with pytest.raises(PipelineError, match="no dataset below this folder"):
+        audit(tmp_path, test)
