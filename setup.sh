@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Installs what the pipeline needs on Debian 12 and is quick when it is there: bash setup.sh [run|quick|test]
+# Installs what the pipeline needs on Debian 12, 13 or Ubuntu 24.04, and is quick when it is there:
+#   bash setup.sh [run|quick|test]
 #   run    then makes the datasets of the configuration that params.yaml names
 #   quick  then checks style and types and runs the tests that take little time
 #   test   then checks style and types and runs all tests, one of them in a browser
@@ -13,13 +14,25 @@ VERB=${1:-}
 
 fail() { printf 'setup.sh: %s\n' "$@" >&2; exit 1; }
 
+# After a tool's own words: the disk, which it frees again when it fails, and what else most often stops it.
+stopped() {
+    local folder free_mb cache=${UV_CACHE_DIR:-$HOME/.cache/uv}
+    for folder in . "${TMPDIR:-/tmp}" "${UV_CACHE_DIR:-$HOME}"; do
+        free_mb=$(df --output=avail --block-size=1M "$folder" | tail -n 1)
+        ((free_mb > 2000)) ||
+            fail "$1; only $((free_mb)) MB are free at $folder" "  try: free 10 GB there, then run this again"
+    done
+    fail "$1; its reason stands above" \
+        "  try: mend the network, or the mirror in pip's configuration; or remove a broken cache, rm -rf $cache"
+}
+
 version_of() { "$1" -c 'import sys; print(*sys.version_info[:2], sep=".")' 2>/dev/null || true; }
 
 find_python() {
     local wanted candidate conda=${CONDA_EXE:-}
     for wanted in "${PYTHONS[@]}"; do
-        # What is installed stays.
-        if [[ -x .venv/bin/pip && $(version_of .venv/bin/python) == "$wanted" ]]; then
+        # What is installed stays. What is half installed does not, as uv takes it for whole.
+        if [[ -e .venv/installed && -x .venv/bin/pip && $(version_of .venv/bin/python) == "$wanted" ]]; then
             echo .venv/bin/python
             return
         fi
@@ -35,7 +48,7 @@ find_python() {
         done
     done
     fetch_python || fail "found no Python ${PYTHONS[*]}, and uv could not fetch one" \
-        "  try: sudo apt-get install -y python3.11"
+        "  try: sudo apt-get install -y python3 python3-venv"
 }
 
 # By uv, which any Python 3 installs.
@@ -59,7 +72,7 @@ missing_packages() {
     has '\blibGL\.so\.1' || echo libgl1
     has '\blibOSMesa\.so' || echo libosmesa6
     has '\blibgthread-2\.0\.so\.0' || echo libglib2.0-0   # OpenCV
-    has '\blibMagickWand-.*\.so' || echo libmagickwand-6.q16-6   # the tests' reference for the benchmark's noise
+    has '\blibMagickWand-.*\.so' || echo imagemagick   # the tests' reference for the benchmark's noise
     has '\blibavcodec\.so' || echo ffmpeg   # torchcodec, which links libpython too; later lerobots do without
     [[ $VERSION != 3.11 ]] || "$PYTHON" -c 'import ctypes; ctypes.CDLL("libpython3.11.so.1.0")' 2>/dev/null ||
         echo libpython3.11
@@ -78,24 +91,27 @@ install_packages() {
     fi
     # One broken third-party source must not stop the others.
     "${as_root[@]}" apt-get update -qq || true
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive "${install[@]}" -qq
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive "${install[@]}" -qq ||
+        stopped "apt-get could not install $*"
 }
 
 install_venv() {
     local index
     if [[ $PYTHON != .venv/bin/python ]]; then
         rm -rf .venv
-        "$PYTHON" -m venv .venv
+        "$PYTHON" -m venv .venv || stopped "$PYTHON could not make .venv"
     fi
-    .venv/bin/pip install --quiet "uv==$UV_VERSION"
+    .venv/bin/pip install --quiet "uv==$UV_VERSION" || stopped "pip could not install uv"
     # uv does not read pip's configuration: hand on the mirror that is named there.
     index=${PIP_INDEX_URL:-$(.venv/bin/pip config get global.index-url 2>/dev/null || true)}
     if [[ -n $index ]]; then export UV_DEFAULT_INDEX=${UV_DEFAULT_INDEX:-$index}; fi
     export VIRTUAL_ENV=$PWD/.venv
     # Compiled once: where PYTHONDONTWRITEBYTECODE is set, each process would compile torch and the others again.
-    .venv/bin/uv pip sync --compile-bytecode --require-hashes requirements.lock
+    .venv/bin/uv pip sync --compile-bytecode --require-hashes requirements.lock ||
+        stopped "uv could not install requirements.lock"
     # The lock holds the build back end, so the package itself needs no network.
-    .venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable .
+    .venv/bin/uv pip install --quiet --no-deps --no-build-isolation --editable . ||
+        stopped "uv could not install this package"
     # So that not every worker of the first run compiles them. Where nothing renders, `doctor` says so later.
     .venv/bin/python -m pipeline.validation.loops || true
 }

@@ -6,7 +6,9 @@ processes inherit it. Two renderers may differ by some grey levels, so the choic
 
 from __future__ import annotations
 
+import ctypes.util
 import functools
+import json
 import os
 import subprocess
 import sys
@@ -22,7 +24,9 @@ from pipeline.errors import PipelineError
 
 BACKENDS = ("egl", "osmesa")
 REMEDY = "apt-get install -y libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libosmesa6   (as root, or let setup.sh do it)"
-NVIDIA_REMEDY = "install NVIDIA's EGL driver (in a container, have graphics among NVIDIA_DRIVER_CAPABILITIES)"
+NVIDIA_EGL = "libEGL_nvidia.so.0"
+VENDOR_FOLDERS = "/etc/glvnd/egl_vendor.d:/usr/share/glvnd/egl_vendor.d"
+DEVICES, LOADED_GPUS = Path("/dev"), Path("/proc/driver/nvidia/gpus")
 
 
 @dataclass(frozen=True)
@@ -228,8 +232,55 @@ def _probe(backend: str, index: str | None) -> str:
     return done.stdout.strip()
 
 
-def has_nvidia_gpu() -> bool:
-    return any(Path("/dev").glob("nvidia[0-9]*"))
+def idle_gpu() -> tuple[str, str] | None:
+    """Why no GPU of this machine renders, and what to try; nothing where there is none.
+
+    EGL needs a device node that this user may open, and for NVIDIA the driver's library and a file that names it where
+    libglvnd looks (its src/EGL/icd_enumeration.md).
+    """
+    nvidia = sorted(DEVICES.glob("nvidia[0-9]*"))
+    closed = [
+        node
+        for node in (*nvidia, *sorted(DEVICES.glob("dri/renderD*")))
+        if not os.access(node, os.R_OK | os.W_OK, effective_ids=True)
+    ]
+    if not nvidia and LOADED_GPUS.is_dir():
+        return (
+            f"NVIDIA's driver is loaded, but there is no {DEVICES}/nvidia0",
+            "as root: nvidia-modprobe -u -c=0; in a container, hand the GPU on: --nv (Apptainer), "
+            "--device nvidia.com/gpu=all (Podman), --gpus all (Docker)",
+        )
+    if nvidia and ctypes.util.find_library("EGL_nvidia") is None:
+        return (
+            f"{NVIDIA_EGL} is missing",
+            "install the driver's EGL library (Debian: libegl-nvidia0, Ubuntu: libnvidia-gl-VERSION); in a container, "
+            "have graphics among NVIDIA_DRIVER_CAPABILITIES",
+        )
+    if nvidia and not any(NVIDIA_EGL in file.read_text(errors="replace") for file in _vendor_files()):
+        named = json.dumps({"file_format_version": "1.0.0", "ICD": {"library_path": NVIDIA_EGL}})
+        return (
+            f"no EGL vendor file names {NVIDIA_EGL}",
+            f"echo '{named}' | sudo tee /usr/share/glvnd/egl_vendor.d/10_nvidia.json; "
+            "unset __EGL_VENDOR_LIBRARY_FILENAMES __EGL_VENDOR_LIBRARY_DIRS",
+        )
+    if closed:
+        return (
+            f"this user may not open {closed[0]}",
+            f"sudo usermod -aG $(stat -c %G {closed[0]}) $USER, then log in again; in Podman, --group-add keep-groups",
+        )
+    if nvidia:
+        return "its driver does not answer", "see that nvidia-smi works; unset MUJOCO_GL MUJOCO_EGL_DEVICE_ID"
+    return None
+
+
+def _vendor_files() -> list[Path]:
+    """Files that tell libglvnd which drivers there are."""
+    if named := os.environ.get("__EGL_VENDOR_LIBRARY_FILENAMES"):
+        files = [Path(file) for file in named.split(":")]
+    else:
+        folders = os.environ.get("__EGL_VENDOR_LIBRARY_DIRS", VENDOR_FOLDERS).split(":")
+        files = [file for folder in folders for file in Path(folder).glob("*.json")]
+    return [file for file in files if file.is_file()]
 
 
 def _is_software(device: str) -> bool:
@@ -239,8 +290,8 @@ def _is_software(device: str) -> bool:
 def _reason(backend: str, device: str, faults: dict[str, str]) -> str:
     if not _is_software(device):
         return "a GPU"
-    if has_nvidia_gpu():
-        return f"software, many times slower than the GPU that is there; {NVIDIA_REMEDY}"
+    if idle := idle_gpu():
+        return f"software, many times slower than the GPU that is there: {idle[0]}; {idle[1]}"
     return f"software, as EGL fails: {faults['egl']}" if backend == "osmesa" else "software, as no GPU answers"
 
 

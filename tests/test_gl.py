@@ -154,7 +154,72 @@ def test_workers_share_the_gpus(
     assert gl.gpus.__wrapped__() == shared
 
 
-def test_an_idle_gpu_is_said_aloud(monkeypatch: pytest.MonkeyPatch, devices: dict[tuple[str, str | None], str]) -> None:
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A folder that stands in for ``/dev``, where a GPU lacks nothing but its driver's answer."""
+    vendors = tmp_path / "vendors"
+    vendors.mkdir()
+    (vendors / "10_nvidia.json").write_text('{"ICD": {"library_path": "libEGL_nvidia.so.0"}}')
+    (tmp_path / "dri").mkdir()
+    for node in ("nvidia0", "dri/renderD128"):
+        (tmp_path / node).touch()
+    monkeypatch.setattr(gl, "DEVICES", tmp_path)
+    monkeypatch.setattr(gl, "LOADED_GPUS", tmp_path / "gpus")
+    monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: f"lib{name}.so.0")
+    monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(vendors))
+    return tmp_path
+
+
+def test_an_idle_gpu_is_said_aloud(machine: Path, devices: dict[tuple[str, str | None], str]) -> None:
     devices["egl", None] = CPU
-    monkeypatch.setattr(gl, "has_nvidia_gpu", lambda: True)
-    assert gl.NVIDIA_REMEDY in str(choose())
+    assert "slower than the GPU that is there: its driver does not answer; see that nvidia-smi" in str(choose())
+
+
+def test_no_gpu_is_none_that_idles(machine: Path) -> None:
+    (machine / "nvidia0").unlink()
+    assert gl.idle_gpu() is None
+
+
+def test_a_gpu_without_its_node(machine: Path) -> None:
+    (machine / "nvidia0").unlink()
+    (machine / "gpus").mkdir()
+    what, remedy = gl.idle_gpu() or ("", "")
+    assert what.endswith(f"there is no {machine}/nvidia0")
+    assert "nvidia-modprobe" in remedy
+    assert "--nv" in remedy
+
+
+def test_a_gpu_without_the_library_of_its_driver(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: None)
+    what, remedy = gl.idle_gpu() or ("", "")
+    assert what == "libEGL_nvidia.so.0 is missing"
+    assert "NVIDIA_DRIVER_CAPABILITIES" in remedy
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_gpu_that_no_vendor_file_names(machine: Path, monkeypatch: pytest.MonkeyPatch, named: bool) -> None:
+    if named:
+        mesa = machine / "50_mesa.json"
+        mesa.write_text('{"ICD": {"library_path": "libEGL_mesa.so.0"}}')
+        monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", str(mesa))
+    else:
+        (machine / "vendors" / "10_nvidia.json").unlink()
+    what, remedy = gl.idle_gpu() or ("", "")
+    assert what == "no EGL vendor file names libEGL_nvidia.so.0"
+    # What it says to write is such a file.
+    (machine / "vendors" / "10_nvidia.json").write_text(remedy.split("'")[1])
+    monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
+    assert (gl.idle_gpu() or ("", ""))[0] == "its driver does not answer"
+
+
+@pytest.mark.parametrize("nvidia", [False, True])
+def test_a_render_node_that_the_user_may_not_open(machine: Path, nvidia: bool) -> None:
+    if not nvidia:
+        (machine / "nvidia0").unlink()
+    node = machine / "dri" / "renderD128"
+    node.unlink()
+    node.symlink_to("nothing")  # which root may not open either
+    what, remedy = gl.idle_gpu() or ("", "")
+    assert what == f"this user may not open {node}"
+    assert "usermod -aG" in remedy

@@ -128,13 +128,31 @@ def test_an_installation_that_failed_is_tried_again(tree: Tree) -> None:
     assert "uv pip sync --compile-bytecode --require-hashes requirements.lock" in tree.calls()
 
 
+def test_a_tool_that_stops_is_named_with_what_to_try(tree: Tree) -> None:
+    assert tree.setup().returncode == 0
+    (tree.root / ".venv" / "bin" / "uv").write_text("#!/bin/bash\necho no host >&2; exit 1\n")
+    (tree.root / "requirements.lock").write_text("numpy==2.2.7\n")
+    done = tree.setup(UV_CACHE_DIR=str(tree.root))
+    assert done.returncode == 1
+    assert "no host\nsetup.sh: uv could not install requirements.lock; its reason stands above\n" in done.stderr
+    assert f"rm -rf {tree.root}\n" in done.stderr
+    # What it left is half installed: the next begins with an empty folder.
+    tree.stub("df", "echo Avail; echo 1999")
+    tree.python("bin/python3.11", "3.11")
+    (tree.root / "bin" / "python3.11").write_text(
+        (tree.root / "bin" / "python3.11").read_text().replace("-m venv *", "-m venv") + "exit 1\n"
+    )
+    done = tree.setup()
+    assert "python3.11 could not make .venv; only 1999 MB are free at .\n" in done.stderr
+
+
 def test_without_root_it_names_what_is_missing_and_stops(tree: Tree) -> None:
     tree.libraries("libEGL.so.1", "libGL.so.1", "libgthread-2.0.so.0")
     tree.stub("id", "echo 1000")
     tree.stub("sudo", "exit 1")
     done = tree.setup("test")
     assert done.returncode != 0
-    packages = f"libegl-mesa0 libosmesa6 libmagickwand-6.q16-6 ffmpeg {BROWSER}"
+    packages = f"libegl-mesa0 libosmesa6 imagemagick ffmpeg {BROWSER}"
     # It lies in a folder that users do not search, so no stand-in can hide it.
     packages += "" if Path(BATCH_SYSTEM).exists() else " slurm-wlm"
     assert f"takes root: {packages}\n" in done.stderr
@@ -180,7 +198,8 @@ def test_each_check_can_fail_the_verb(tree: Tree, failing: str) -> None:
         ({"bin/python3": "3.14", "bin/python": "3.13"}, "3.13"),
         ({"bin/python3.11": "", "bin/python3": "3.10", ".pyenv/versions/3.12.1/bin/python": "3.12"}, "3.12"),
         ({"bin/python3": "3.14", "conda/envs/work/bin/python": "3.11"}, "3.11"),
-        ({"bin/python3.11": "3.11", ".venv/bin/python": "3.13", ".venv/bin/pip": ""}, "3.13"),
+        ({"bin/python3.11": "3.11", ".venv/bin/python": "3.13", ".venv/bin/pip": "", ".venv/installed": ""}, "3.13"),
+        ({"bin/python3.11": "3.11", ".venv/bin/python": "3.13", ".venv/bin/pip": ""}, "3.11"),
         ({"bin/python3.11": "3.11", ".venv/bin/python": "3.10", ".venv/bin/pip": ""}, "3.11"),
     ],
 )
@@ -213,7 +232,7 @@ def test_no_python_and_none_to_fetch(tree: Tree) -> None:
     assert done.returncode != 0
     assert "no network" in done.stderr
     assert "found no Python 3.11 3.12 3.13" in done.stderr
-    assert "apt-get install -y python3.11" in done.stderr
+    assert "apt-get install -y python3 python3-venv" in done.stderr
 
 
 def test_an_unknown_verb_is_refused_before_any_work(tree: Tree) -> None:

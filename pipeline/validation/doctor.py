@@ -169,8 +169,8 @@ def _opengl() -> Diagnosis:
         choice = gl.choose()
     except PipelineError as error:
         return Diagnosis("OpenGL", "fail", error.what, error.remedy or "")
-    if choice.software and gl.has_nvidia_gpu():
-        return Diagnosis("OpenGL", "warn", str(choice), gl.NVIDIA_REMEDY)
+    if choice.software and (idle := gl.idle_gpu()):
+        return Diagnosis("OpenGL", "warn", f"{choice.backend} on {choice.device}, as {idle[0]}", idle[1])
     return Diagnosis("OpenGL", "ok", str(choice))
 
 

@@ -82,7 +82,7 @@ def imagemagick() -> Reference:
     try:
         from wand.image import Image as Picture
     except ImportError as error:
-        pytest.fail(f"ImageMagick's library is missing, install the Debian package libmagickwand-6.q16-6 ({error})")
+        pytest.fail(f"ImageMagick's library is missing, install the Debian package imagemagick ({error})")
 
     def motion_blur(frame: Frame, radius_px: float, sigma_px: float, angle_deg: float) -> Frame:
         with Picture.from_array(frame) as picture:

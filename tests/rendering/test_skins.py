@@ -13,6 +13,7 @@ from arenas import both_ways
 from numpy.typing import NDArray
 
 from pipeline import gl, seeding
+from pipeline.rendering import opengl
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.faces import Faces
@@ -270,3 +271,26 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
     assert faces[:SKINS].any(), "with places in a texture"
     assert faces[SKINS:].any(), "without them"
     assert np.max(drawn) < 0.6 * whole, "half of the faces are on the other side"
+
+
+def test_display_lists_may_be_numbered_downwards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mesa 22 counts on, Mesa 25 fills gaps, so that a later block may have lower numbers."""
+    gl.prepare()
+    functions, lowest = opengl._functions(), 0
+    upwards = functions.glGenLists
+
+    def downwards(count: int) -> int:
+        nonlocal lowest
+        lowest = (lowest or upwards(1000) + 1000) - count
+        return lowest
+
+    monkeypatch.setattr(functions, "glGenLists", downwards)
+    opened = Renderer(scene(shadows=False))
+    with both_ways(opened) as (ours, plain):
+        mujoco.mj_forward(opened.model, opened.data)
+        # Each picture would leave matrices on a stack of 32.
+        for _ in range(12):
+            for camera in ("fixed", "moving"):
+                assert np.array_equal(opened.frame(camera), plain.frame(opened.data, camera)), camera
+        assert ours._skins.rendered.any()
+    assert lowest

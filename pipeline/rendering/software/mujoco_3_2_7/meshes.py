@@ -61,8 +61,11 @@ class Meshes:
         self._of_geom = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
         kept = former._give_up() if former else {}
         calls().glDeleteLists(context.baseMesh, context.rangeMesh)
-        context.rangeMesh = 2 * model.nmesh
+        # One block with those that MuJoCo calls beside them: it calls no list below its base, and OpenGL may number a
+        # later block lower (Mesa 25 does, Mesa 22 does not).
+        context.rangeMesh = 2 * model.nmesh + 1 + len(rendered)
         context.baseMesh = calls().glGenLists(context.rangeMesh)
+        self._own = context.baseMesh + 2 * model.nmesh
         self.contents = {mesh: _content(model, mesh) for mesh in rendered}
         self._faces: dict[bytes, int] = {}
         for mesh, content in self.contents.items():
@@ -70,7 +73,6 @@ class Meshes:
                 self._faces[content] = kept.pop(content, 0) or _uploaded(model, context, mesh)
         for number in kept.values():
             calls().glDeleteLists(number, 2)
-        self._own = calls().glGenLists(1 + len(rendered))
         for place, mesh in enumerate(rendered):
             _call_from_base(context.baseMesh + 2 * mesh, place)
             _call_from_base(self._own + 1 + place, len(rendered) + 1 + place)
@@ -81,12 +83,11 @@ class Meshes:
         self._passes: dict[Hashable, list[_Lists]] = {}
 
     def _give_up(self) -> dict[bytes, int]:
-        """Delete all but the lists of faces.
+        """Delete all but the lists of faces and the context's own.
 
         Returns:
             Hash of a mesh to the number of its list of faces.
         """
-        calls().glDeleteLists(self._own, 1 + len(self._meshes))
         for lists in (lists for made in self._passes.values() for lists in made):
             calls().glDeleteLists(lists.base, 2 * len(self._meshes) + 1)
         calls().glDeleteQueries(1, [self._nothing])
@@ -191,7 +192,8 @@ def _uploaded(model: mujoco.MjModel, context: mujoco.MjrContext, mesh: int) -> i
     number: int = calls().glGenLists(2)
     try:
         model.mesh_graphadr[mesh] = -1
-        context.baseMesh = number - 2 * mesh
+        # Unsigned, as in C.
+        context.baseMesh = (number - 2 * mesh) % 2**32
         mujoco.mjr_uploadMesh(model, context, mesh)
         check("mjr_uploadMesh")
     finally:
