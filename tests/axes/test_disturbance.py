@@ -136,7 +136,7 @@ def test_the_hand_is_pushed_off_and_comes_back_to_the_goal(
 def test_liberos_own_environment_does_the_same_under_the_same_wrench(
     environment: Environment, whole: dict[Task, Trajectory]
 ) -> None:
-    from benchmarks.repeat_in_libero import opened, put_in
+    from repeat_in_libero import opened, put_in
 
     kept = replayed(environment, whole[BOWL], pushed_at(12, 80.0))
     libero: Any = opened(BOWL)
