@@ -23,9 +23,9 @@ from pipeline.physics.replay import replay
 from pipeline.planning.streams import streams_of
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.render import render
-from pipeline.types import Extra, Rendered, Task, Trajectory
+from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
 
-ASKED: tuple[tuple[Extra, ...], ...] = (
+ASKED: tuple[tuple[RenderedExtra, ...], ...] = (
     (),
     ("depth",),
     ("segmentation",),
@@ -50,7 +50,7 @@ def main() -> None:
     print(json.dumps(result))
 
 
-def measure(trajectory: Trajectory, task: Task, extras: Sequence[Extra]) -> dict[str, float]:
+def measure(trajectory: Trajectory, task: Task, extras: Sequence[RenderedExtra]) -> dict[str, float]:
     """Of rendering both views with extras: seconds by the clock and of all cores, bytes of frames and of extras."""
     clock_s, cpu_s = time.perf_counter(), time.process_time()
     with closing(LastScene()) as opened:

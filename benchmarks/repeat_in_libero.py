@@ -118,6 +118,9 @@ def repeated(env: Any, done: Done) -> str | None:
     if not np.array_equal(env.get_sim_state(), done.states[0]):
         return f"another first look after {settled} steps"
     for number, action in enumerate(done.actions, 1):
+        if (push := done.scene.push) is not None:
+            acts = push.first_step < number <= push.first_step + push.steps
+            env.sim.data.xfrc_applied[env.sim.model.body_name2id(push.body)] = push.wrench if acts else 0.0
         env.step(action)
         if number < len(done.states) and not np.array_equal(env.get_sim_state(), done.states[number]):
             return f"another state after {number} of {len(done.actions)} actions"

@@ -42,6 +42,7 @@ AXES: dict[str, tuple[str, dict[str, Any]]] = {
     "target": ("pose", {"components": ["target"]}),
     "scene": ("pose", {"components": ["scene"]}),
     "layout": ("layout", {}),
+    "disturbance": ("disturbance", {}),
 }
 """What is measured to its axis and the options of that."""
 SATURATED = 0.93
@@ -77,8 +78,9 @@ def main() -> None:
         replayed = store.rows()
         lines = _lines(rows.values(), replayed)
         shapes = list(_shapes(rows.values(), replayed, store))
+        displaced = _displaced_cm(rows.values(), replayed, store)
     _print(lines)
-    print(json.dumps({"yields": lines, "smoothness": _medians(shapes)}))
+    print(json.dumps({"yields": lines, "smoothness": _medians(shapes), "displaced_cm": displaced}))
 
 
 def _lines(rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -123,6 +125,27 @@ def _shapes(
             own, twin = (_shape(store, trajectory_id) for trajectory_id in (row.trajectory_id, twins[row.demo_id]))
             ratios = {name: own[name] / twin[name] for name in own if name != "saturated"}
             yield ratios | {"saturated": own["saturated"], "saturated_twin": twin["saturated"]}
+
+
+def _displaced_cm(
+    rows: Iterable[plan.Row], replayed: Mapping[str, Mapping[str, Any]], store: TrajectoryStore
+) -> dict[int, list[float]]:
+    """Level of pushes to how far, at most, they put the hand from the twin's, until half a second after them.
+
+    Tenth, fiftieth and ninetieth percentile of those that are kept.
+    """
+    twins = {row.demo_id: row.trajectory_id for row in rows if row.role == "twin"}
+    found: dict[int, list[float]] = defaultdict(list)
+    for row in rows:
+        if row.axis == "disturbance" and replayed[row.trajectory_id]["kept"]:
+            pushed, twin = store.load(row.trajectory_id), store.load(twins[row.demo_id])
+            push = pushed.scene.push
+            assert push is not None
+            steps = slice(push.first_step, min(push.first_step + push.steps + 10, len(twin.actions)))
+            hands = [Reference.of(one.model_xml, one.states[steps], one.actions[steps]) for one in (pushed, twin)]
+            away_m = np.linalg.norm(hands[0].positions_m - hands[1].positions_m, axis=1)
+            found[int(row.level)].append(100 * float(away_m.max()))
+    return {level: np.percentile(cm, [10, 50, 90]).round(1).tolist() for level, cm in sorted(found.items())}
 
 
 @cache

@@ -17,7 +17,7 @@ from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
 from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import select_tasks
-from pipeline.types import Extra
+from pipeline.types import RenderedExtra
 
 
 class DemosConfig(Frozen):
@@ -133,7 +133,7 @@ class ReplayConfig(Frozen):
     fixture_seed: int = Field(default=0, ge=0, lt=2**32)
 
 
-def _each_once(extras: tuple[Extra, ...]) -> tuple[Extra, ...]:
+def _each_once(extras: tuple[RenderedExtra, ...]) -> tuple[RenderedExtra, ...]:
     return tuple(sorted(set(extras)))
 
 
@@ -172,7 +172,7 @@ class RenderConfig(Frozen):
 
     encoding: Literal["jpeg"] = "jpeg"
     jpeg_quality: int = Field(default=95, ge=50, le=100)
-    extras: Annotated[tuple[Extra, ...], AfterValidator(_each_once)] = ()
+    extras: Annotated[tuple[RenderedExtra, ...], AfterValidator(_each_once)] = ()
 
 
 class SlurmConfig(Frozen):

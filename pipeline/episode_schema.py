@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Literal, Self
 
 import numpy as np
@@ -152,6 +152,15 @@ MAPS: tuple[Extra, ...] = ("depth", "segmentation")
 """What each view of an episode has at each step on request."""
 
 
+OUTCOME: Mapping[str, Literal["bool", "string"]] = {"success": "bool", "reason": "string"}
+"""What each failure says of itself beside its provenance: ``success`` is false, ``reason`` as in the manifest."""
+
+
+def provenance_of(extras: Collection[Extra]) -> dict[str, str]:
+    """What each episode says of itself, to its type."""
+    return {**SCHEMA.provenance, **(OUTCOME if "outcome" in extras else {})}
+
+
 def named(extras: Collection[Extra]) -> bool:
     """Whether episodes with these extras have a table of names."""
     return bool({"segmentation", "object_poses"} & set(extras))
@@ -184,12 +193,13 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     if not episode.instruction.strip() or "_" in episode.instruction:
         # OpenVLA-OFT's loader spins for ever on an empty text; an underscore betrays a file name.
         raise _fault(episode, "instruction", f"is {episode.instruction!r}", "words, without underscores")
-    if set(episode.provenance) != set(SCHEMA.provenance):
-        wrong = sorted(set(episode.provenance) ^ set(SCHEMA.provenance))
-        raise _fault(episode, "provenance", f"lacks or adds {wrong}", f"exactly {list(SCHEMA.provenance)}")
-    types = {"string": str, "int64": int, "float32": float}
-    if wrong := sorted(k for k, v in episode.provenance.items() if not isinstance(v, types[SCHEMA.provenance[k]])):
-        expected = ", ".join(f"{SCHEMA.provenance[key]} in {key}" for key in wrong)
+    columns = provenance_of(extras)
+    if set(episode.provenance) != set(columns):
+        wrong = sorted(set(episode.provenance) ^ set(columns))
+        raise _fault(episode, "provenance", f"lacks or adds {wrong}", f"exactly {list(columns)}")
+    types = {"string": str, "int64": int, "float32": float, "bool": bool}
+    if wrong := sorted(k for k, v in episode.provenance.items() if not isinstance(v, types[columns[k]])):
+        expected = ", ".join(f"{columns[key]} in {key}" for key in wrong)
         raise _fault(episode, "provenance", f"holds something else in {wrong}", expected)
     if episode.provenance["episode_id"] != episode.episode_id:
         raise _fault(episode, "provenance", f"names episode {episode.provenance['episode_id']!r}", "its own episode_id")

@@ -156,6 +156,7 @@ class ExportConfig(_Frozen):
         rlds, lerobot: null leaves a format out.
         lerobot_v21: the same episodes for clients that read LeRobot's older version.
         where: a subset of the kept episodes; all of them when left out.
+        failures: write replays that missed their goal too, into sets of their own below ``failures/``.
     """
 
     rlds: RldsConfig | None = RldsConfig()
@@ -163,6 +164,7 @@ class ExportConfig(_Frozen):
     # Left out where they say nothing, so that what was finished before they were added stays what it is.
     lerobot_v21: LeRobotV21Config | None = Field(default=None, exclude_if=lambda options: options is None)
     where: Where | None = Field(default=None, exclude_if=lambda where: where is None)
+    failures: bool = Field(default=False, exclude_if=lambda asked: not asked)
 
     @model_validator(mode="after")
     def _some_format(self) -> ExportConfig:
@@ -185,6 +187,14 @@ class ExportConfig(_Frozen):
         """With a name for each dataset that has none."""
         unnamed = {one: options for one, options in self.formats.items() if not options.name}
         return self.model_copy(update={one: o.model_copy(update={"name": name}) for one, o in unnamed.items()})
+
+    def of_failures(self) -> ExportConfig:
+        """How failures are written: as the other episodes, under another name, and without a validation split."""
+        formats = {
+            one: options.model_copy(update={"name": f"{options.name}_failures", "validation": 0.0})
+            for one, options in self.formats.items()
+        }
+        return self.model_copy(update=formats)
 
     def refuse_too_few(self, demonstrations: int) -> None:
         """Refuse a validation split that nothing could be in.

@@ -17,8 +17,10 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
 """(H, W, 3) RGB."""
-Extra = Literal["depth", "segmentation", "object_poses"]
+RenderedExtra = Literal["depth", "segmentation", "object_poses"]
 """What the render stage makes beside the frames when it is asked to."""
+Extra = Literal[RenderedExtra, "outcome"]
+"""What a dataset has beside the frames; ``outcome``, that of failures says of each episode why it is one."""
 
 
 class State(NamedTuple):
@@ -97,6 +99,22 @@ class Demo:
         return f"{self.task.suite}/{self.task.name}/{self.key}"
 
 
+class Push(NamedTuple):
+    """An external force in the course of an episode.
+
+    Attributes:
+        body: of MuJoCo's model, on whose centre of mass it acts (``mj_data.xfrc_applied``).
+        wrench: (6,) force in N and torque in N m along the world's axes.
+        first_step: executed actions before it, since the first look.
+        steps: control steps that it lasts.
+    """
+
+    body: str
+    wrench: tuple[float, float, float, float, float, float]
+    first_step: int
+    steps: int
+
+
 @dataclass(frozen=True)
 class Scene:
     """Where a replay starts.
@@ -110,6 +128,7 @@ class Scene:
         posture_rad: (7,) joint angles of the reset that came before the state was put in. To these the controller's
             null space pulls the arm, and it keeps their orientation of the hand until an action turns that. None where
             it holds the arm as the state has it.
+        push: what pushes the robot in the course of the episode, whatever is done meanwhile.
     """
 
     model_xml: str
@@ -117,6 +136,7 @@ class Scene:
     resolved: Mapping[str, Any] = field(default_factory=dict)
     gripper: float = 0.0
     posture_rad: tuple[float, ...] | None = None
+    push: Push | None = None
 
 
 RollOut = Callable[[Scene, Demo], Floats]

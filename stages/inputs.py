@@ -5,7 +5,7 @@ So DVC notices what it cannot see itself.
 
 from pipeline.config import Config
 from pipeline.files import write_json
-from pipeline.formats.registry import formats_of
+from pipeline.formats.registry import failures_of, formats_of
 from pipeline.run import export, inputs
 from pipeline.run.stage import main
 from pipeline.stores.frame_store import FrameStore
@@ -17,7 +17,8 @@ def run(config: Config) -> None:
     write_json(config.data / "inputs.json", inputs.listing(config))
     TrajectoryStore(config.data / "trajectories").notice_changes()
     FrameStore(config.data / "frames", config.render).notice_changes()
-    for one in formats_of(config.data, config.export, config.render.extras):
+    asked = (config.data, config.export, config.render.extras)
+    for one in (*formats_of(*asked), *failures_of(*asked)):
         export.notice_changes(one)
 
 

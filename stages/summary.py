@@ -27,8 +27,11 @@ def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
 
     load = EpisodeLoader(config.data, config.render)
     sheets.write(rows, load, config.data / "sheets")
-    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
-        preview.for_run(config, config.data / "previews", workers)
+    previews = finished.of_previews(config)
+    if not previews.holds():
+        with runner(config.compute, config.data, gl.WorkerSetup) as workers:
+            preview.for_run(config, config.data / "previews", workers)
+        previews.keep()
 
 
 if __name__ == "__main__":

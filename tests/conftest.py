@@ -62,10 +62,10 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 
 LONG = (
-    *("test_finished", "test_evaluation", "test_effect", "test_run", "test_kills", "test_evaluation_policies"),
-    "test_reserves",
-    *("test_preview", "test_writers", "test_exports", "test_cluster", "test_validate", "test_render", "test_pose"),
-    *("test_light", "test_background", "test_bad_demonstrations", "test_tracking"),
+    *("test_finished", "test_evaluation", "test_commands", "test_reserves", "test_preview", "test_kills", "test_run"),
+    *("test_effect", "test_compute", "test_stepping", "test_validate", "test_layers", "test_without_gl", "test_stores"),
+    *("test_culling", "test_render", "test_writers", "test_evaluation_analyses", "test_replay", "test_doctor"),
+    *("test_examples", "test_bad_demonstrations", "test_renderer", "test_evaluation_policies", "test_asset_archive"),
 )
 """Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
 
@@ -78,6 +78,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if isinstance(item, pytest.Function) and SLOW_FIXTURES.intersection(item.fixturenames):
             item.add_marker(pytest.mark.slow)
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+
+
+def pytest_collection_finish() -> None:
+    """robosuite collects garbage with every scene that it drops: spare it the half a million objects of the imports."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,8 @@ from pipeline.validation.loops import compile_all
 
 def test_every_loop_is_compiled_once_and_for_all() -> None:
     for module in pkgutil.walk_packages(pipeline.__path__, "pipeline."):
-        if not module.name.rpartition(".")[2].startswith("_") and ".templates." not in module.name:
+        apart = module.name.endswith(".lerobot_eval")  # which needs lerobot 0.6
+        if not module.name.rpartition(".")[2].startswith("_") and ".templates." not in module.name and not apart:
             importlib.import_module(module.name)
     compile_all()
     assert len(DISPATCHERS) >= 5

@@ -20,6 +20,7 @@ from pipeline.axes.base import (
     TextPerturbation,
 )
 from pipeline.axes.camera import CameraAxis
+from pipeline.axes.disturbance import DisturbanceAxis
 from pipeline.axes.language import LanguageAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.axes.light import LightAxis
@@ -39,6 +40,7 @@ class Axes(Frozen):
     layout: LayoutAxis | None = None
     pose: PoseAxis | None = None
     robot: RobotAxis | None = None
+    disturbance: DisturbanceAxis | None = None
     camera: CameraAxis | None = None
     light: LightAxis | None = None
     background: BackgroundAxis | None = None

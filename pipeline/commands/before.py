@@ -79,6 +79,7 @@ def preview(arguments: argparse.Namespace) -> int:
     With `all`, one strong draw of each axis beside the clean twin. A name that ends in .jpg gives JPEG, else PNG.
     Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default ranges.
     """
+    from pipeline import gl
     from pipeline.files import replaced
     from pipeline.libero.tasks import select_tasks
     from pipeline.report import preview
@@ -86,6 +87,7 @@ def preview(arguments: argparse.Namespace) -> int:
 
     config = loaded(arguments)
     chosen = select_tasks([arguments.task])
+    gl.choose()  # Where nothing renders, that is said before anything takes time.
     stage = preview.staged(chosen, config)
     with replaced(arguments.out) as temporary:
         if arguments.axis == EVERY:

@@ -114,6 +114,11 @@ def _add_settings(command: argparse.ArgumentParser) -> None:
         "or say nothing at all",
     )
     add(
+        "--step-limits",
+        choices=("openvla", "lerobot"),
+        help="whose: they differ in libero_spatial, 220 (openvla, default) and 280 (lerobot)",
+    )
+    add(
         "--black",
         choices=("none", "agentview", "all"),
         help="show the policy black frames in place of the agent view, or of all views (default: none)",

@@ -32,6 +32,9 @@ from pipeline.types import Floats, Frame, Scene, Task
 STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
 """Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
 
+LEROBOT_SPATIAL = 280
+"""lerobot's limit of ``libero_spatial``; its others are those of OpenVLA (``lerobot/envs/libero.py``, 0.6.1)."""
+
 
 class EpisodeSettings(Frozen):
     """What holds for all episodes of an evaluation.
@@ -47,6 +50,9 @@ class EpisodeSettings(Frozen):
         plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
             it by the SHA-256 of its file.
         look_every: see ``NextLook``; of model servers alone.
+        step_limits: whose.
+        runner: what asks the policy. ``lerobot-eval`` has its own batches and random numbers, so what one policy does
+            there and in ``evaluate`` need not be the same.
     """
 
     prompt: Prompt = "clean"
@@ -57,6 +63,13 @@ class EpisodeSettings(Frozen):
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
     plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
     look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
+    step_limits: Literal["openvla", "lerobot"] = Field(default="openvla", exclude_if=lambda whose: whose == "openvla")
+    runner: Literal["pipeline", "lerobot-eval"] = Field(default="pipeline", exclude_if=lambda one: one == "pipeline")
+
+    def step_limit(self, suite: str) -> int:
+        """Of an episode in a suite."""
+        lerobots = self.step_limits == "lerobot" and suite == "libero_spatial"
+        return LEROBOT_SPATIAL if lerobots else STEP_LIMITS[suite]
 
     @field_serializer("plan")
     def _name_by_content(self, plan: Path) -> str:
@@ -111,7 +124,7 @@ class EpisodeEnvironment:
         self._picture.restore()
         self.progress = Progress()
         self.task, self._base = task, find_task(task.suite, task.base)
-        self.step_limit = STEP_LIMITS[task.suite]
+        self.step_limit = self.settings.step_limit(task.suite)
         self.resolved: Mapping[str, Any] = {}
         self.perturbations: tuple[Perturbation, ...] = ()
         self._seen: dict[str, Frame] = {}
@@ -161,6 +174,11 @@ class EpisodeEnvironment:
     def observed(self) -> Observed:
         """What LIBERO observed of the last control step."""
         return self._opened.observed
+
+    @property
+    def controller(self) -> Any:
+        """robosuite's controller of the arm."""
+        return self._opened.controller
 
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""

@@ -19,7 +19,7 @@ from pipeline import gl
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
-from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Policy, PolicyError
 from pipeline.evaluation.results import one_setting
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
@@ -186,7 +186,7 @@ class EvaluationJob:
     def limit_s(self) -> float:
         """So long it may take before it counts as hanging: far above what scenes and answers take."""
         step_s = max(STEP_S, self.evaluation.policy.timeout_s)
-        return sum(SCENE_S + step_s * STEP_LIMITS[task.suite] for task in self.tasks)
+        return sum(SCENE_S + step_s * self.evaluation.settings.step_limit(task.suite) for task in self.tasks)
 
     def lost(self) -> list[str]:
         """What to say of its episodes where no worker survives it."""

@@ -22,7 +22,7 @@ from vla_eval.specs import (
 
 from pipeline import gl
 from pipeline.errors import PipelineError
-from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import check_settings
 from pipeline.evaluation.policies import NextLook, Wanted, checked_actions
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
@@ -142,7 +142,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     def get_metadata(self) -> dict[str, Any]:
         """``max_steps`` is the largest limit; each episode ends at that of its own suite."""
         return {
-            "max_steps": max(STEP_LIMITS[suite] for suite in self._selection.suites),
+            "max_steps": max(self._environment.settings.step_limit(suite) for suite in self._selection.suites),
             "max_episodes_per_task": 1,
             "selection": self._selection.model_dump(mode="json"),
             "settings": self._environment.settings.model_dump(mode="json"),

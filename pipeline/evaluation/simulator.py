@@ -15,6 +15,7 @@ from pipeline.axes import Perturbation
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
+from pipeline.physics.quality import ARM, FINGERS
 from pipeline.physics.stepping import ControlStep
 from pipeline.planning.streams import Stream
 from pipeline.rendering.frames import changes_of, frames_of
@@ -37,12 +38,16 @@ class Observed(NamedTuple):
         site_alpha: (nsite,) opacity of each site in them.
         state: (8,) float32 position (m) and axis-angle (rad) of the end effector and two finger joints (m).
         joint_state: (7,) float32 joint angles in rad.
+        hand_wxyz: (4,) orientation of the hand, which ``state`` has as an axis-angle.
+        velocity: (9,) of the joints (rad/s) and the two finger joints (m/s).
     """
 
     qpos: Floats
     site_alpha: NDArray[np.float32]
     state: NDArray[np.float32]
     joint_state: NDArray[np.float32]
+    hand_wxyz: Floats
+    velocity: Floats
 
 
 class ObservationClock:
@@ -104,6 +109,11 @@ class Simulator(Environment):
         """The model that LIBERO's last reset compiled, textures included."""
         return self._env.sim.model._model
 
+    @property
+    def controller(self) -> Any:
+        """robosuite's, of the arm."""
+        return self._env.env.robots[0].controller
+
     def start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
         """Reset, put in an initial state and settle, as the benchmarks' evaluations do.
 
@@ -116,6 +126,7 @@ class Simulator(Environment):
                 drives the arm to them.
         """
         env = self._env.env
+        self._push = None
         if self._rewind is None or (seed, posture_rad) != (self._rewind.seed, self._rewind.posture_rad):
             self._reset(seed, posture_rad)
         else:
@@ -171,6 +182,7 @@ class Simulator(Environment):
         """
         data = self._env.sim.data._data
         qpos = data.qpos.copy()
+        self._act_from_outside()
         try:
             for _ in self._control_step.substeps(action):
                 if self._clock.tick():
@@ -181,7 +193,10 @@ class Simulator(Environment):
 
     def _observe(self, qpos: Floats) -> Observed:
         """Args: qpos: (nq,) that the data's geometry was computed from, one substep before the data's own."""
-        return Observed(qpos, self.site_alpha, *proprioception(self._env.sim.data._data))
+        data, names = self._env.sim.data._data, (*ARM, *FINGERS)
+        velocity = np.concatenate([data.joint(name).qvel for name in names])
+        hand_wxyz = data.body("robot0_right_hand").xquat.copy()
+        return Observed(qpos, self.site_alpha, *proprioception(data), hand_wxyz, velocity)
 
 
 def _styles(images: Mapping[str, str]) -> dict[str, str]:

@@ -98,7 +98,8 @@ class Format(ABC, Generic[Options]):
     @property
     def stage_record(self) -> Path:
         """The record that DVC knows the output of the format's stage by."""
-        return self.record_file
+        data = self.data.parent if "outcome" in self.extras else self.data  # Failures are written by the same stage.
+        return data / f"{self.name}.json"
 
     @property
     def work(self) -> Path:

@@ -16,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, named
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, named, provenance_of
 from pipeline.errors import PipelineError
 from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
 from pipeline.formats.lerobot_columns import (
@@ -155,7 +155,7 @@ def figures(found: Numbers, shown: Mapping[str, Counts]) -> dict[str, dict[str, 
 def provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
     """Of ``meta/provenance.parquet``, which has a row for each episode, and which lerobot passes by."""
     stored = {"episode_index": pa.int64()}
-    stored |= {name: pa.type_for_alias(dtype) for name, dtype in SCHEMA.provenance.items()}
+    stored |= {name: pa.type_for_alias(dtype) for name, dtype in provenance_of(extras).items()}
     stored |= {name: pa.list_(pa.float32(), spec.shape[0] * spec.shape[1]) for name, spec in matrix_columns().items()}
     return pa.schema(stored | ({INSTANCES: pa.string()} if named(extras) else {}))
 

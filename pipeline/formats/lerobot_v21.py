@@ -42,7 +42,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     @property
     def stage_record(self) -> Path:
         # Of one stage with v3.0, as a stage of DVC has files whether or not this format is asked for.
-        return self.data / f"{LeRobot.name}.json"
+        return super().stage_record.with_name(f"{LeRobot.name}.json")
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []

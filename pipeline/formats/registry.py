@@ -27,6 +27,15 @@ def formats_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) 
     return [kind(data, options.formats[kind.name], extras) for kind in FORMATS if kind.name in options.formats]
 
 
+FAILURES = "failures"
+"""Folder of a run with the datasets of replays that missed their goal."""
+
+
+def failures_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
+    """The datasets of failures; none where they are not asked for."""
+    return formats_of(data / FAILURES, options.of_failures(), (*extras, "outcome")) if options.failures else []
+
+
 def columns() -> list[pa.Field]:
     """The manifest's columns of all formats."""
     return [column for kind in FORMATS for column in kind.columns]

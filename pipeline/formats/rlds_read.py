@@ -10,7 +10,7 @@ from typing import Any
 
 import tensorflow_datasets as tfds
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named, provenance_of
 from pipeline.errors import PipelineError
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Copy, Fault, sampled
@@ -135,7 +135,7 @@ def _copy(steps: Mapping[str, Any], place: Place, extras: tuple[Extra, ...]) -> 
         joint_state=steps["observation/joint_state"],
         action=steps["action"],
         instruction=instructions[0],
-        provenance={name: _said(steps[METADATA + name][0]) for name in SCHEMA.provenance},
+        provenance={name: _said(steps[METADATA + name][0]) for name in provenance_of(extras)},
         geometry={view: _geometry(steps, view, extras) for view in SCHEMA.views},
         object_poses=steps["observation/object_poses"] if "object_poses" in extras else None,
         instances=json.loads(steps[f"{METADATA}instances"][0]) if named(extras) else (),

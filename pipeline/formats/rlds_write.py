@@ -17,7 +17,17 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MapSpec, MatrixSpec, VectorSpec, check, named
+from pipeline.episode_schema import (
+    MAPS,
+    MATRICES,
+    SCHEMA,
+    MapSpec,
+    MatrixSpec,
+    VectorSpec,
+    check,
+    named,
+    provenance_of,
+)
 from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
@@ -58,6 +68,7 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
                 name=split_name, shard_lengths=list(shards.values()), num_bytes=stored, filename_template=template
             )
         )
+    kept, end = ("miss the goal", "failure") if "outcome" in extras else ("solve the task", "success")
     tfds.folder_dataset.write_metadata(
         data_dir=folder,
         features=features(extras),
@@ -65,8 +76,8 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
         version=VERSION,
         filename_template=template,
         check_data=False,  # the check needs TensorFlow
-        description="LIBERO demonstrations, perturbed, replayed in simulation and kept when they solve the task. "
-        "Robot: Franka Panda. Every episode ends in success; episode_metadata says what was changed.",
+        description=f"LIBERO demonstrations, perturbed, replayed in simulation and kept when they {kept}. "
+        f"Robot: Franka Panda. Every episode ends in {end}; episode_metadata says what was changed.",
         homepage="https://libero-project.github.io",
         citation=schema_file("citation.bib").read_text(),
         license="LIBERO's demonstrations: CC BY 4.0. README.md of the dataset names what its textures and objects owe.",
@@ -90,19 +101,24 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     if "object_poses" in extras:
         observation["object_poses"] = _matrix(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
+    failures = "outcome" in extras
     step = {
         "observation": observation,
         "action": _vector(SCHEMA.action),
         "discount": scalar(np.float32, doc="always 1"),
-        "reward": scalar(np.float32, doc="1 on the last step, else 0"),
+        "reward": scalar(np.float32, doc="always 0" if failures else "1 on the last step, else 0"),
         "is_first": scalar(np.bool_, doc="first step of the episode"),
         "is_last": scalar(np.bool_, doc="last step of the episode"),
-        "is_terminal": scalar(np.bool_, doc="last step: every episode ends in success"),
+        "is_terminal": scalar(
+            np.bool_,
+            doc=f"{'never' if failures else 'last step'}: every episode ends in {'failure' if failures else 'success'}",
+        ),
         "language_instruction": tfds.features.Text(doc="what the policy is asked to do"),
     }
     metadata = {"file_path": tfds.features.Text(doc="where the demonstration was published, as demo_source")}
     meanings = {column["name"]: column["meaning"] for column in read_json(schema_file("manifest.json"))["columns"]}
-    for key, dtype in SCHEMA.provenance.items():
+    meanings["success"] = "whether the goal was reached: false"
+    for key, dtype in provenance_of(extras).items():
         doc = meanings[key]
         metadata[key] = tfds.features.Text(doc=doc) if dtype == "string" else scalar(np.dtype(dtype), doc=doc)
     metadata |= {f"{view}_{name}": _matrix(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
@@ -140,7 +156,7 @@ def _serializer(extras: tuple[Extra, ...] = ()) -> Any:
 
 
 def _tree(episode: Episode) -> dict[str, Any]:
-    last = len(episode) - 1
+    last, success = len(episode) - 1, bool(episode.provenance.get("success", True))
     columns: dict[str, Sequence[Any] | NDArray[Any]] = {**episode.frames}
     columns |= {"state": episode.state, "joint_state": episode.joint_state}
     columns |= {} if episode.object_poses is None else {"object_poses": episode.object_poses}
@@ -150,10 +166,10 @@ def _tree(episode: Episode) -> dict[str, Any]:
             "observation": {name: values[t] for name, values in columns.items()},
             "action": episode.action[t],
             "discount": 1.0,
-            "reward": float(t == last),
+            "reward": float(success and t == last),
             "is_first": t == 0,
             "is_last": t == last,
-            "is_terminal": t == last,
+            "is_terminal": success and t == last,
             "language_instruction": episode.instruction,
         }
         for t in range(len(episode))

@@ -20,7 +20,7 @@ from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
 from pipeline.scenes.compiled import fixed_pose, physics_of, put_images, take_images
 from pipeline.scenes.swept_path import SURFACES
-from pipeline.types import Floats, Scene, Task
+from pipeline.types import Floats, Push, Scene, Task
 
 DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 """(7,) what is done while a scene settles: nothing, with the gripper open (OpenVLA's and LIBERO-Plus's rule)."""
@@ -83,6 +83,8 @@ class Environment:
         self._openings = len(self._env.env.object_property_initializers)
         self._placed: dict[int, str] = {}
         self._scene: str | None = None
+        self._push: Push | None = None
+        self._steps = 0
 
     def place_fixtures(self, seed: int) -> str:
         """The scene as LIBERO's own first reset makes it under ``seed``, as MJCF; 1.3 s, the second time nothing.
@@ -194,6 +196,7 @@ class Environment:
             env.sim.forward()
         env._post_process()
         self._control_step = ControlStep(env)
+        self._push, self._steps = scene.push, 0
 
     def settle(self, steps: int) -> None:
         """Do nothing for some control steps, with the gripper open, while the arm and objects come to rest.
@@ -201,6 +204,8 @@ class Environment:
         Raises:
             RefusedError: see ``step``.
         """
+        # Before the first look, from which a push counts.
+        self._steps = -steps
         for _ in range(steps):
             self.step(DUMMY_ACTION)
 
@@ -253,10 +258,18 @@ class Environment:
         Raises:
             RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
         """
+        self._act_from_outside()
         try:
             self._control_step(action)
         except (np.linalg.LinAlgError, mujoco.FatalError) as error:
             raise RefusedError("simulation_unstable") from error
+
+    def _act_from_outside(self) -> None:
+        """Begin or end the scene's push, and count the step that follows."""
+        if self._push is not None:
+            acts = self._push.first_step <= self._steps < self._push.first_step + self._push.steps
+            self.sim.data._data.body(self._push.body).xfrc_applied[:] = self._push.wrench if acts else 0.0
+        self._steps += 1
 
     @property
     def sim(self) -> Any:

@@ -56,7 +56,9 @@ def replay(
         states, actions, alphas, judged = _execute(environment, scene, settle_steps, acting)
         return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused or judged)
 
-    followed = reference() if config.mode == "tracked" else None
+    # What is pushed is tracked also where the recorded actions would reach the goal: they do not work against the push.
+    tracks = config.mode == "tracked" or (config.mode == "auto" and scene.push is not None and not refused)
+    followed = reference() if tracks else None
     if followed is None:
         opened = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
         if config.mode != "auto" or opened.verdict.kept or refused:

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.config import ReplayConfig
 from pipeline.physics.environment import shared
 from pipeline.scenes.noops import kept_actions
-from pipeline.types import Demo, Floats, Scene, Task
+from pipeline.types import Demo, Floats, Push, Scene, Task
 
 
 def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
@@ -35,19 +35,19 @@ def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
     return state
 
 
-_Start = tuple[str, bytes, float, tuple[float, ...] | None]
+_Start = tuple[str, bytes, float, tuple[float, ...] | None, Push | None]
 
 
 def _start(scene: Scene) -> _Start:
     """What a replay in the scene depends on; unlike the scene, it can be a key."""
-    return scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad
+    return scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad, scene.push
 
 
 @lru_cache(maxsize=4)
 def _states(task: Task, start: _Start, actions: bytes, settle_steps: int) -> Floats:
-    model_xml, state, gripper, posture_rad = start
+    model_xml, state, gripper, posture_rad, push = start
     environment = shared(task)
-    environment.restore(Scene(model_xml, np.frombuffer(state), gripper=gripper, posture_rad=posture_rad))
+    environment.restore(Scene(model_xml, np.frombuffer(state), gripper=gripper, posture_rad=posture_rad, push=push))
     environment.settle(settle_steps)
     states = [environment.state]
     for action in np.frombuffer(actions).reshape(-1, 7):

@@ -27,7 +27,8 @@ Groups = Mapping[str, Values]
 
 REFERENCES = ("clean", "benchmark")
 GREY = "#8c8c8c"
-PALETTE = ("#7d9a1f", "#d463b0", "#129fc0", "#4285f4", "#e59a00", "#1f9e82", "#9467d6", "#e4572e", "#6b7d94", "#a3384d")
+PALETTE = ("#7d9a1f", "#d463b0", "#129fc0", "#6b7d94", "#4285f4", "#e59a00", "#1f9e82", "#9467d6", "#e4572e", "#a3384d")
+"""In the order of ``Axes``; what comes with a new axis is put in at its place, so that others keep their colours."""
 COLOURS = dict(zip(AXES, PALETTE, strict=False))
 OTHER = "#b0794a"
 """For episodes that are perturbed on several axes, and where axes are more than colours."""

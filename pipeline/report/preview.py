@@ -1,7 +1,7 @@
-"""Preview: what the axes do to a task, as a contact sheet in the manner of the paper's appendix; no replay.
+"""Preview: what the axes do to a task, as a contact sheet in the manner of the paper's appendix.
 
-Every picture shows the demonstration's first state. The draws are those that a plan with the same seed makes for the
-demonstration.
+Every picture shows the demonstration's first state, without a replay; of a push, the replay that it acts in. The draws
+are those that a plan with the same seed makes for the demonstration.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer
+from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
@@ -25,6 +26,8 @@ from pipeline.libero.demonstrations import Problem
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
+from pipeline.physics.reference import Reference
+from pipeline.physics.replay import replay
 from pipeline.physics.roll_out import first_look, roll_out
 from pipeline.planning.plan import Draws
 from pipeline.planning.streams import Stream
@@ -36,6 +39,8 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Frame, Scene, Task
 
 VARIANTS, PHYSICS_VARIANTS = 11, 3
+STRIP_STEPS = (0, 6, 16)
+"""Control steps after the end of a push that a strip shows, beside where it begins."""
 """With the original, three rows of four; one where each variant is a scene of its own to compile."""
 CANDIDATES = 200
 """The plan's first draws, from which the variants are chosen; most draws take well under a millisecond."""
@@ -72,8 +77,37 @@ class Stage:
         for physics in of_layer(changes, PhysicsPerturbation):
             scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
-        state, site_alpha = first_look(scene, self.demo.task, self.replay), renderer.model.site_rgba[:, 3].copy()
+        site_alpha = renderer.model.site_rgba[:, 3].copy()
+        if (push := scene.push) is None:
+            state = first_look(scene, self.demo.task, self.replay)
+        else:
+            state = roll_out(scene, self.demo, self.replay)[push.first_step + push.steps]
         return frames_of(renderer, state, site_alpha, [Stream(view, changes) for view in views], 0)
+
+    def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
+        """Steps of a pushed replay, and the agent view at each, without the push and with it.
+
+        Raises:
+            RefusedError: when the demonstration refuses the push, or does not reach its goal without one.
+        """
+        environment = shared(self.demo.task)
+        twin = replay(environment, self.demo, "twin", self.replay)
+        if not twin.verdict.kept:
+            raise RefusedError(twin.verdict.reason)
+        reference = Reference.of(twin.model_xml, twin.states, twin.actions)
+        changes = of_layer((perturbation,), PhysicsPerturbation)
+        pushed = replay(environment, self.demo, "pushed", self.replay, changes, lambda: reference)
+        if (push := pushed.scene.push) is None:
+            raise RefusedError(pushed.verdict.reason)
+        renderer, stream = self.opened.renderer(pushed.model_xml), Stream("image", ())
+        shown = []
+        for step in (push.first_step, *(push.first_step + push.steps + after for after in STRIP_STEPS)):
+            frames: list[Frame] = []
+            for one in (twin, pushed):
+                at = min(step, len(one.actions))
+                frames += frames_of(renderer, one.states[at], one.site_alpha[at], [stream], at)
+            shown.append((step, frames))
+        return shown
 
 
 def staged(tasks: Iterable[Task], config: Config) -> Stage:
@@ -154,15 +188,30 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     side = SIDE_PX[len(views)]
     original = stage.frames(views)
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
+    if strips := [tile for push in drawn for tile in _strip(stage, push)]:
+        tiles, drawn = strips, []
     for perturbation in drawn:
         caption = describe(perturbation)
         try:
-            frames = stage.frames(views, perturbation)
+            # What changes words alone is not rendered anew.
+            frames = stage.frames(views, perturbation) if perturbation.views else original
         except RefusedError as refused:
             caption = f"refused, {refused.reason}: {caption}"
             frames = [np.full_like(frame, REFUSED_GREY) for frame in original]
         tiles.append(Tile(side_by_side(frames, side), caption))
     return sheet(f"{demo.demo_id}, first state; axis {name}, seed {seed}; {', '.join(views)}", tiles)
+
+
+def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
+    """What a push does, step by step, beside the replay without it; nothing where it is refused."""
+    if not isinstance(push, DisturbancePerturbation):
+        return []
+    try:
+        shown = stage.strip(push)
+    except RefusedError:
+        return []
+    caption = f"without and with {describe(push)}"
+    return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in shown]
 
 
 def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:

@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.axes import from_json
 from pipeline.axes.background import BackgroundPerturbation
+from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.layout import LayoutPerturbation
 from pipeline.axes.noise import NoisePerturbation
@@ -216,7 +217,7 @@ class _Run:
         self._store = TrajectoryStore(config.data / "trajectories")
         self._frames = FrameStore(config.data / "frames", config.render)
         self._twins = {row.episode_id: row for row in kept if row.role == "twin"}
-        self._looks: dict[str, Look] = {}
+        self._looks: dict[tuple[str, int], Look] = {}
 
     def of(self, row: Row) -> Iterator[tuple[str, float]]:
         """What an episode shows that changes nothing, or one axis."""
@@ -226,6 +227,10 @@ class _Run:
                 yield from self._look(row).measures().items()
             case (RobotPerturbation() as change,) if twin:
                 yield from self._look(row).away_from(self._look(twin), change.component, change.level).items()
+            case (DisturbancePerturbation() as change,) if twin:
+                end = change.first_step + change.steps
+                away_cm = 100 * math.dist(self._look(row, end).position_m, self._look(twin, end).position_m)
+                yield f"disturbance: hand off its path after a push of level {change.level} (cm)", away_cm
             case (ScenePerturbation() as change,):
                 moves = {one.name: (one.dx_m, one.dy_m) for one in change.moves}
                 yield from _targets_moved(row.suite, row.task, moves, change.level)
@@ -245,11 +250,12 @@ class _Run:
             case (LanguagePerturbation(),):
                 yield "language: words", len(row.instruction.split())
 
-    def _look(self, row: Row) -> Look:
-        if row.trajectory_id not in self._looks:
+    def _look(self, row: Row, step: int = 0) -> Look:
+        if (row.trajectory_id, step) not in self._looks:
             trajectory = self._store.load(row.trajectory_id)
-            self._looks[row.trajectory_id] = Look.of(physics_to_read(trajectory.model_xml), trajectory.states[0])
-        return self._looks[row.trajectory_id]
+            look = Look.of(physics_to_read(trajectory.model_xml), trajectory.states[step])
+            self._looks[row.trajectory_id, step] = look
+        return self._looks[row.trajectory_id, step]
 
     def _changed(self, row: Row, twin: Row) -> dict[str, Floats]:
         """View to the (H, W, 3) differences of the first frame from the twin's."""

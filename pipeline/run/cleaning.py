@@ -29,6 +29,7 @@ PARTS = {
     "uploads": Part(("card", "finetune"), "card and recipe"),
     "rlds": Part(("rlds", "rlds.json"), "export_rlds, from the frames"),
     "lerobot": Part(("lerobot", "lerobot.json", "lerobot_v21", "lerobot_v21.json"), "export_lerobot, from the frames"),
+    "failures": Part(("failures",), "export_rlds and export_lerobot, from the frames"),
     "frames": Part(("frames",), "render, from the trajectories: most of a run's time"),
     "trajectories": Part(("trajectories", "replay.json"), "replay, from the demonstrations"),
     "tables": Part(

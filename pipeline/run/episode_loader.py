@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from pipeline.config import RenderConfig
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import provenance_of
 from pipeline.files import Edition, edition
 from pipeline.identity import versions
 from pipeline.libero.tasks import find_task
@@ -16,21 +16,23 @@ from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Episode, Subtask
+from pipeline.types import Episode, Extra, Subtask
 
 
 @dataclass(frozen=True)
 class EpisodeLoader:
-    """Loads kept episodes by id; small enough to send to a worker, which reads the plan once for itself.
+    """Loads rendered episodes by id; small enough to send to a worker, which reads the plan once for itself.
 
     Attributes:
         data: folder with the plan and the frame store.
         config: how its frames are encoded.
+        extras: ``outcome`` for failures.
         rewrites: episode id to other wordings of its task, where episodes come with them and with their subtasks.
     """
 
     data: Path
     config: RenderConfig
+    extras: tuple[Extra, ...] = ()
     rewrites: Mapping[str, Sequence[str]] | None = None
 
     def __call__(self, episode_id: str) -> Episode:
@@ -42,6 +44,9 @@ class EpisodeLoader:
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
         known |= asdict(rendered.quality) if rendered.quality else {}
         known |= {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
+        if "outcome" in self.extras:
+            verdict = TrajectoryStore(self.data / "trajectories").load(row.trajectory_id).verdict
+            known |= {"success": verdict.kept, "reason": verdict.reason}
         episode = Episode(
             episode_id=episode_id,
             frames={view: rendered.streams[stream.stream_id] for view, stream in shown.items()},
@@ -49,7 +54,7 @@ class EpisodeLoader:
             joint_state=rendered.joint_state,
             action=rendered.action,
             instruction=row.instruction,
-            provenance={name: known[name] for name in SCHEMA.provenance},
+            provenance={name: known[name] for name in provenance_of(self.extras)},
             geometry={view: rendered.geometry[name] for view, name in geometry.items()},
             object_poses=rendered.object_poses,
             instances=rendered.instances,

@@ -23,6 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import checksum, keep_below, put_in_place, remove, remove_if_empty, replaced, sync, write_json
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
+from pipeline.formats.registry import failures_of
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
 from pipeline.libero.tasks import find_task
 from pipeline.planning import plan
@@ -30,6 +31,7 @@ from pipeline.run import outcome
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
+from pipeline.types import Extra
 
 AnyFormat = Format[Any]
 
@@ -46,8 +48,19 @@ def export_run(kind: type[AnyFormat], config: Config) -> None:
             write_json(record, {})
         print(f"{kind.title} is not asked for: export.{kind.name} is null")
         return
-    target = kind(config.data, options, config.render.extras)
-    episodes = asked(target, config, kept_episodes(config))
+    _bring_up_to_date(kind(config.data, options, config.render.extras), kept_episodes(config), config)
+    for target in failures_of(config.data, config.export, config.render.extras):
+        if target.name == kind.name:
+            _bring_up_to_date(target, failed_episodes(config), config)
+
+
+def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> None:
+    if not episodes.ids and "outcome" in target.extras:
+        remove(target.folder)
+        target.record_file.unlink(missing_ok=True)
+        print(f"no replay missed its goal: nothing is in {target.folder}")
+        return
+    episodes = asked(target, config, episodes)
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
         return
@@ -60,16 +73,27 @@ def export_run(kind: type[AnyFormat], config: Config) -> None:
 def kept_episodes(config: Config) -> Episodes:
     """The kept episodes of a run, in the order they are written."""
     run = outcome.read(config)
-    contents, known = run.contents(), {}
-    for episode_id in run.kept:
+    return Episodes(_known(run, run.kept), EpisodeLoader(config.data, config.render))
+
+
+def failed_episodes(config: Config) -> Episodes:
+    """Its failures, where they are asked for, in the order they are written."""
+    run = outcome.read(config)
+    known = _known(run, outcome.shuffled(run.missed))
+    return Episodes(known, EpisodeLoader(config.data, config.render, ("outcome",)))
+
+
+def _known(run: outcome.Outcome, episode_ids: Sequence[str]) -> dict[str, Known]:
+    known = {}
+    for episode_id in episode_ids:
         row = run.row_of[episode_id]
         steps = run.trajectories[row.trajectory_id]["steps"]
-        known[episode_id] = Known(row.suite, contents[episode_id], row.demo_id, row.instruction, steps)
-    return Episodes(known, EpisodeLoader(config.data, config.render))
+        known[episode_id] = Known(row.suite, run.content(episode_id), row.demo_id, row.instruction, steps)
+    return known
 
 
 def asked(target: AnyFormat, config: Config, episodes: Episodes) -> Episodes:
-    """The kept episodes with what a format takes beside: where it takes ``language``, rewrites and subtasks.
+    """Episodes with what a format takes beside: where it takes ``language``, rewrites and subtasks.
 
     Rewrites are those that the run's language axis may draw for the episode, or its default ranges.
     """
@@ -84,7 +108,8 @@ def asked(target: AnyFormat, config: Config, episodes: Episodes) -> Episodes:
     rows = {row.episode_id: row for row in plan.read(config.data / "plan.parquet")}
     rewrites = {one: wordings(rows[one].suite, rows[one].task, rows[one].axis) for one in episodes.known}
     known = {one: of._replace(content=digest(of.content, rewrites[one])[:16]) for one, of in episodes.known.items()}
-    return Episodes(known, EpisodeLoader(config.data, config.render, rewrites))
+    extras: tuple[Extra, ...] = ("outcome",) if "outcome" in target.extras else ()
+    return Episodes(known, EpisodeLoader(config.data, config.render, extras, rewrites))
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:

@@ -18,7 +18,7 @@ from pipeline.axes.language import BANK_FILE
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
-from pipeline.formats.registry import formats_of
+from pipeline.formats.registry import failures_of, formats_of
 from pipeline.identity import fingerprint
 from pipeline.run.export import untouched
 from pipeline.stores.frame_store import FrameStore
@@ -72,7 +72,8 @@ class Memory:
 def of_validate(config: Config) -> Memory:
     """Of what ``validate`` found: it passed on these contents, of which nothing has changed."""
     names = ("plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "inputs.json")
-    formats = formats_of(config.data, config.export, config.render.extras)
+    asked = (config.data, config.export, config.render.extras)
+    formats = [*formats_of(*asked), *(one for one in failures_of(*asked) if one.record_file.exists())]
     stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
     files = [
         *(config.data / name for name in names),
@@ -105,6 +106,13 @@ def of_summary(config: Config) -> Memory:
     settings = [settings_of(config.demos), settings_of(config.plan), settings_of(config.replay)]
     made_by = fingerprint("pictures", *settings, _contents(files, config.data)) if frames.untouched() else None
     return Memory(config.data, "summary", made_by, ["sheets", "previews"])
+
+
+def of_previews(config: Config) -> Memory:
+    """Of the previews alone, which show no episode: what is kept and exported changes none."""
+    settings = [settings_of(config.demos), settings_of(config.plan), settings_of(config.replay)]
+    made_by = fingerprint("pictures", *settings, _contents([config.data / "inputs.json"], config.data))
+    return Memory(config.data, "previews", made_by, ["previews"])
 
 
 def of_report(config: Config) -> Memory:

@@ -39,7 +39,7 @@ def settings(config: Config) -> dict[str, Any]:
     sections = {
         name: settings_of(getattr(config, name)) for name in ("demos", "plan", "replay", "filter", "render", "export")
     }
-    return {**sections, "export": {"where": None, "lerobot_v21": None, **sections["export"]}}
+    return {**sections, "export": {"where": None, "lerobot_v21": None, "failures": False, **sections["export"]}}
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any
 
 from pipeline.config import Config, FilterConfig
 from pipeline.errors import PipelineError
+from pipeline.export_config import ExportConfig
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.seeding import digest
@@ -21,6 +22,11 @@ LEFT_OUT = "left_out"
 """The reason why an episode that reached its goal is in no dataset: ``export.where`` does not name it."""
 
 
+MISSED = ("goal_not_reached", "goal_lost")
+"""The reasons of failures: what was simulated to the end, and missed its goal. Good demonstrations do too: see the
+yields in docs/axes.md."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """The plan, and what replay and rendering made of it.
@@ -30,32 +36,35 @@ class Outcome:
         trajectories: trajectory id to its row in the table of replays.
         frames: trajectory id to what is stored of its frames.
         verdicts: episode id to verdict.
+        missed: ids of the failures to write, in the order of the plan; none unless they are asked for.
     """
 
     rows: Sequence[plan.Row]
     trajectories: Mapping[str, Mapping[str, Any]]
     frames: Mapping[str, Shown]
     verdicts: Mapping[str, Verdict]
+    missed: Sequence[str] = ()
 
     @cached_property
     def kept(self) -> list[str]:
-        """Ids of the kept episodes, in the order they are written: shuffled, because readers walk shards in order."""
-        ids = [row.episode_id for row in self.rows if self.verdicts[row.episode_id].kept]
-        return sorted(ids, key=lambda episode_id: digest("order", episode_id))
+        """Ids of the kept episodes, in the order they are written."""
+        return shuffled(row.episode_id for row in self.rows if self.verdicts[row.episode_id].kept)
 
     @cached_property
     def row_of(self) -> dict[str, plan.Row]:
         """Episode id to its row of the plan."""
         return {row.episode_id: row for row in self.rows}
 
-    def contents(self) -> dict[str, str]:
-        """Kept episode id to a short name of its content: equal names, equal bytes in a dataset."""
-        named = {}
-        for episode_id in self.kept:
-            row = self.row_of[episode_id]
-            frames = self.frames[row.trajectory_id]
-            named[episode_id] = digest(asdict(row), frames.made_by, frames.device, frames.replay_mode)[:16]
-        return named
+    def content(self, episode_id: str) -> str:
+        """A short name of a rendered episode's content: equal names, equal bytes in a dataset."""
+        row = self.row_of[episode_id]
+        frames = self.frames[row.trajectory_id]
+        return digest(asdict(row), frames.made_by, frames.device, frames.replay_mode)[:16]
+
+
+def shuffled(episode_ids: Iterable[str]) -> list[str]:
+    """In the order in which episodes are written, because readers walk shards in order."""
+    return sorted(episode_ids, key=lambda episode_id: digest("order", episode_id))
 
 
 def replayed(
@@ -115,11 +124,18 @@ def read(config: Config) -> Outcome:
         for row in rows:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
                 judged[row.episode_id] = Verdict(False, LEFT_OUT)
-    missing = dict.fromkeys(
-        store.folder(row.trajectory_id) for row in rows if judged[row.episode_id].kept and not rendered(row, frames)
-    )
+    failures = [row for row in missed(rows, judged, config.export) if row.episode_id not in rejected]
+    kept = [row for row in rows if judged[row.episode_id].kept]
+    missing = dict.fromkeys(store.folder(row.trajectory_id) for row in (*kept, *failures) if not rendered(row, frames))
     _refuse_missing([*missing], "render")
-    return Outcome(rows, trajectories, frames, judged)
+    return Outcome(rows, trajectories, frames, judged, [row.episode_id for row in failures])
+
+
+def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
+    """The failures that are asked for, by the verdicts of ``plan.select``."""
+    found = [row for row in rows if export.failures and judged[row.episode_id].reason in MISSED]
+    where = export.where
+    return [row for row in found if where is None or where.takes(row.axis, row.component, row.level, row.suite)]
 
 
 def rendered(row: plan.Row, frames: Mapping[str, Shown]) -> bool:

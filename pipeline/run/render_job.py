@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from pipeline.compute.pool import LOST
 from pipeline.config import RenderConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
+from pipeline.physics.quality import measure
 from pipeline.planning.plan import Row
 from pipeline.planning.streams import Stream
 from pipeline.rendering.last_scene import scene_of_process
@@ -59,6 +60,8 @@ class RenderJob:
         parts, missing = self._stored()
         if missing:
             task = find_task(self.row.suite, self.row.task)
+            if trajectory.quality is None:  # Of what missed its goal, only rendering asks for it.
+                trajectory = replace(trajectory, quality=measure(trajectory, task))
             parts = [*parts, render(trajectory, task, missing, self.config, scene_of_process())]
         self._save(parts)
 

@@ -15,7 +15,7 @@ from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row, select
 from pipeline.planning.streams import Stream, streams_of
-from pipeline.run.outcome import rejections
+from pipeline.run.outcome import MISSED, rejections
 from pipeline.stores.frame_store import FrameStore, file_name, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
@@ -47,7 +47,7 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
 
 
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, workers: Workers) -> set[str]:
-    """Render the streams of every kept episode that ``folder`` does not hold yet.
+    """Render the streams of every kept episode, and of failures where asked for, that ``folder`` does not hold yet.
 
     Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing that
     can be made from the trajectories that are there.
@@ -64,7 +64,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in store.refresh().items() if row["device"] == device}
-        needed = _needed(rows, judged, rejections(rows, shown_of(stored)))
+        needed = _needed(rows, judged, rejections(rows, shown_of(stored)), MISSED if config.export.failures else ())
         missing = {name: portion for name, portion in needed.items() if name not in stored}
         if not missing:
             return set(needed)
@@ -91,8 +91,17 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
             scene_of_process().close()
 
 
-def _needed(rows: Sequence[Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str]) -> dict[str, Portion]:
-    """Name of each file that the plan needs to what is in it, as far as verdicts and rejections are known."""
+def _needed(
+    rows: Sequence[Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str], failures: Collection[str]
+) -> dict[str, Portion]:
+    """Name of each file that the plan needs to what is in it, as far as verdicts and rejections are known.
+
+    Args:
+        rows: the plan.
+        judged: trajectory id to its verdict.
+        rejected: episode id to the reason why its frames were rejected.
+        failures: reasons of dropped episodes that are rendered too.
+    """
     row_of = {row.trajectory_id: row for row in rows}
     planned: dict[str, dict[str, Stream]] = {trajectory_id: {} for trajectory_id in row_of}
     needed: dict[str, set[str]] = {}
@@ -102,7 +111,7 @@ def _needed(rows: Sequence[Row], judged: Mapping[str, Verdict], rejected: Mappin
         planned[row.trajectory_id] |= shown
         verdict = outcome[row.episode_id]
         # A rejected stream stays needed: without it, its episode would be tried again.
-        if verdict.kept or verdict.reason == rejected.get(row.episode_id):
+        if verdict.kept or verdict.reason in (rejected.get(row.episode_id), *failures):
             needed.setdefault(row.trajectory_id, set()).update(shown)
     return {
         file_name(trajectory_id, [stream.stream_id for stream in portion]): (row_of[trajectory_id], portion)

@@ -15,7 +15,7 @@ from pipeline.config import FilterConfig
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
 from pipeline.tables import columns_of
-from pipeline.types import Quality, Scene, Trajectory, Verdict
+from pipeline.types import Push, Quality, Scene, Trajectory, Verdict
 
 
 class TrajectoryStore(Store):
@@ -59,6 +59,9 @@ class TrajectoryStore(Store):
             "gripper": trajectory.scene.gripper,
             "posture_rad": trajectory.scene.posture_rad,
         }
+        if trajectory.scene.push is not None:
+            # Others' files stay what they were before there were pushes.
+            attributes["push"] = trajectory.scene.push
         with self.created(trajectory.trajectory_id, attributes) as file:
             file["model_xml"] = np.frombuffer(portable(trajectory.model_xml).encode(), np.uint8)
             file["start"] = trajectory.scene.state
@@ -74,12 +77,14 @@ class TrajectoryStore(Store):
         """
         with self.opened(trajectory_id) as file:
             posture_rad = file.attributes["posture_rad"]
+            push = file.attributes.get("push")
             scene = Scene(
                 model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
                 state=file.array("start"),
                 resolved=json.loads(file.attributes["resolved"]),
                 gripper=file.attributes["gripper"],
                 posture_rad=None if posture_rad is None else tuple(posture_rad),
+                push=None if push is None else Push(push[0], tuple(push[1]), *push[2:]),
             )
             return Trajectory(
                 trajectory_id=trajectory_id,

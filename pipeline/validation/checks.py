@@ -139,7 +139,7 @@ def wording(case: Case) -> Iterator[Fault]:
 def provenance(case: Case) -> Iterator[Fault]:
     """The manifest's provenance, but for this project's version: a manifest is made anew where a dataset stays."""
     for copy in case.copies:
-        for column in SCHEMA.provenance:
+        for column in case.made.provenance:
             found, expected = copy.episode.provenance.get(column), case.row[column]
             if found != expected and column != OWN_VERSION:
                 yield case.finding(copy.dataset, f"{column} is {found!r}", repr(expected))
@@ -225,14 +225,15 @@ def gripper(case: Case) -> Iterator[Fault]:
 
 
 def flags(case: Case) -> Iterator[Fault]:
-    """The first and the last step marked as such, and a reward for the last alone, where a dataset has such marks."""
+    """Where a dataset has such marks: the first and the last step, and a reward for the last of a success alone."""
     for copy in case.copies:
         step = np.arange(len(copy))
         first, last = step == 0, step == len(step) - 1
+        success = last & case.row["kept"]
         yield from _marked(
             case,
             copy,
-            {"is_first": first, "is_last": last, "is_terminal": last, "reward": last, "discount": step >= 0},
+            {"is_first": first, "is_last": last, "is_terminal": success, "reward": success, "discount": step >= 0},
         )
 
 

@@ -12,12 +12,11 @@ from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
 from pipeline.libero.tasks import SUITES, find_task
 from pipeline.planning.plan import twins
+from pipeline.run.outcome import MISSED
 from pipeline.run.replay_job import ReplayJob
 from pipeline.types import Task
 
 LAYOUT = f"<suite>/<task>_demo.hdf5, with a suite of {', '.join(SUITES)}"
-MISSES = ("goal_not_reached", "goal_lost")
-"""What also happens to good demonstrations: see the yields in docs/axes.md."""
 
 
 @dataclass
@@ -114,8 +113,8 @@ class _FileJob:
         count = min(self.replays, len(index.entries))
         chosen = [index.entries[round(k * (len(index.entries) - 1) / max(count - 1, 1))] for k in range(count)]
         reasons = self._replayed(chosen)
-        all_miss = all(reason in MISSES for reason in reasons.values())
-        missed = [] if all_miss else [entry.demo_id for entry, reason in reasons.items() if reason in MISSES]
+        all_miss = all(reason in MISSED for reason in reasons.values())
+        missed = [] if all_miss else [entry.demo_id for entry, reason in reasons.items() if reason in MISSED]
         for entry, reason in reasons.items():
             if reason != "kept" and entry.demo_id not in missed:
                 where = f"{self.root / entry.source.split()[0]} data/{entry.key}"

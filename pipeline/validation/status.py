@@ -12,7 +12,7 @@ from rich.table import Table
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
-from pipeline.formats.registry import formats_of
+from pipeline.formats.registry import failures_of, formats_of
 from pipeline.planning import plan
 from pipeline.run import cleaning, export, finished, inputs, outcome
 from pipeline.run.remake import outdated
@@ -79,7 +79,9 @@ def _steps(
     if needed := plan.pending(rows, verdicts, rejected):
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
     judged = plan.select(rows, verdicts, rejected)
-    if missing := [row for row in rows if judged[row.episode_id].kept and not outcome.rendered(row, frames)]:
+    shown = [row for row in rows if judged[row.episode_id].kept]
+    shown += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
+    if missing := [row for row in shown if not outcome.rendered(row, frames)]:
         yield "render", f"the frames of {len(missing)} episodes are not there" + _of(made_anew, "files of frames")
     if needed or missing or of_plan:
         yield "exports and all that follows", "their episodes are not all there" if needed or missing else "a new plan"
@@ -89,9 +91,12 @@ def _steps(
 
 def _follow(config: Config) -> Iterator[tuple[str, str]]:
     """The stages after the frames."""
-    episodes = export.kept_episodes(config)
+    kept, failed = export.kept_episodes(config), export.failed_episodes(config)
+    sets = (config.data, config.export, config.render.extras)
     stale = False
-    for one in formats_of(config.data, config.export, config.render.extras):
+    datasets = [(one, kept) for one in formats_of(*sets)]
+    datasets += [(one, failed) for one in failures_of(*sets) if failed.ids]
+    for one, episodes in datasets:
         if not export.untouched(one):
             yield f"export_{one.stage_record.stem}", f"{one.title}: there is no dataset, or files of it have changed"
             stale = True

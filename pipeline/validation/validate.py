@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,17 @@ from pipeline.compute.pool import Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json, scratch
+from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
-from pipeline.formats.registry import formats_of
+from pipeline.formats.registry import failures_of, formats_of
+from pipeline.libero.tasks import find_task
+from pipeline.physics.quality import measure
 from pipeline.rendering.last_scene import scene_of_process
-from pipeline.run import manifest
+from pipeline.run import manifest, outcome
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.types import Extra
 from pipeline.validation import run_checks
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import rendered, witnesses
@@ -48,9 +52,11 @@ class Results:
         self.checked[check] += checked
         self.findings[check] += found
 
-    def add(self, other: Results) -> None:
+    def add(self, other: Results, within: str = "") -> None:
+        """Take over what others came to; ``within`` comes before the names of their datasets."""
         for check, checked in other.checked.items():
-            self.note(check, other.findings[check], checked)
+            found = [replace(fault, dataset=within + fault.dataset) for fault in other.findings[check]]
+            self.note(check, found, checked)
 
 
 def validate(config: Config, workers: Workers) -> dict[str, Any]:
@@ -68,29 +74,16 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
     kept = {row["episode_id"]: row for row in rows if row["kept"]}
     total = Results()
     total.note("counts", run_checks.counts(data, rows), len(rows))
+    asked = (data, config.export, config.render.extras)
     with scratch(data / ".work" / "validate") as cache:
-        opened = []
-        for one in formats_of(data, config.export, config.render.extras):
-            for faults in workers(Written.faults, one.written(), f"{one.title} checksums"):
-                total.note("checksums", faults)
-            if any(fault.dataset == one.name for fault in total.findings["checksums"]):
-                # What damaged files seem to hold is of no interest, and may be anything.
-                continue
-            try:
-                # In a worker, which reads the episodes with the same packages later.
-                (found,) = workers(partial(_as_a_whole, kept, cache), [one], f"{one.title} as a whole")
-            except PipelineError as error:
-                total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
-                continue
-            opened.append(one)
-            total.note("format", [fault for check, fault in found if check == "format"])
-            total.note("ids", [fault for check, fault in found if check == "ids"], len(kept))
-            total.note("readable", [fault for check, fault in found if check == "readable"], 0)
-        again = frozenset(witnesses(rows))
-        job = EpisodesJob(config, data, opened, cache, again)
         try:
-            for results in workers(job, _slices(kept, again, opened), "validate"):
-                total.add(results)
+            job = EpisodesJob(config, data, formats_of(*asked), cache, frozenset(witnesses(rows)))
+            total.add(_datasets(job, kept, workers))
+            if failures := failures_of(*asked) if (missed := set(outcome.read(config).missed)) else []:
+                places = registry.places(failures)
+                failed = {one: row | places.get(one, {}) for row in rows if (one := row["episode_id"]) in missed}
+                job = EpisodesJob(config, data, failures, cache, frozenset([*failed][:1]), ("outcome",))
+                total.add(_datasets(job, failed, workers), within=f"{registry.FAILURES}/")
         finally:
             scene_of_process().close()
     damaged = {fault.dataset for check in ("readable", "checksums") for fault in total.findings[check]}
@@ -104,6 +97,30 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
         check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
         for check, checked in total.checked.items()
     }
+
+
+def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
+    """The checks of some datasets, each as a whole, and of their episodes; ``job`` has all datasets."""
+    total, opened = Results(), []
+    for one in job.formats:
+        for faults in workers(Written.faults, one.written(), f"{one.title} checksums"):
+            total.note("checksums", faults)
+        if any(fault.dataset == one.name for fault in total.findings["checksums"]):
+            # What damaged files seem to hold is of no interest, and may be anything.
+            continue
+        try:
+            # In a worker, which reads the episodes with the same packages later.
+            (found,) = workers(partial(_as_a_whole, episodes, job.cache), [one], f"{one.title} as a whole")
+        except PipelineError as error:
+            total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
+            continue
+        opened.append(one)
+        total.note("format", [fault for check, fault in found if check == "format"])
+        total.note("ids", [fault for check, fault in found if check == "ids"], len(episodes))
+        total.note("readable", [fault for check, fault in found if check == "readable"], 0)
+    for results in workers(replace(job, formats=opened), _slices(episodes, job.witnesses, opened), "validate"):
+        total.add(results)
+    return total
 
 
 def _as_a_whole(kept: Mapping[str, Row], cache: Path, one: Format[Any]) -> list[tuple[str, Fault]]:
@@ -135,6 +152,7 @@ class EpisodesJob:
         formats: the datasets that can be opened.
         cache: folder for files that reading them needs.
         witnesses: ids of the episodes to render anew.
+        extras: ``outcome`` for failures.
     """
 
     config: Config
@@ -142,6 +160,7 @@ class EpisodesJob:
     formats: Sequence[Format[Any]]
     cache: Path
     witnesses: frozenset[str]
+    extras: tuple[Extra, ...] = ()
 
     def __call__(self, rows: Sequence[Row]) -> Results:
         results = Results()
@@ -164,12 +183,15 @@ class EpisodesJob:
         results.note("readable", unreadable)
         language = self.config.plan.axes.language
         try:
-            made = EpisodeLoader(self.data, self.config.render)(episode_id)
+            made = EpisodeLoader(self.data, self.config.render, self.extras)(episode_id)
             trajectory = TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"])
         except PipelineError as error:
             results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])
             return
         results.note("stored", [])
+        if "outcome" in self.extras:  # The manifest has figures of kept episodes alone.
+            quality = measure(trajectory, find_task(row["suite"], row["task"]))
+            row = {**row, **asdict(quality), "success": row["kept"]}
         case = Case(
             row=row,
             made=made,

@@ -10,7 +10,7 @@ from pipeline.compute.pool import Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.formats.read_back import Written
-from pipeline.formats.registry import formats_of
+from pipeline.formats.registry import failures_of, formats_of
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.store import Store
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -30,14 +30,16 @@ def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
     }
     for name, store in stores.items():
         results[name] = _result(workers(_Reader(store), store.names(), name))
-    for one in formats_of(config.data, config.export, config.render.extras):
+    asked = (config.data, config.export, config.render.extras)
+    for one in (*formats_of(*asked), *(one for one in failures_of(*asked) if one.record_file.exists())):
+        name = one.folder.relative_to(config.data).as_posix()
         try:
             files = one.written()
         except PipelineError as error:
-            results[one.name] = {"checked": 0, "damaged": [str(error)]}
+            results[name] = {"checked": 0, "damaged": [str(error)]}
             continue
         faults = workers(Written.faults, files, one.title)
-        results[one.name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
+        results[name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
     return results
 
 

@@ -200,10 +200,11 @@ if __name__ == "__main__":
         optimizer.step()
         scheduler.step()
         step += 1
-    make_dataset_from_rlds("{NAME}_10", arguments["--data_root_dir"])
+    statistics = make_dataset_from_rlds("{NAME}_10", arguments["--data_root_dir"])
     save_dataset_statistics({{"{NAME}_spatial": 1, "{NAME}_10": 2}}, Path("."))
     Path("seen.json").write_text(json.dumps({{
         "arguments": arguments,
+        "statistics": statistics,
         "weight_decay": optimizer.param_groups[0]["weight_decay"],
         "rates": rates,
         "configs": configs.OXE_DATASET_CONFIGS,
@@ -271,6 +272,29 @@ def test_openvla_oft_resumes_by_its_arguments_and_changes_no_file_of_the_run(tra
     sha256 = tiny_recipe(tmp_path)["dataset"]["sha256"]["value"]
     known_by = f"counts and sizes of {NAME}_10" + "state" + sha256
     assert statistics.stem.endswith(hashlib.sha256(known_by.encode()).hexdigest())
+
+
+@pytest.mark.slow
+def test_openvla_oft_continues_under_the_statistics_of_a_checkpoint(trained: Path, tmp_path: Path) -> None:
+    checkout, script = stand_in(tmp_path / "oft", OFT), trained / "finetune" / "run_openvla_oft.py"
+    file = tmp_path / "dataset_statistics.json"
+    former = {"action": {"q01": [0.5]}, "proprio": {"q01": [0.25]}, "num_trajectories": 432}
+    file.write_text(json.dumps({f"{suite}_no_noops": former for suite in SUITES}))
+    seen = run(checkout, script, "--statistics", str(file), "--max_steps", "3")
+    assert seen["statistics"] == former | {"num_trajectories": 1}
+    assert "--statistics" not in seen["arguments"]
+    file.write_text(json.dumps({"bridge": former}))
+    done = subprocess.run(
+        [sys.executable, str(script), "--statistics", str(file)],
+        cwd=checkout,
+        env={**os.environ, "PYTHONPATH": str(checkout), "HOME": str(checkout / "home")},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "has no statistics for libero_" in done.stderr
+    assert "it has: bridge" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def demonstration(episode_id: str) -> Episode:
         action=action,
         state=np.resize(small.state, (steps, 8)),
         joint_state=np.resize(small.joint_state, (steps, 7)),
-        frames={view: frames[:1] * steps for view, frames in small.frames.items()},
+        frames={view: [frames[0]] * steps for view, frames in small.frames.items()},
     )
 
 
@@ -75,7 +75,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     v21 = LeRobotV21Config(name=NAME, convention="openpi")
     rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
     for target in (Rlds(data, rlds), LeRobot(data, lerobot), LeRobotV21(data, v21)):
-        export(target, Episodes(known, made.__getitem__), loop)  # type: ignore[arg-type]
+        export(target, Episodes(known, made.__getitem__), loop)
     statistics = motion_statistics.openvla([(one.action, one.state) for one in made.values()])
     (data / "dataset_statistics.json").write_text(json.dumps({SET: statistics}))
     recipe.write({}, data, ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=v21))

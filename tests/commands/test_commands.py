@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
-from conftest import IN_SCRIPTS, REPOSITORY, dvc, in_a_clone, rot, tiny_config
+from conftest import IN_SCRIPTS, REPOSITORY, dvc, rot, tiny_config
 
 from pipeline.__main__ import main, parser
 from pipeline.libero.tasks import SUITES, tasks
@@ -164,6 +164,7 @@ def test_run_elsewhere_with_a_subset_in_one_format(clone: Path, tmp_path: Path) 
     shutil.move(clone / "data" / "tiny", elsewhere / "tiny")
     (clone / "params.yaml").write_text("run: other\ndata: data\n")
     frames = {file: file.read_bytes() for file in (elsewhere / "tiny/frames").rglob("*.h5")}
+    previews = {file: file.stat().st_mtime_ns for file in (elsewhere / "tiny/previews").rglob("*")}
     lerobot = (elsewhere / "tiny/lerobot.json").read_bytes()
     where = {"axis": ["clean", "camera"], "suite": ["libero_goal"]}
     export = {"rlds": {"name": "libero_tiny"}, "lerobot": None, "where": where}
@@ -187,6 +188,7 @@ def test_run_elsewhere_with_a_subset_in_one_format(clone: Path, tmp_path: Path) 
     assert all(row["lerobot_episode_index"] is None for row in rows)
     assert [folder.name for folder in (elsewhere / "tiny/rlds").iterdir()] == ["libero_tiny_goal"]
     assert {file: file.read_bytes() for file in frames} == frames
+    assert {file: file.stat().st_mtime_ns for file in previews} == previews != {}, "they show no episode"
     assert (elsewhere / "tiny/lerobot.json").read_bytes() == lerobot, "finished work stays until it is cleaned"
     recipe = yaml.safe_load((elsewhere / "tiny/finetune/finetune.yaml").read_text())
     assert list(recipe["clients"]) == ["openvla_oft"]
@@ -207,15 +209,17 @@ def test_run_elsewhere_with_a_subset_in_one_format(clone: Path, tmp_path: Path) 
     assert "python -m pipeline run configs/tiny.yaml" in mistaken.stdout + mistaken.stderr
 
 
-@pytest.mark.slow
-def test_run_goes_on_after_it_was_stopped(short_demos: Path, tmp_path: Path) -> None:
-    clone = tmp_path / "clone"
-    in_a_clone(tiny_config(short_demos) | {"plan": {"episodes": {"language": 2}}}, clone)
+def test_run_goes_on_after_it_was_stopped(clone: Path) -> None:
+    """A run that has yet to plan, to replay a demonstration and to write its report."""
+    plan, report = clone / "data/tiny/plan.parquet", clone / "data/tiny/report.html"
+    lost = next((clone / "data/tiny/trajectories").glob("*.h5"))
+    trajectory = lost.read_bytes()
+    for file in (plan, report, lost):
+        file.unlink()
     command = [sys.executable, "-m", "pipeline", "run"]
     running = subprocess.Popen(
         command, cwd=clone, env=IN_SCRIPTS, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
-    plan = clone / "data" / "tiny" / "plan.parquet"
     while not plan.exists() and running.poll() is None:
         time.sleep(0.05)
     running.send_signal(signal.SIGTERM)
@@ -225,7 +229,8 @@ def test_run_goes_on_after_it_was_stopped(short_demos: Path, tmp_path: Path) -> 
     (clone / "dvc.lock").write_text("stages:\n  plan: [")
     done = call(clone, "run")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert (clone / "data/tiny/report.html").is_file()
+    assert report.is_file()
+    assert lost.read_bytes() == trajectory
 
 
 def _in(folder: Path, process: Path) -> bool:

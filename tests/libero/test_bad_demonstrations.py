@@ -78,7 +78,8 @@ BAD: dict[str, tuple[Callable[[hdf5.Recording], hdf5.Recording], str, str]] = {
 }
 
 
-def good_recording() -> hdf5.Recording:
+@pytest.fixture(scope="module")
+def good() -> hdf5.Recording:
     environment, demo = Environment(STOVE), starter_demo(STOVE)
     model_xml = environment.place_fixtures(0)
     environment.restore(recorded_start(demo, model_xml))
@@ -91,10 +92,9 @@ def good_recording() -> hdf5.Recording:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(good: hdf5.Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One task's file: the first and the last demonstration are good, the others are those of ``BAD``."""
     root = tmp_path_factory.mktemp("bad")
-    good = good_recording()
     last = replace(good, actions=good.actions * 0.99)
     recordings = [good, *(spoil(good) for spoil, _, _ in BAD.values()), last]
     hdf5.write(root / STOVE.suite / f"{STOVE.name}_demo.hdf5", STOVE, recordings)
@@ -139,8 +139,7 @@ def test_each_bad_demonstration_is_a_verdict(
 
 
 @pytest.mark.slow
-def test_a_bad_scene_leaves_no_trace_in_its_worker() -> None:
-    good = good_recording()
+def test_a_bad_scene_leaves_no_trace_in_its_worker(good: hdf5.Recording) -> None:
     environment = Environment(STOVE)
     reached = []
     for _ in range(2):

@@ -23,7 +23,7 @@ from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
-from pipeline.physics.environment import Environment
+from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay, verdict
 from pipeline.planning import plan
 from pipeline.run.replay_job import ReplayJob
@@ -104,7 +104,7 @@ def test_same_bytes_first_or_tenth_and_in_a_fresh_process(short_demos: Path) -> 
 
 
 def test_burner_does_not_stay_lit(short_demos: Path) -> None:
-    environment = Environment(STOVE)
+    environment = shared(STOVE)
     first = replayed(short_demos, STOVE, environment)
     lit = first.site_alpha[-1] != first.site_alpha[0]
     assert lit.sum() == 1, "the burner is the one site whose opacity changes"
@@ -158,12 +158,11 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
     # Two pauses: at the start, where the gripper stays as it is, and on the way.
     actions[[0, 1, 5, 6], :6], actions[[0, 1, 5, 6], 6] = 0.0, actions[4, 6]
     demo = replace(demo, actions=actions)
-    trajectory = replay(Environment(STOVE), demo, "t", ReplayConfig(noops=noops, settle_steps=0), (PathSeen(level=1),))
+    trajectory = replay(shared(STOVE), demo, "t", ReplayConfig(noops=noops, settle_steps=0), (PathSeen(level=1),))
     assert len(trajectory.actions) == {"drop": 8, "trim_ends": 10, "keep": 12}[noops]
     assert np.array_equal(json.loads(trajectory.resolved)["path"], trajectory.states)
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_what_misses_once_settled_is_tracked_along_its_unsettled_replay(tmp_path: Path) -> None:
     """Of a starter demonstration no states are recorded that could be followed instead."""

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import BOWL, MILK, STOVE, starter_demo
+from conftest import MILK, STOVE, starter_demo
 
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import find_task
@@ -29,7 +29,7 @@ def steps(environment: Environment, actions: Floats, liberos: bool) -> tuple[Flo
     return np.stack(states), np.stack(alphas), succeeded
 
 
-@pytest.mark.parametrize("task", [STOVE, BOWL, MILK], ids=lambda task: task.name)
+@pytest.mark.parametrize("task", [STOVE, MILK], ids=lambda task: task.name)
 def test_whole_demonstrations_are_liberos_bit_for_bit(task: Task, whole: dict[Task, Trajectory]) -> None:
     ours = whole[task]
     environment = Environment(task)
@@ -50,7 +50,7 @@ def test_actions_beyond_their_limits_are_liberos_bit_for_bit(task: Task) -> None
     environment, demo = Environment(task), starter_demo(task)
     model_xml = environment.place_fixtures(0)
     # Four times too large: the controller clips, and the arm meets its joint limits and whatever stands in its way.
-    actions = demo.actions[:60] * [4, 4, 4, 4, 4, 4, 1]
+    actions = demo.actions[:30] * [4, 4, 4, 4, 4, 4, 1]
     assert (np.abs(actions[:, :6]) > 1).any(axis=1).mean() > 0.5
     results = []
     for liberos in (False, True):

@@ -47,7 +47,7 @@ def test_the_same_pixels_with_less_drawn(shadows: bool) -> None:
     left_out, reflecting = 0, []
     opened = Renderer(scene(shadows))
     with both_ways(opened) as (ours, plain):
-        for _ in range(40):
+        for _ in range(20):
             quat_wxyz = rng.normal(size=4)
             opened.data.mocap_quat[0] = quat_wxyz / np.linalg.norm(quat_wxyz)
             mujoco.mj_forward(opened.model, opened.data)
@@ -59,7 +59,7 @@ def test_the_same_pixels_with_less_drawn(shadows: bool) -> None:
     if shadows:
         assert left_out == 0, "what is not in the picture may cast a shadow into it"
     else:
-        assert left_out > 40 * GEOMS / 2
+        assert left_out > 20 * GEOMS / 2
 
 
 @pytest.mark.slow
@@ -70,7 +70,7 @@ def test_the_same_pixels_in_every_arena(arena: str, caplog: pytest.LogCaptureFix
     rng = seeding.rng("test_culling", arena)
     left_out = 0
     with both_ways(opened) as (ours, plain):
-        for number, camera in product(range(5), (view.camera for view in SCHEMA.views.values())):
+        for number, camera in product(range(3), (view.camera for view in SCHEMA.views.values())):
             # The first seven are the arm's.
             opened.data.qpos[:7] += rng.uniform(-0.3, 0.3, 7)
             opened.model.light_castshadow[:] = number % 2

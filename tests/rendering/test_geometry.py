@@ -40,10 +40,10 @@ from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Extra, Rendered, Task, Trajectory
+from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
 
-EXTRAS: tuple[Extra, ...] = ("depth", "object_poses", "segmentation")
+EXTRAS: tuple[RenderedExtra, ...] = ("depth", "object_poses", "segmentation")
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
 DIM = LightPerturbation(component="diffuse", level=1, diffuse_scale_rgb=(0.9, 0.9, 0.9))
 STREAMS = {

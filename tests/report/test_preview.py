@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import pytest
-from conftest import BOWL, MILK, REPOSITORY, STOVE, starter_demo
+from conftest import BOWL, MILK, REPOSITORY, starter_demo
 from PIL import Image
 
 from pipeline import __main__ as command_line
@@ -24,7 +24,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.images.jpeg import decode
 from pipeline.libero.demonstrations import DemoEntry
-from pipeline.physics.environment import Environment
+from pipeline.physics.environment import shared
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.rendering.last_scene import scene_of_process
@@ -193,7 +193,7 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
 
 
 def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
-    environment = Environment(STOVE)
+    environment = shared(BOWL)
     environment.restore(stage.scene)
     environment.settle(10)
     begun = Trajectory(
@@ -205,10 +205,9 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
         site_alpha=np.stack([environment.site_alpha] * 2),
         verdict=Verdict(True, "kept"),
     )
-    environment.close()
     shown = stage.frames(VIEWS)
     streams = streams_of("[]")
-    rendered = render(begun, STOVE, list(streams.values()), STARTER.render, stage.opened)
+    rendered = render(begun, BOWL, list(streams.values()), STARTER.render, stage.opened)
     stage.opened.close()
     for view, frame in zip(VIEWS, shown, strict=True):
         compressed = decode(rendered.streams[streams[view].stream_id][0])
@@ -219,9 +218,11 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
 def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sheet"
     monkeypatch.chdir(REPOSITORY)
-    monkeypatch.setattr("sys.argv", ["pipeline", "preview", "libero_goal/turn_on*", "language", "--out", str(out)])
+    monkeypatch.setattr(
+        "sys.argv", ["pipeline", "preview", "libero_goal/put_the_bowl_on_the_p*", "language", "--out", str(out)]
+    )
     assert command_line.main() == 0
-    assert "libero_goal/turn_on_the_stove" in capsys.readouterr().out
+    assert f"libero_goal/{BOWL.name}" in capsys.readouterr().out
     with Image.open(out) as sheet:
         assert sheet.format == "PNG"
         assert sheet.width == 4 * (preview.SIDE_PX[1] + sheets.GAP_PX) + sheets.GAP_PX
@@ -264,7 +265,7 @@ def test_an_overview_shows_the_strongest_draw_that_the_scene_takes(
 @pytest.mark.slow
 def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(preview, "VARIANTS", 2)
-    tasks = tuple(f"{task.suite}/{task.name}" for task in (STOVE, MILK))
+    tasks = tuple(f"{task.suite}/{task.name}" for task in (BOWL, MILK))
     config = STARTER.model_copy(
         update={
             "demos": STARTER.demos.model_copy(update={"tasks": tasks}),
@@ -272,7 +273,7 @@ def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
         }
     )
     drawn = preview.for_run(config, tmp_path / "previews", loop)
-    assert drawn == {suite: tmp_path / "previews" / suite for suite in (STOVE.suite, MILK.suite)}
+    assert drawn == {suite: tmp_path / "previews" / suite for suite in (BOWL.suite, MILK.suite)}
     for folder in drawn.values():
         with Image.open(folder / "language.png") as sheet:
             assert np.asarray(sheet).std() > 20

@@ -15,9 +15,9 @@ from pipeline.config import Config, load
 from pipeline.files import edition
 from pipeline.formats.registry import formats_of
 from pipeline.run import export
-from pipeline.run.finished import Memory, of_report, of_summary, of_validate
+from pipeline.run.finished import Memory, of_previews, of_report, of_summary, of_validate
 
-REMEMBERED: tuple[Callable[[Config], Memory], ...] = (of_validate, of_summary, of_report)
+REMEMBERED: tuple[Callable[[Config], Memory], ...] = (of_validate, of_summary, of_report, of_previews)
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def config(clone: Path) -> Config:
 
 
 def hold(config: Config) -> list[bool]:
-    """Whether ``validate``, ``summary`` and ``report`` would do nothing."""
+    """Whether ``validate``, ``summary`` and ``report`` would do nothing, and ``summary`` would leave the previews."""
     return [of(config).holds() for of in REMEMBERED]
 
 
@@ -43,10 +43,13 @@ def largest(folder: Path) -> Path:
 
 
 def test_a_finished_run_is_remembered_until_something_changes(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert hold(config) == [True, True, True]
+    assert hold(config) == [True, True, True, True]
     elsewhere = config.model_copy(update={"compute": config.compute.model_copy(update={"workers": 3})})
-    assert hold(elsewhere) == [True, True, True], "where it is computed changes nothing"
-    cases: dict[identity.Step, list[bool]] = {"checks": [False, True, True], "pictures": [True, False, False]}
+    assert hold(elsewhere) == [True, True, True, True], "where it is computed changes nothing"
+    cases: dict[identity.Step, list[bool]] = {
+        "checks": [False, True, True, True],
+        "pictures": [True, False, False, False],
+    }
     for step, expected in cases.items():
         with monkeypatch.context() as patch:
             identity._parts.cache_clear()
@@ -58,16 +61,16 @@ def test_a_finished_run_is_remembered_until_something_changes(config: Config, mo
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("rlds", [False, True, True]),
-        ("lerobot", [False, True, True]),
-        ("frames", [False, False, False]),
-        ("trajectories", [False, True, True]),
-        ("manifest.parquet", [False, False, False]),
-        ("counts.json", [False, True, True]),
-        ("validation.json", [False, True, True]),
-        ("sheets", [True, False, False]),
-        ("previews", [True, False, False]),
-        ("report.html", [True, True, False]),
+        ("rlds", [False, True, True, True]),
+        ("lerobot", [False, True, True, True]),
+        ("frames", [False, False, False, True]),
+        ("trajectories", [False, True, True, True]),
+        ("manifest.parquet", [False, False, False, True]),
+        ("counts.json", [False, True, True, True]),
+        ("validation.json", [False, True, True, True]),
+        ("sheets", [True, False, False, True]),
+        ("previews", [True, False, False, False]),
+        ("report.html", [True, True, False, True]),
     ],
 )
 def test_a_changed_file_is_noticed(config: Config, name: str, expected: list[bool]) -> None:

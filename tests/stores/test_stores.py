@@ -60,17 +60,28 @@ def rows(config: Config) -> list[plan.Row]:
 
 
 @pytest.fixture(scope="module")
-def replayed(config: Config, rows: list[plan.Row], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("replayed")
+def whole_replay(config: Config, rows: list[plan.Row], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("whole_replay")
     judged = Replays(config.demos, config.replay, folder, loop).of(rows)
     TrajectoryStore(folder).keep(judged)
     assert all(verdict.kept for verdict in judged.values())
     return folder
 
 
+@pytest.fixture(scope="module")
+def replayed(whole_replay: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same without what follows the first three steps: most tests render it."""
+    whole, store = TrajectoryStore(whole_replay), TrajectoryStore(tmp_path_factory.mktemp("replayed"))
+    (name,) = whole.names()
+    one = whole.load(name)
+    store.save(replace(one, states=one.states[:4], actions=one.actions[:3], site_alpha=one.site_alpha[:4]))
+    store.keep([name])
+    return store.root
+
+
 @pytest.fixture
-def trajectories(replayed: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(replayed, tmp_path / "trajectories"))
+def trajectories(whole_replay: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole_replay, tmp_path / "trajectories"))
 
 
 def test_the_table_spares_opening_the_files(replayed: Path, monkeypatch: pytest.MonkeyPatch) -> None:

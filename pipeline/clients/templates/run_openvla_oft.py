@@ -8,6 +8,10 @@ OFT always logs to Weights & Biases; offline it needs no account. With one, give
 NAME`` instead. Further arguments go to OFT's ``vla-scripts/finetune.py`` and win over the recipe, such as
 ``--dataset_name libero_perturbed_spatial`` for one suite, or ``--max_steps 20000``.
 
+To continue from a checkpoint that was trained on LIBERO, add ``--statistics CHECKPOINT/dataset_statistics.json``. Its
+action head gives actions in units of its own statistics; with others, the same outputs would be other movements. To
+begin from weights that were not trained on LIBERO, leave it out: then the statistics are those of these datasets.
+
 What OFT has no flag for is done here: the datasets and their mixture are registered, AdamW gets the recipe's weight
 decay (OFT leaves PyTorch's 0.01), a cosine with warm-up takes the place of OFT's step (whose own warm-up would undo
 any later decay), the statistics of a checkpoint are also named by suite, which is where OFT's evaluation looks, and
@@ -18,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import json
 import math
 import runpy
 import sys
@@ -63,10 +68,24 @@ def name_statistics_by_suite(suites: Mapping[str, str]) -> None:
     module.save_dataset_statistics = save_with_suites
 
 
-def keep_statistics_elsewhere(dataset_sha256: str) -> None:
+def statistics_of(file: Path, suites: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Each dataset to a checkpoint's statistics of actions and proprioception for its suite."""
+    stored = json.loads(file.read_text())
+    former = {}
+    for suite, name in suites.items():
+        # Published checkpoints name LIBERO's sets without no-ops.
+        key = next((key for key in (f"{suite}_no_noops", suite) if key in stored), None)
+        if key is None:
+            sys.exit(f"error: {file} has no statistics for {suite}\n  it has: {', '.join(stored)}")
+        former[name] = {part: stored[key][part] for part in ("action", "proprio")}
+    return former
+
+
+def keep_statistics_elsewhere(dataset_sha256: str, former: Mapping[str, Mapping[str, Any]]) -> None:
     """Have OFT's loader write ``dataset_statistics_<hash>.json`` to its cache folder: it would change the dataset's.
 
     OFT takes the file for another run's where sizes and counts are the same, so the manifest's hash goes into its name.
+    ``former`` statistics of a dataset take the place of its own; its counts, by which OFT weighs it, stay.
     """
     # The module that calls the function; it has imported it by name.
     module: Any = importlib.import_module(f"{DATASETS}.dataset")
@@ -75,7 +94,9 @@ def keep_statistics_elsewhere(dataset_sha256: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
 
     def get_dataset_statistics(dataset: Any, hash_dependencies: tuple[str, ...], save_dir: object = None) -> Any:
-        return compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
+        own = compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
+        # OFT passes the folder of the dataset's version.
+        return {**own, **former.get(Path(str(save_dir)).parent.name, {})}
 
     module.get_dataset_statistics = get_dataset_statistics
 
@@ -166,13 +187,18 @@ def prepare() -> None:
     yaml: Any = importlib.import_module("yaml")
     recipe = yaml.safe_load((HERE / "finetune.yaml").read_text())
     dataset, training = recipe["dataset"], recipe["training"]
-    given = sys.argv[1:]
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--statistics", type=Path)
+    own, given = parser.parse_known_args()
+    suites = dataset["suites"]["value"]
     # OFT takes its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" among the arguments.
     # Of two values the last counts; a warm-up of OFT's own would undo the cosine, so there is none.
     sys.argv = [SCRIPT, *arguments(recipe), *given, "--lr_warmup_steps", "0"]
     register(dataset["mixtures"]["value"])
-    name_statistics_by_suite(dataset["suites"]["value"])
-    keep_statistics_elsewhere(dataset["sha256"]["value"])
+    name_statistics_by_suite(suites)
+    keep_statistics_elsewhere(
+        dataset["sha256"]["value"], statistics_of(own.statistics, suites) if own.statistics else {}
+    )
     set_optimiser(
         training["weight_decay"]["value"],
         read_schedule(given, training["steps"]["value"], training["warmup_steps"]["value"]),

@@ -1,0 +1,146 @@
+"""The tasks as an environment of Gymnasium, which observes and acts as lerobot 0.6's own LIBERO environment does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from pipeline import gl
+from pipeline.errors import PipelineError
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.rollout import Evaluation
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.images.jpeg import resized
+from pipeline.types import Frame
+
+CAMERAS = {"image": "agentview", "image2": "wrist"}
+"""What lerobot calls the views."""
+
+Observation = dict[str, Any]
+
+
+def observation_space(size_px: tuple[int, int]) -> spaces.Dict:
+    """Args: size_px: height and width of the views."""
+
+    def numbers(*shape: int) -> spaces.Box:
+        return spaces.Box(-np.inf, np.inf, shape, np.float64)
+
+    image = spaces.Box(0, 255, (*size_px, 3), np.uint8)
+    eef = spaces.Dict({"pos": numbers(3), "quat": numbers(4), "mat": numbers(3, 3)})
+    gripper = spaces.Dict({"qpos": numbers(2), "qvel": numbers(2)})
+    joints = spaces.Dict({"pos": numbers(7), "vel": numbers(7)})
+    robot = spaces.Dict({"eef": eef, "gripper": gripper, "joints": joints})
+    return spaces.Dict({"pixels": spaces.Dict(dict.fromkeys(CAMERAS, image)), "robot_state": robot})
+
+
+class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
+    """One of several environments that share a list of episodes: of ``stride`` it runs every ``stride``-th.
+
+    A task has its own start, so the seed of ``reset`` decides nothing.
+
+    Args:
+        tasks: all episodes, in order.
+        first: which of them is the first here.
+        stride: how many environments share them.
+        size_px: height and width of the views; they are rendered in 256 x 256 and resized.
+        evaluation: where the rows of episodes go, if anywhere.
+        archive: see ``EpisodeEnvironment``.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    render_mode = "rgb_array"
+
+    def __init__(
+        self,
+        tasks: Sequence[EvaluationTask],
+        settings: EpisodeSettings,
+        first: int = 0,
+        stride: int = 1,
+        size_px: tuple[int, int] = (256, 256),
+        evaluation: Evaluation | None = None,
+        archive: Path | None = None,
+    ):
+        self._tasks, self._next, self._stride, self._size_px = tasks, first, stride, size_px
+        self._round = 0
+        self._evaluation, self._environment = evaluation, EpisodeEnvironment(settings, archive)
+        self._max_episode_steps = settings.step_limit(tasks[0].suite)  # asked for by lerobot
+        self.observation_space = observation_space(size_px)
+        self.action_space = spaces.Box(-1.0, 1.0, (7,), np.float32)
+
+    @property
+    def task(self) -> str:
+        return self._environment.task.name
+
+    @property
+    def task_description(self) -> str:
+        """What the policy is told."""
+        return self._environment.instruction
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Any]:
+        """Start the next episode.
+
+        Where the episodes do not fill the last round, some environments run one again, which has no row.
+
+        Raises:
+            PipelineError: when there is no episode left in any environment.
+        """
+        super().reset(seed=seed)
+        if self._round * self._stride >= len(self._tasks):
+            count = len(self._tasks)
+            raise PipelineError(
+                f"more episodes are asked for than the {count} that were selected",
+                where="eval.n_episodes",
+                expected=f"--eval.n_episodes={count}",
+                remedy="rows of finished episodes are kept",
+            )
+        self._round += 1
+        self._again = self._next >= len(self._tasks)
+        task = self._tasks[self._next % len(self._tasks)]
+        self._next += self._stride
+        self._device = gl.prepare().device
+        self._looks = 0
+        if self._environment.reset(task).over:
+            raise PipelineError("the scene refuses what was sampled", where=str(task), remedy="leave this task out")
+        return self._look(), {"is_success": False}
+
+    def step(self, action: np.ndarray[Any, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Take one control step; see ``EpisodeEnvironment``."""
+        progress = self._environment.step(action)
+        seen = self._look()
+        limited = progress.reason == "step_limit"
+        if progress.over and self._evaluation is not None and not self._again:
+            self._evaluation.save(self._environment, Wanted(), self._looks, self._device)
+        done = {"done": progress.over, "is_success": progress.success, "task": self.task}
+        return seen, float(progress.success), progress.over and not limited, limited, done
+
+    def render(self) -> Frame:
+        """(256, 256, 3) the agent view, upright."""
+        return self._environment.image("agentview")
+
+    def close(self) -> None:
+        self._environment.close()
+
+    def _look(self) -> Observation:
+        """LIBERO's views as they are rendered, upside down, which lerobot's processor turns."""
+        self._looks += 1
+        observed, controller = self._environment.observed, self._environment.controller
+        turned = {name: resized(self._environment.image(view), *self._size_px) for name, view in CAMERAS.items()}
+        w, *xyz = observed.hand_wxyz
+        return {
+            "pixels": {name: np.ascontiguousarray(frame[::-1, ::-1]) for name, frame in turned.items()},
+            "robot_state": {
+                "eef": {
+                    "pos": observed.state[:3].astype(np.float64),
+                    "quat": np.array([*xyz, w]),
+                    "mat": controller.ee_ori_mat.copy(),
+                },
+                "gripper": {"qpos": observed.state[6:].astype(np.float64), "qvel": observed.velocity[7:]},
+                "joints": {"pos": observed.joint_state.astype(np.float64), "vel": observed.velocity[:7]},
+            },
+        }

@@ -1,0 +1,148 @@
+"""The tasks for ``lerobot-eval --env.discover_packages_path=pipeline.evaluation.lerobot_eval``, of lerobot 0.6.
+
+One vector environment a suite runs all episodes that are selected of it, shared among ``--eval.batch_size``
+environments: ``--eval.n_episodes`` is their number, which is printed.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs.types import PolicyFeature
+from lerobot.envs.configs import EnvConfig, LiberoEnv
+
+from pipeline import gl
+from pipeline.errors import PipelineError
+from pipeline.evaluation.environment import EpisodeSettings
+from pipeline.evaluation.evaluate import check_settings
+from pipeline.evaluation.gym_environment import PerturbedLiberoEnv
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import EvaluationTask
+
+try:
+    from lerobot.configs.parser import get_path_arg
+    from lerobot.envs.utils import freeze_after_episode_end
+except ImportError as error:
+    raise ImportError(
+        "lerobot here takes no environments from outside: use lerobot 0.6.1 and Python 3.12 or 3.13, or "
+        "`python -m pipeline evaluate --checkpoint DIR`"
+    ) from error
+
+__path__: list[str] = []  # lerobot looks for modules inside what it is told to import
+
+
+@EnvConfig.register_subclass("perturbed_libero")
+@dataclass
+class PerturbedLibero(EnvConfig):  # type: ignore[misc]
+    """Tasks as a ``Selection`` chooses them, under ``EpisodeSettings``; the fields are theirs.
+
+    Attributes:
+        task: suites, separated by commas; ``subset`` and ``episodes`` hold for each.
+        observation_height, observation_width: of the policy's images.
+        out, label: folder for the rows of the policy, as ``evaluate`` writes them, and its name there; none by default.
+        assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
+    """
+
+    task: str | None = "libero_goal"
+    fps: int = 20
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=dict)
+    observation_height: int = 256
+    observation_width: int = 256
+    source: str = "libero"
+    axes: list[str] = field(default_factory=list)
+    components: list[str] = field(default_factory=list)
+    levels: list[int] = field(default_factory=list)
+    tasks: list[str] = field(default_factory=list)
+    episodes: int = 1
+    subset: int | None = None
+    seed: int = 0
+    prompt: str = "clean"
+    step_limits: str = "openvla"
+    out: str | None = None
+    label: str = ""
+    assets: str | None = None
+
+    def __post_init__(self) -> None:
+        theirs = self._theirs()
+        self.features, self.features_map = theirs.features, theirs.features_map
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        return {}
+
+    def get_env_processors(self) -> Any:
+        return self._theirs().get_env_processors()
+
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """Suite to the vector environment of all its episodes, whose number is 0."""
+        if self.source not in ("libero", "libero_plus", "goals"):
+            raise PipelineError(f"no source {self.source!r}", where="env.source", expected="libero, libero_plus, goals")
+        if self.max_parallel_tasks > 1:
+            raise PipelineError(
+                "suites would share one policy, which keeps the actions of one batch",
+                where="env.max_parallel_tasks",
+                expected="1",
+                remedy="--eval.batch_size runs episodes beside each other",
+            )
+        given = {name: getattr(self, name) for name in ("prompt", "seed", "step_limits")}
+        settings = EpisodeSettings.model_validate({**given, "runner": "lerobot-eval"})
+        archive = None if self.assets is None else Path(self.assets)
+        evaluation = self._evaluation(settings, archive)
+        tasks: dict[str, list[EvaluationTask]] = defaultdict(list)
+        for suite in (self.task or "").split(","):
+            # Those of one scene after the other, so that it is built once.
+            selection = self._selection(suite.strip())
+            check_settings(selection, settings)
+            tasks[suite.strip()] = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
+        if evaluation is not None:
+            evaluation.check(task for suite in tasks.values() for task in suite)
+        print(gl.choose())  # before the worker processes, which inherit it
+        found: dict[str, dict[int, gym.vector.VectorEnv]] = {}
+        for suite, of_suite in tasks.items():
+            print(f"{suite}: {len(of_suite)} episodes; --eval.n_episodes={len(of_suite)} runs each of them once")
+            made = [
+                # An environment that is done waits until the others are.
+                freeze_after_episode_end(
+                    partial(PerturbedLiberoEnv, of_suite, settings, first, n_envs, self._size_px, evaluation, archive)
+                )
+                for first in range(n_envs)
+            ]
+            later = gym.vector.AutoresetMode.NEXT_STEP
+            if use_async_envs and n_envs > 1:
+                found[suite] = {0: gym.vector.AsyncVectorEnv(made, context="forkserver", autoreset_mode=later)}
+            else:
+                found[suite] = {0: gym.vector.SyncVectorEnv(made, autoreset_mode=later)}
+        return found
+
+    @property
+    def _size_px(self) -> tuple[int, int]:
+        return self.observation_height, self.observation_width
+
+    def _theirs(self) -> Any:
+        return LiberoEnv(observation_height=self.observation_height, observation_width=self.observation_width)
+
+    def _selection(self, suite: str) -> Selection:
+        named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
+        return Selection.model_validate({"suites": (suite,), **{name: getattr(self, name) for name in named}})
+
+    def _evaluation(self, settings: EpisodeSettings, archive: Path | None) -> Evaluation | None:
+        """Where rows go, under the identity of the policy that lerobot is told to load."""
+        if self.out is None:
+            return None
+        folder = get_path_arg("policy")
+        if folder is None or not Path(folder).is_dir():
+            raise PipelineError(
+                f"rows name a policy by the content of its files, and {folder} is no folder",
+                where="policy.path",
+                expected="a folder that lerobot saved a policy in",
+                remedy="hf download REPOSITORY --local-dir DIR, and --policy.path=DIR",
+            )
+        policy = PolicyConfig(kind="checkpoint", address=folder, label=self.label)
+        return Evaluation(settings, policy, policy.identity(), Path(self.out), archive=archive)

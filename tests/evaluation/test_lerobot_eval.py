@@ -1,0 +1,157 @@
+"""lerobot-eval sees what LIBERO's own environment shows, and each of its episodes is one row."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import checkpoints
+import numpy as np
+import pytest
+from conftest import STOVE
+
+from pipeline import gl
+
+# LIBERO's environment renders with what robosuite finds in MUJOCO_GL when it is imported.
+gl.choose()
+
+from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
+
+from pipeline.errors import PipelineError  # noqa: E402
+from pipeline.evaluation import environment  # noqa: E402
+from pipeline.evaluation.environment import EpisodeSettings  # noqa: E402
+from pipeline.evaluation.gym_environment import PerturbedLiberoEnv  # noqa: E402
+from pipeline.evaluation.results import read, refuse_different, stored  # noqa: E402
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig  # noqa: E402
+from pipeline.evaluation.selection import Selection, select  # noqa: E402
+from pipeline.evaluation.tasks import libero_states  # noqa: E402
+from pipeline.libero.tasks import tasks  # noqa: E402
+from pipeline.seeding import rng  # noqa: E402
+from pipeline.testset.benchmark import TESTED_SUITES  # noqa: E402
+from pipeline.types import Task  # noqa: E402
+
+ACTIONS = rng("test_lerobot_eval").uniform(-1, 1, (10, 7))
+
+
+def as_lerobot(env: Any, raw: dict[str, Any]) -> dict[str, Any]:
+    """LIBERO's observation as ``LiberoEnv._format_raw_obs`` of lerobot 0.6.1 returns it, by its keys."""
+    return {
+        "image": raw["agentview_image"],
+        "image2": raw["robot0_eye_in_hand_image"],
+        "eef/pos": raw["robot0_eef_pos"],
+        "eef/quat": raw["robot0_eef_quat"],
+        "eef/mat": env.robots[0].controller.ee_ori_mat.copy(),
+        "gripper/qpos": raw["robot0_gripper_qpos"],
+        "gripper/qvel": raw["robot0_gripper_qvel"],
+        "joints/pos": raw["robot0_joint_pos"],
+        "joints/vel": raw["robot0_joint_vel"],
+    }
+
+
+def liberos(task: Task) -> list[tuple[Any, dict[str, Any]]]:
+    """State and observation of LIBERO's own environment after settling and after each action, as lerobot takes them."""
+    # All of them at once: robosuite draws into whichever OpenGL context is current.
+    env = OffScreenRenderEnv(bddl_file_name=str(task.bddl_file), camera_heights=256, camera_widths=256)
+    env.seed(0)
+    env.reset()
+    raw = env.set_init_state(libero_states(task)[0])
+    for _ in range(10):
+        raw, *_ = env.step([0, 0, 0, 0, 0, 0, -1])
+    seen = [(env.get_sim_state(), as_lerobot(env, raw))]
+    for action in ACTIONS:
+        raw, *_ = env.step([*action[:6], np.sign(action[6])])
+        seen.append((env.get_sim_state(), as_lerobot(env, raw)))
+    env.close()
+    return seen
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suite", TESTED_SUITES)
+def test_ten_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
+    # A drawer, which the first of libero_goal opens, starts the solver elsewhere: states differ by 1e-17 there.
+    task = STOVE if suite == STOVE.suite else tasks(suite)[0]
+    shown = liberos(task)
+    ours = PerturbedLiberoEnv(select(Selection(suites=(suite,), tasks=(task.name,))), EpisodeSettings())
+    seen, _ = ours.reset(seed=1000)
+    for step, (state, expected) in enumerate(shown):
+        if step:
+            seen, *_ = ours.step(ACTIONS[step - 1])
+        assert np.array_equal(ours._environment._opened.state, state), step
+        assert ours.observation_space.contains(seen)
+        robot = seen["robot_state"]
+        flat = {f"{part}/{name}": value for part, values in robot.items() for name, value in values.items()}
+        for name, value in (seen["pixels"] | flat).items():
+            # Positions have the digits of float32, which lerobot's processor leaves of them.
+            digits = np.float32 if name in ("eef/pos", "gripper/qpos", "joints/pos") else expected[name].dtype
+            assert np.array_equal(value, expected[name].astype(digits)), (step, name)
+        assert np.array_equal(ours.render(), expected["image"][::-1, ::-1])
+    assert ours.task_description == task.instruction
+    ours.close()
+
+
+def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(environment.STEP_LIMITS, STOVE.suite, 2)
+    policy = PolicyConfig(kind="checkpoint", address=str(checkpoints.save(tmp_path / "act", 0.0)), label="act")
+    settings = EpisodeSettings(runner="lerobot-eval")
+    evaluation = Evaluation(settings, policy, policy.identity(), tmp_path / "rows")
+    listed = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,), episodes=3))
+    sharing = [PerturbedLiberoEnv(listed, settings, first, 2, (32, 48), evaluation) for first in range(2)]
+    for _ in range(2):
+        for env in sharing:
+            seen, _ = env.reset()
+            assert seen["pixels"]["image2"].shape == (32, 48, 3)
+            done = False
+            while not done:
+                _, _, terminated, done, info = env.step(np.zeros(7, np.float32))
+                assert not terminated
+                assert not info["is_success"]
+    with pytest.raises(PipelineError, match=r"eval\.n_episodes=3"):
+        sharing[0].reset()
+    # The fourth episode only fills the last round.
+    rows = {row.number: row for row, _ in stored([evaluation.folder])}
+    assert [(row.steps, row.looks, row.reason) for row in rows.values()] == [(2, 3, "step_limit")] * 3
+    assert sorted(rows) == [0, 1, 2]
+    assert rows[0].identity == evaluation.identity
+    assert rows[0].versions["lerobot"] == version("lerobot")
+    (read_back,) = read([evaluation.folder])
+    assert read_back.settings["runner"] == "lerobot-eval"
+    for env in sharing:
+        env.close()
+
+
+def test_limits_of_openvla_and_lerobot_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(environment.STEP_LIMITS, "libero_spatial", 1)
+    monkeypatch.setattr(environment, "LEROBOT_SPATIAL", 2)
+    policy = PolicyConfig(kind="open_loop")
+    listed = select(Selection(suites=("libero_spatial",)))[:1]
+    for whose in ("openvla", "lerobot"):
+        settings = EpisodeSettings.model_validate({"step_limits": whose})
+        evaluation = Evaluation(settings, policy, policy.identity(), tmp_path / whose)
+        env = PerturbedLiberoEnv(listed, settings, evaluation=evaluation)
+        env.reset()
+        while not any(env.step(np.zeros(7, np.float32))[2:4]):
+            pass
+        env.close()
+    both = stored([tmp_path / "openvla", tmp_path / "lerobot"])
+    assert [row.step_limit for row, _ in both] == [1, 2]
+    assert both[0][0].episode != both[1][0].episode
+    with pytest.raises(PipelineError, match="step_limit 1 and 2"):
+        refuse_different(both)
+    refuse_different(both, across=["step_limit"])
+
+
+def test_it_registers_where_lerobot_takes_environments() -> None:
+    name = "pipeline.evaluation.lerobot_eval"
+    if sys.version_info < (3, 12):  # with lerobot 0.4.4
+        with pytest.raises(ImportError, match=r"use lerobot 0\.6"):
+            import_module(name)
+        return
+    config = import_module(name).PerturbedLibero(observation_height=224, observation_width=224)
+    own = import_module("lerobot.envs.configs").LiberoEnv(observation_height=224, observation_width=224)
+    assert config.type == "perturbed_libero"
+    assert (config.features, config.features_map) == (own.features, own.features_map)
+    with pytest.raises(PipelineError, match="no source"):
+        import_module(name).PerturbedLibero(source="own").create_envs(1)

@@ -1,0 +1,103 @@
+"""Replays that missed their goal are sets of their own, where they are asked for, and nothing else changes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from contextlib import chdir
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from conftest import run_stages, tiny_config
+
+from pipeline.config import load
+from pipeline.files import checksum
+from pipeline.formats.registry import failures_of, places
+from pipeline.formats.tfrecord import METADATA, columns, records
+from pipeline.run import manifest
+from pipeline.validation.validate import EpisodesJob
+
+STAGES = ("inputs", "render", "export_rlds", "export_lerobot", "manifest", "validate")
+
+
+def sums(data: Path) -> dict[str, str]:
+    """Of all frames and datasets but those of failures."""
+    files = (file for name in ("frames", "rlds", "lerobot") for file in (data / name).rglob("*") if file.is_file())
+    return {str(file.relative_to(data)): checksum(file) for file in files if file.name != "index.parquet"}
+
+
+@pytest.fixture(scope="module")
+def asked(finished: Path, short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run's folder after all formats were asked for with failures."""
+    folder = tmp_path_factory.mktemp("asked")
+    shutil.copytree(finished, folder / "data" / "tiny")
+    run_stages(folder, with_failures(short_demos), STAGES)
+    return folder / "data" / "tiny"
+
+
+def with_failures(short_demos: Path) -> dict[str, Any]:
+    config = tiny_config(short_demos)
+    v21 = {"name": "tiny", "convention": "ipec"}
+    return config | {"export": config["export"] | {"lerobot_v21": v21, "failures": True}}
+
+
+def test_each_format_has_the_failures_with_their_reason(asked: Path) -> None:
+    rows = manifest.read(asked / "manifest.parquet")
+    missed = {row["episode_id"]: row for row in rows if row["reason"] in ("goal_not_reached", "goal_lost")}
+    assert missed
+    assert not any(row["kept"] for row in missed.values())
+    said = {}
+    for shard in (asked / "failures" / "rlds").glob("libero_tiny_failures_*/*/*.tfrecord*"):
+        builder_dir = shard.parent
+        for record in records(shard):
+            steps = columns(record, features_of(builder_dir))
+            episode_id = steps[f"{METADATA}episode_id"][0].decode()
+            said[episode_id] = (bool(steps[f"{METADATA}success"][0]), steps[f"{METADATA}reason"][0].decode())
+            assert not steps["reward"].any()
+            assert not steps["is_terminal"].any()
+            assert steps["is_last"].tolist() == [0] * (missed[episode_id]["steps"] - 1) + [1]
+    assert said == {episode_id: (False, row["reason"]) for episode_id, row in missed.items()}
+    for name in ("lerobot/tiny_failures", "lerobot_v21/tiny_failures_object"):
+        (file,) = (asked / "failures" / name).glob("meta/provenance.parquet")
+        listed = pq.read_table(file).to_pylist()
+        assert {row["episode_id"]: (row["success"], row["reason"]) for row in listed} == said
+        assert all(row["path_m"] > 0 for row in listed)
+
+
+def features_of(folder: Path) -> Any:
+    import tensorflow_datasets as tfds
+
+    return tfds.builder_from_directory(folder).info.features
+
+
+def test_validate_checks_them_and_finds_a_success_among_them(asked: Path, tmp_path: Path) -> None:
+    report = json.loads((asked / "validation.json").read_text())
+    rows = manifest.read(asked / "manifest.parquet")
+    missed = [row for row in rows if row["reason"] in ("goal_not_reached", "goal_lost")]
+    assert report["flags"]["checked"] == sum(row["kept"] for row in rows) + len(missed)
+    shutil.copytree(asked.parents[1], tmp_path, dirs_exist_ok=True)
+    with chdir(tmp_path):
+        config = load(Path("configs/tiny.yaml"))
+        file = config.data / "failures" / "lerobot" / "tiny_failures" / "meta" / "provenance.parquet"
+        table = pq.read_table(file)
+        succeeded = pa.array([True] * len(table))
+        place = table.schema.get_field_index("success")
+        pq.write_table(table.set_column(place, table.schema.field("success"), succeeded), file)
+        sets = failures_of(config.data, config.export)
+        job = EpisodesJob(config, config.data, sets, tmp_path / "cache", frozenset(), ("outcome",))
+        found = job([missed[0] | places(sets)[missed[0]["episode_id"]]]).findings
+    told = {check: {fault.dataset for fault in faults} for check, faults in found.items() if faults}
+    assert told == {"provenance": {"lerobot"}}
+
+
+def test_nothing_else_changes_and_what_is_not_asked_for_any_more_is_not_kept(
+    asked: Path, finished: Path, short_demos: Path, tmp_path: Path
+) -> None:
+    before = sums(finished)
+    assert before.items() < sums(asked).items()
+    shutil.copytree(asked, tmp_path / "data" / "tiny")
+    run_stages(tmp_path, tiny_config(short_demos), ["inputs", "render"])
+    assert sums(tmp_path / "data" / "tiny") == before
