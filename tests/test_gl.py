@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import ctypes.util
 import os
 import subprocess
 import sys
@@ -165,7 +166,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         (tmp_path / node).touch()
     monkeypatch.setattr(gl, "DEVICES", tmp_path)
     monkeypatch.setattr(gl, "LOADED_GPUS", tmp_path / "gpus")
-    monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: f"lib{name}.so.0")
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so.0")
     monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(vendors))
     return tmp_path
@@ -191,7 +192,7 @@ def test_a_gpu_without_its_node(machine: Path) -> None:
 
 
 def test_a_gpu_without_the_library_of_its_driver(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gl.ctypes.util, "find_library", lambda name: None)
+    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
     what, remedy = gl.idle_gpu() or ("", "")
     assert what == "libEGL_nvidia.so.0 is missing"
     assert "NVIDIA_DRIVER_CAPABILITIES" in remedy

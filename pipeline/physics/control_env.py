@@ -26,17 +26,18 @@ def control_env() -> Any:
     try:
         with gl.left_out():
             if "robosuite" not in sys.modules:
-                _turn_off_rendering()
+                _set_macros()
             from libero.libero.envs.env_wrapper import ControlEnv
     finally:
         logging.disable(logging.NOTSET)
     return ControlEnv
 
 
-def _turn_off_rendering() -> None:
-    """Unset robosuite's ``MUJOCO_GPU_RENDERING``, by which it loads EGL when it is imported, even where disabled.
+def _set_macros() -> None:
+    """Unset robosuite's ``MUJOCO_GPU_RENDERING``, by which it loads EGL when it is imported, even where disabled, and
+    its log ``/tmp/robosuite.log``, which it cannot open where it is another user's.
 
-    The flag lies in a module of the package, and importing that module would import the package first.
+    The flags lie in a module of the package, and importing that module would import the package first.
     """
     package = find_spec("robosuite")
     if package is None or package.origin is None:
@@ -47,6 +48,7 @@ def _turn_off_rendering() -> None:
     macros = module_from_spec(spec)
     spec.loader.exec_module(macros)
     macros.MUJOCO_GPU_RENDERING = False  # type: ignore[attr-defined]
+    macros.FILE_LOGGING_LEVEL = None  # type: ignore[attr-defined]
     sys.modules[spec.name] = macros
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from runpy import run_path
 from typing import Any
 
 import numpy as np
 import pytest
-from conftest import BOWL, REPOSITORY, starter_demo
+from conftest import BOWL, starter_demo
 
 from pipeline.axes.disturbance import DisturbanceAxis, DisturbancePerturbation
 from pipeline.config import ReplayConfig
@@ -137,10 +136,11 @@ def test_the_hand_is_pushed_off_and_comes_back_to_the_goal(
 def test_liberos_own_environment_does_the_same_under_the_same_wrench(
     environment: Environment, whole: dict[Task, Trajectory]
 ) -> None:
+    from repeat_in_libero import opened, put_in
+
     kept = replayed(environment, whole[BOWL], pushed_at(12, 80.0))
-    benchmark = run_path(str(REPOSITORY / "benchmarks" / "repeat_in_libero.py"))
-    libero: Any = benchmark["opened"](BOWL)
-    benchmark["put_in"](libero, kept.scene)
+    libero: Any = opened(BOWL)
+    put_in(libero, kept.scene)
     for _ in range(10):
         libero.step([0.0] * 6 + [-1.0])
     hand = libero.sim.model.body_name2id("robot0_right_hand")

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import mujoco
@@ -15,6 +17,24 @@ from pipeline.types import Scene, Task, Trajectory
 OPEN_DRAWER = find_task(
     "libero_10", "KITCHEN_SCENE4_put_the_black_bowl_in_the_bottom_drawer_of_the_cabinet_and_close_it"
 )
+
+
+ANOTHERS_LOG = """
+import sys
+
+def refuse(event, arguments):
+    if event == "open" and arguments[0] == "/tmp/robosuite.log":
+        raise PermissionError(arguments[0])
+
+sys.addaudithook(refuse)
+from pipeline.physics.control_env import control_env
+control_env()
+"""
+
+
+def test_another_user_may_own_the_log_of_robosuite() -> None:
+    done = subprocess.run([sys.executable, "-c", ANOTHERS_LOG], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.fixture(scope="module")
