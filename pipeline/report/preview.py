@@ -189,7 +189,7 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     original = stage.frames(views)
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
     if strips := [tile for push in drawn for tile in _strip(stage, push)]:
-        tiles, drawn = strips, []
+        tiles, drawn, views = strips, [], ["image"]
     for perturbation in drawn:
         caption = describe(perturbation)
         try:
@@ -199,7 +199,9 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
             caption = f"refused, {refused.reason}: {caption}"
             frames = [np.full_like(frame, REFUSED_GREY) for frame in original]
         tiles.append(Tile(side_by_side(frames, side), caption))
-    return sheet(f"{demo.demo_id}, first state; axis {name}, seed {seed}; {', '.join(views)}", tiles)
+    return sheet(
+        f"{demo.demo_id}, {'replays' if strips else 'first state'}; axis {name}, seed {seed}; {', '.join(views)}", tiles
+    )
 
 
 def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
