@@ -71,22 +71,23 @@ def liberos(task: Task) -> list[tuple[Any, dict[str, Any]]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", TESTED_SUITES)
 def test_ten_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
-    # A drawer, which the first of libero_goal opens, starts the solver elsewhere: states differ by 1e-17 there.
-    task = STOVE if suite == STOVE.suite else tasks(suite)[0]
+    task = tasks(suite)[0]
     shown = liberos(task)
     ours = PerturbedLiberoEnv(select(Selection(suites=(suite,), tasks=(task.name,))), EpisodeSettings())
     seen, _ = ours.reset(seed=1000)
     for step, (state, expected) in enumerate(shown):
         if step:
             seen, *_ = ours.step(ACTIONS[step - 1])
-        assert np.array_equal(ours._environment._opened.state, state), step
+        # In libero_object the last bits of velocities differ, by 1e-16.
+        np.testing.assert_allclose(ours._environment._opened.state, state, rtol=0, atol=1e-12, err_msg=str(step))
         assert ours.observation_space.contains(seen)
         robot = seen["robot_state"]
         flat = {f"{part}/{name}": value for part, values in robot.items() for name, value in values.items()}
         for name, value in (seen["pixels"] | flat).items():
-            # Positions have the digits of float32, which lerobot's processor leaves of them.
-            digits = np.float32 if name in ("eef/pos", "gripper/qpos", "joints/pos") else expected[name].dtype
-            assert np.array_equal(value, expected[name].astype(digits)), (step, name)
+            if name in seen["pixels"]:
+                assert np.array_equal(value, expected[name]), (step, name)
+            else:  # positions have the digits of float32, which lerobot's processor leaves of them
+                np.testing.assert_allclose(value, expected[name], rtol=1e-6, atol=1e-7, err_msg=f"{step} {name}")
         assert np.array_equal(ours.render(), expected["image"][::-1, ::-1])
     assert ours.task_description == task.instruction
     ours.close()
