@@ -18,7 +18,7 @@ fail() { printf 'setup.sh: %s\n' "$@" >&2; exit 1; }
 stopped() {
     local folder free_mb cache=${UV_CACHE_DIR:-$HOME/.cache/uv}
     for folder in . "${TMPDIR:-/tmp}" "${UV_CACHE_DIR:-$HOME}"; do
-        free_mb=$(df --output=avail --block-size=1M "$folder" | tail -n 1)
+        free_mb=$(df --output=avail --block-size=1M "$folder" 2>/dev/null | tail -n 1) || continue
         ((free_mb > 2000)) ||
             fail "$1; only $((free_mb)) MB are free at $folder" "  try: free 10 GB there, then run this again"
     done

@@ -255,6 +255,12 @@ class Config(Frozen):
         return named
 
     @model_validator(mode="after")
+    def _pushes_where_they_were_sampled(self) -> Config:
+        if self.plan.axes.disturbance and self.replay.noops != "drop":
+            raise ValueError("pushes count steps without no-ops: the axis disturbance goes with replay.noops: drop")
+        return self
+
+    @model_validator(mode="after")
     def _rewrites_of_every_task(self) -> Config:
         """LIBERO-90 has none among those that are shipped."""
         if self.plan.axes.language is None:

@@ -6,7 +6,7 @@ processes inherit it. Two renderers may differ by some grey levels, so the choic
 
 from __future__ import annotations
 
-import ctypes.util
+import ctypes
 import functools
 import json
 import os
@@ -27,6 +27,10 @@ REMEDY = "apt-get install -y libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libosme
 NVIDIA_EGL = "libEGL_nvidia.so.0"
 VENDOR_FOLDERS = "/etc/glvnd/egl_vendor.d:/usr/share/glvnd/egl_vendor.d"
 DEVICES, LOADED_GPUS = Path("/dev"), Path("/proc/driver/nvidia/gpus")
+
+
+ASKED = "MUJOCO_GL asks for it"
+"""The reason of a choice that was not ours."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,7 @@ def choose() -> GlChoice:
         os.environ.update(MUJOCO_GL=backend, PYOPENGL_PLATFORM=backend)
         if index is not None:
             os.environ["MUJOCO_EGL_DEVICE_ID"] = index
-        reason = "MUJOCO_GL asks for it" if asked else _reason(backend, device, faults)
+        reason = ASKED if asked else _reason(backend, device, faults)
         return GlChoice(backend, device, reason, device_named)
 
     what = "; ".join(f"{backend} fails: {fault}" for backend, fault in faults.items())
@@ -250,7 +254,7 @@ def idle_gpu() -> tuple[str, str] | None:
             "as root: nvidia-modprobe -u -c=0; in a container, hand the GPU on: --nv (Apptainer), "
             "--device nvidia.com/gpu=all (Podman), --gpus all (Docker)",
         )
-    if nvidia and ctypes.util.find_library("EGL_nvidia") is None:
+    if nvidia and not _loads(NVIDIA_EGL):
         return (
             f"{NVIDIA_EGL} is missing",
             "install the driver's EGL library (Debian: libegl-nvidia0, Ubuntu: libnvidia-gl-VERSION); in a container, "
@@ -271,6 +275,15 @@ def idle_gpu() -> tuple[str, str] | None:
     if nvidia:
         return "its driver does not answer", "see that nvidia-smi works; unset MUJOCO_GL MUJOCO_EGL_DEVICE_ID"
     return None
+
+
+def _loads(library: str) -> bool:
+    """Whether the loader finds a library, also by ``LD_LIBRARY_PATH``, as containers are given the driver."""
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        return False
+    return True
 
 
 def _vendor_files() -> list[Path]:

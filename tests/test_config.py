@@ -142,6 +142,13 @@ def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
     )
 
 
+def test_pushes_go_with_dropped_no_ops(tmp_path: Path) -> None:
+    file = tmp_path / "pushed.yaml"
+    file.write_text("{name: pushed, plan: {episodes: {disturbance: 1}}, replay: {noops: keep}}")
+    with pytest.raises(PipelineError, match=r"goes with replay\.noops: drop"):
+        load(file)
+
+
 def test_the_examples_of_the_documentation_are_valid() -> None:
     text = (REPOSITORY / "docs" / "configuration.md").read_text()
     examples = [yaml.safe_load(block) for block in re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)]

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import ctypes.util
+import ctypes
 import os
 import subprocess
 import sys
@@ -166,7 +166,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         (tmp_path / node).touch()
     monkeypatch.setattr(gl, "DEVICES", tmp_path)
     monkeypatch.setattr(gl, "LOADED_GPUS", tmp_path / "gpus")
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: f"lib{name}.so.0")
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: name)
     monkeypatch.delenv("__EGL_VENDOR_LIBRARY_FILENAMES", raising=False)
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(vendors))
     return tmp_path
@@ -192,7 +192,10 @@ def test_a_gpu_without_its_node(machine: Path) -> None:
 
 
 def test_a_gpu_without_the_library_of_its_driver(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ctypes.util, "find_library", lambda name: None)
+    def missing(name: str) -> None:
+        raise OSError(name)
+
+    monkeypatch.setattr(ctypes, "CDLL", missing)
     what, remedy = gl.idle_gpu() or ("", "")
     assert what == "libEGL_nvidia.so.0 is missing"
     assert "NVIDIA_DRIVER_CAPABILITIES" in remedy

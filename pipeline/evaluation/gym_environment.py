@@ -106,7 +106,9 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         self._device = gl.prepare().device
         self._looks = 0
         if self._environment.reset(task).over:
-            raise PipelineError("the scene refuses what was sampled", where=str(task), remedy="leave this task out")
+            raise PipelineError(
+                "the scene refuses what was sampled", where=str(task), remedy="name others by --env.tasks"
+            )
         return self._look(), {"is_success": False}
 
     def step(self, action: np.ndarray[Any, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

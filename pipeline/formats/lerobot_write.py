@@ -74,7 +74,9 @@ def write_piece(
             check(episode, extras)
             shown = {view: of_episode.show(episode, view, videos.get(view)) for view in SCHEMA.views}
             numbers = of_episode.numbers(episode, index, first_step, piece.tasks[episode.instruction])
-            columns = of_episode.columns(episode, numbers) | of_episode.language(episode, piece.split == "train")
+            columns = of_episode.columns(episode, numbers)
+            if language:
+                columns |= of_episode.language(episode, piece.split == "train")
             # A row group for each episode, so that one is read without the others.
             data.write_table(pa.table({name: columns[name] for name in data.schema.names}).cast(data.schema))
             # An episode's statistics are there because lerobot's tools for editing put them together again.

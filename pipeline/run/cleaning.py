@@ -23,13 +23,18 @@ class Part(NamedTuple):
     made_by: str
 
 
+def _with_failures(*formats: str) -> tuple[str, ...]:
+    """Datasets and records of some formats, which one stage makes."""
+    names = [name for one in formats for name in (one, f"{one}.json")]
+    return (*names, *(f"failures/{name}" for name in names))
+
+
 PARTS = {
     "unfinished": Part((".work",), "nothing: what stopped stages left"),
     "pictures": Part(("sheets", "previews", "report.html"), "summary and report"),
     "uploads": Part(("card", "finetune"), "card and recipe"),
-    "rlds": Part(("rlds", "rlds.json"), "export_rlds, from the frames"),
-    "lerobot": Part(("lerobot", "lerobot.json", "lerobot_v21", "lerobot_v21.json"), "export_lerobot, from the frames"),
-    "failures": Part(("failures",), "export_rlds and export_lerobot, from the frames"),
+    "rlds": Part(_with_failures("rlds"), "export_rlds, from the frames"),
+    "lerobot": Part(_with_failures("lerobot", "lerobot_v21"), "export_lerobot, from the frames"),
     "frames": Part(("frames",), "render, from the trajectories: most of a run's time"),
     "trajectories": Part(("trajectories", "replay.json"), "replay, from the demonstrations"),
     "tables": Part(

@@ -144,8 +144,10 @@ def read(dataset: Path) -> Iterator[Found]:
     Raises:
         PipelineError: when there is none, or it cannot be read.
     """
-    rlds = sorted(file.parent for file in dataset.rglob("features.json"))
-    lerobot = sorted(file.parents[1] for file in dataset.rglob("meta/info.json"))
+    rlds, lerobot = (
+        sorted(file for file in dataset.rglob(name) if not _hidden(file.relative_to(dataset)))
+        for name in ("features.json", "meta/info.json")
+    )
     if not rlds and not lerobot:
         raise PipelineError(
             "no dataset below this folder",
@@ -153,12 +155,17 @@ def read(dataset: Path) -> Iterator[Found]:
             expected="features.json, as TFDS writes it, or meta/info.json, as lerobot does",
         )
     try:
-        for folder in rlds:
-            yield from _rlds(folder)
-        for folder in lerobot:
-            yield from _lerobot(folder)
+        for file in rlds:
+            yield from _rlds(file.parent)
+        for file in lerobot:
+            yield from _lerobot(file.parents[1])
     except (OSError, ValueError, KeyError) as error:
         raise PipelineError(f"cannot be read ({type(error).__name__}: {error})", where=dataset) from error
+
+
+def _hidden(path: Path) -> bool:
+    """Whether it lies in a folder of what is not finished."""
+    return any(part.startswith(".") for part in path.parts)
 
 
 def _rlds(folder: Path) -> Iterator[Found]:

@@ -169,7 +169,7 @@ def _opengl() -> Diagnosis:
         choice = gl.choose()
     except PipelineError as error:
         return Diagnosis("OpenGL", "fail", error.what, error.remedy or "")
-    if choice.software and (idle := gl.idle_gpu()):
+    if choice.software and choice.reason != gl.ASKED and (idle := gl.idle_gpu()):
         return Diagnosis("OpenGL", "warn", f"{choice.backend} on {choice.device}, as {idle[0]}", idle[1])
     return Diagnosis("OpenGL", "ok", str(choice))
 

@@ -79,7 +79,9 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
         try:
             job = EpisodesJob(config, data, formats_of(*asked), cache, frozenset(witnesses(rows)))
             total.add(_datasets(job, kept, workers))
-            if failures := failures_of(*asked) if (missed := set(outcome.read(config).missed)) else []:
+            missed = set(outcome.read(config).missed) if config.export.failures else set()
+            if missed:
+                failures = failures_of(*asked)
                 places = registry.places(failures)
                 failed = {one: row | places.get(one, {}) for row in rows if (one := row["episode_id"]) in missed}
                 job = EpisodesJob(config, data, failures, cache, frozenset([*failed][:1]), ("outcome",))

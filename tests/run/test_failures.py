@@ -18,6 +18,8 @@ from pipeline.files import checksum
 from pipeline.formats.registry import failures_of, places
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.run import manifest
+from pipeline.run.cleaning import PARTS
+from pipeline.run.export import notice_changes
 from pipeline.validation.validate import EpisodesJob
 
 STAGES = ("inputs", "render", "export_rlds", "export_lerobot", "manifest", "validate")
@@ -91,6 +93,25 @@ def test_validate_checks_them_and_finds_a_success_among_them(asked: Path, tmp_pa
         found = job([missed[0] | places(sets)[missed[0]["episode_id"]]]).findings
     told = {check: {fault.dataset for fault in faults} for check, faults in found.items() if faults}
     assert told == {"provenance": {"lerobot"}}
+
+
+def test_a_damaged_set_of_failures_leaves_the_record_of_the_others(asked: Path, tmp_path: Path) -> None:
+    shutil.copytree(asked.parents[1], tmp_path, dirs_exist_ok=True)
+    with chdir(tmp_path):
+        config = load(Path("configs/tiny.yaml"))
+        (failed,) = (one for one in failures_of(config.data, config.export) if one.name == "rlds")
+        seen_by_dvc = failed.stage_record.read_bytes()
+        record = json.loads(seen_by_dvc)
+        next(failed.folder.rglob("*.tfrecord*")).write_bytes(b"damaged")
+        notice_changes(failed)
+        assert not failed.record_file.exists()
+        assert failed.stage_record.read_bytes() != seen_by_dvc, "DVC starts the stage"
+        assert json.loads(failed.stage_record.read_text()) == record
+        assert {name for name in PARTS["rlds"].names if (config.data / name).exists()} == {
+            "rlds",
+            "rlds.json",
+            "failures/rlds",
+        }
 
 
 def test_nothing_else_changes_and_what_is_not_asked_for_any_more_is_not_kept(

@@ -69,15 +69,16 @@ def name_statistics_by_suite(suites: Mapping[str, str]) -> None:
 
 
 def statistics_of(file: Path, suites: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Each dataset to a checkpoint's statistics of actions and proprioception for its suite."""
+    """Datasets to a checkpoint's statistics of actions and proprioception for their suites, as far as it has them."""
     stored = json.loads(file.read_text())
     former = {}
     for suite, name in suites.items():
         # Published checkpoints name LIBERO's sets without no-ops.
         key = next((key for key in (f"{suite}_no_noops", suite) if key in stored), None)
-        if key is None:
-            sys.exit(f"error: {file} has no statistics for {suite}\n  it has: {', '.join(stored)}")
-        former[name] = {part: stored[key][part] for part in ("action", "proprio")}
+        if key is not None:
+            former[name] = {part: stored[key][part] for part in ("action", "proprio")}
+    if not former:
+        sys.exit(f"error: {file} has no statistics for {' or '.join(suites)}\n  it has: {', '.join(stored)}")
     return former
 
 
@@ -96,7 +97,10 @@ def keep_statistics_elsewhere(dataset_sha256: str, former: Mapping[str, Mapping[
     def get_dataset_statistics(dataset: Any, hash_dependencies: tuple[str, ...], save_dir: object = None) -> Any:
         own = compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
         # OFT passes the folder of the dataset's version.
-        return {**own, **former.get(Path(str(save_dir)).parent.name, {})}
+        name = Path(str(save_dir)).parent.name
+        if former and name not in former:
+            sys.exit(f"error: the given statistics have none for {name}\n  they have: {', '.join(former)}")
+        return {**own, **former.get(name, {})}
 
     module.get_dataset_statistics = get_dataset_statistics
 
