@@ -46,6 +46,9 @@ class Result:
         "JSON of what physics perturbations came to in the scene, by axis, or under fault why the demonstration could "
         "not be simulated; null when not replayed",
     ]
+    path_ratio: Annotated[
+        float | None, "path_m by that of the clean twin; null where one of them did not reach the goal"
+    ]
     gl_device: Annotated[str | None, "what rendered the frames, as OpenGL names it; null when not rendered"]
 
 
@@ -85,11 +88,17 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
             replay_mode=replayed.get("mode"),
             steps=replayed.get("steps"),
             resolved=replayed.get("resolved"),
+            path_ratio=_ratio(replayed, run.trajectories.get(run.row_of[row.twin_id].trajectory_id, {})),
             gl_device=rendered.device if rendered else None,
         )
         quality = {each.name: replayed.get(each.name) for each in fields(Quality)}
         table.append({**asdict(row), **asdict(result), **quality, **places.get(row.episode_id, {}), **own_versions})
     return pa.Table.from_pylist(table, schema=schema(columns))
+
+
+def _ratio(replayed: Mapping[str, Any], twin: Mapping[str, Any]) -> float | None:
+    one, other = replayed.get("path_m"), twin.get("path_m")
+    return one / other if one is not None and other else None
 
 
 def version_column(name: str) -> str:

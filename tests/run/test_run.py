@@ -145,6 +145,21 @@ def test_twins_share_what_does_not_differ(finished: Path, rows: list[dict[str, A
         assert np.array_equal(episode.action, twin.action)
 
 
+def test_paths_are_compared_with_the_twins(finished: Path, rows: list[dict[str, Any]]) -> None:
+    """By the positions of the hand in the stored states of both."""
+    kept = {row["episode_id"]: row for row in rows if row["kept"]}
+    lengths = {}
+    for episode_id in kept:
+        hand_m = loader(finished)(episode_id).state[:, :3]
+        lengths[episode_id] = np.linalg.norm(np.diff(hand_m, axis=0), axis=1).sum()
+    for episode_id, row in kept.items():
+        expected = lengths[episode_id] / lengths[row["twin_id"]] if row["twin_id"] in kept else None
+        # A path ends with the state after the last action, which no step of an episode shows.
+        assert row["path_ratio"] == (expected if expected is None else pytest.approx(expected, rel=0.05))
+    assert {row["path_ratio"] for row in kept.values() if row["role"] == "twin"} == {1.0}
+    assert all(row["path_ratio"] is None for row in rows if row["reason"] == "goal_not_reached")
+
+
 def test_statistics_and_sheets(finished: Path, rows: list[dict[str, Any]]) -> None:
     found = json.loads((finished / "dataset_statistics.json").read_text())
     assert set(found) == {"libero_tiny_goal", "libero_tiny_object"}
