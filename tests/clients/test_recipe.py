@@ -26,6 +26,7 @@ from pipeline.clients.recipe import build, check, write
 from pipeline.clients.templates.run_openvla_oft import read_schedule, set_optimiser
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
+from pipeline.formats.registry import formats_of
 
 NAME = "libero_tiny"
 SUITES = {"libero_spatial": f"{NAME}_spatial", "libero_10": f"{NAME}_10"}
@@ -76,6 +77,13 @@ def test_recipe_counts_what_was_kept(tmp_path: Path) -> None:
     values = {name: field["value"] for name, field in recipe["training"].items()}
     assert values["effective_batch_size"] == values["gpus"] * values["batch_size_per_gpu"]
     assert all(field["source"] for field in (*recipe["dataset"].values(), *recipe["training"].values()))
+
+
+@pytest.mark.parametrize("convention", ["ipec", "openpi"])
+def test_every_client_is_named_by_the_format_that_it_reads(convention: str, tmp_path: Path) -> None:
+    export = export_config(lerobot_v21={"name": NAME, "convention": convention})
+    named = [client for one in formats_of(tmp_path, export) for client in one.clients]
+    assert sorted(named) == sorted(tiny_recipe(tmp_path, export)["clients"])
 
 
 def test_recipe_changes_with_the_dataset(tmp_path: Path) -> None:

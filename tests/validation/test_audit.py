@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
+import arenas
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import IDS, NAME, episode, loop
 
 from pipeline.__main__ import main
+from pipeline.axes.scene import ROBOT_X_M
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known
@@ -26,6 +29,7 @@ from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.libero.bddl import Arena
 from pipeline.libero.tasks import find_task
+from pipeline.report.seen import CAMERA_M
 from pipeline.run.export import export
 from pipeline.tables import write_table
 from pipeline.testset import benchmark
@@ -182,3 +186,8 @@ def test_the_command_ends_with_1_where_something_overlaps(
 def test_a_folder_without_a_dataset_is_refused(tmp_path: Path, test: TestSet) -> None:
     with pytest.raises(PipelineError, match="no dataset below this folder"):
         audit(tmp_path, test)
+
+
+@pytest.mark.parametrize("places", [AGENT_VIEWS, CAMERA_M, ROBOT_X_M, arenas.TASKS])
+def test_what_is_known_of_arenas_is_known_of_all(places: Mapping[str, object]) -> None:
+    assert places.keys() == set(get_args(Arena))
