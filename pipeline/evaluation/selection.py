@@ -231,12 +231,13 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
 
 
 def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
-    """``each`` held-out draws of every axis in every suite; parameters only, no scene is built.
+    """``each`` held-out draws of every axis that the benchmark tests, in every suite; no scene is built.
 
     The number of a draw counts up once all tasks and levels had one, so initial states differ too.
     """
     drawn: list[EvaluationTask] = []
-    for suite, axis in product(TESTED_SUITES, OWN_AXES):
+    tested = [axis for axis in OWN_AXES if load().of(axis)]
+    for suite, axis in product(TESTED_SUITES, tested):
         every = (
             drawn_task(task, axis, level, number, seed)
             for number in count()

@@ -81,7 +81,7 @@ def checks() -> dict[str, Any]:
         *(np.zeros((steps + 1, 0), np.float32), Verdict(True, "kept")),
     )
     row: dict[str, Any] = {**made.provenance, "suite": STOVE.suite, "task": STOVE.name, "perturbations": "[]"}
-    row |= {"steps": steps + 1, "place": 1, "instruction": "task_1"}
+    row |= {"kept": True, "steps": steps + 1, "place": 1, "instruction": "task_1"}
     view, other = SCHEMA.views
     shown = {(name, t): decode(made.frames[name][t]) for name in SCHEMA.views for t in sampled(steps)}
     marks = {"is_first": np.arange(steps) == 0, "timestamp": np.arange(steps) / SCHEMA.fps_hz}
