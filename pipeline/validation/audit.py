@@ -16,39 +16,22 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import tensorflow_datasets as tfds
-from scipy.spatial.transform import Rotation
 
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
-from pipeline.axes.camera import ORBIT_CENTRE_M, CameraPerturbation
-from pipeline.axes.language import LanguagePerturbation, load_bank
+from pipeline.axes.camera_pose import AGENT_VIEWS, moved_to
+from pipeline.axes.language import LanguagePerturbation, load_bank, normalise
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats.lerobot_columns import EPISODE_ID, camera_column
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.libero import bddl
-from pipeline.libero.bddl import Arena
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.planning.leakage import AxisDistance
 from pipeline.planning.leakage import check as compare
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TESTED_SUITES, TestSet
 from pipeline.types import Floats, Task
-
-_TURN_WXYZ = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
-_LOW_TURN_WXYZ = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
-AGENT_VIEWS: dict[Arena, tuple[tuple[float, float, float], tuple[float, float, float, float]]] = {
-    "tabletop": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
-    "kitchen": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
-    "study": ((0.4586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
-    "floor": ((0.8965773716836134, 0.0, 0.65), _LOW_TURN_WXYZ),
-    "living_room": ((0.6065773716836134, 0.0, 0.96), _LOW_TURN_WXYZ),
-}
-"""Where LIBERO's agent view stands in the world (m) and how it is turned, by arena (``_setup_camera`` of LIBERO's
-problems)."""
-
-UNMOVED = 0.05
-"""Degrees; a camera nearer than this to LIBERO's own was not moved. Matrices are stored in single precision."""
 
 
 @dataclass(frozen=True)
@@ -247,76 +230,35 @@ def _row(one: Found, task: Task | None, test: TestSet) -> Labelled:
     if one.extrinsics is not None:
         seen = [p for p in seen if p.axis != "camera"]
         arenas = list(AGENT_VIEWS) if task is None else [bddl.read(task.bddl_file).arena]
-        cameras = [camera(one.extrinsics, arena) for arena in arenas]
+        cameras = [moved_to(one.extrinsics, arena) for arena in arenas]
         if None not in cameras:
             anywhere = tasks(TESTED_SUITES[0])[0]
             seen.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
-    rewrites = [] if task is not None and _same(one.instruction, task.instruction) else [_rewrite(one.instruction)]
+    own = task is not None and normalise(one.instruction) == normalise(task.instruction)
+    rewrites = [] if own else [_rewrite(one.instruction)]
     task = task or _nearest_task(rewrites[0], test)
     return Labelled(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
-
-
-def camera(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
-    """The change of the agent view that leads to a pose; None where it was not moved.
-
-    A roll, which no test camera has, is left out: the distance to a test camera is then the least that it can be.
-
-    Args:
-        extrinsics: (4, 4) from the camera (z forward, y down) to the world.
-        arena: whose own agent view the pose is compared with.
-    """
-    own_m, own_wxyz = (np.array(part) for part in AGENT_VIEWS[arena])
-    offset_m, own_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, own_m - ORBIT_CENTRE_M
-    radius_m, own_radius_m = np.linalg.norm(offset_m), np.linalg.norm(own_offset_m)
-    azimuth = np.arctan2(offset_m[1], offset_m[0])
-    elevation = np.arcsin(offset_m[2] / radius_m) - np.arcsin(own_offset_m[2] / own_radius_m)
-    own = Rotation.from_quat(np.roll(own_wxyz, -1))
-    # MuJoCo's cameras look along -z, with y up.
-    turned = Rotation.from_matrix(extrinsics[:3, :3] * [1.0, -1.0, -1.0])
-    in_place = turned * (Rotation.from_euler("z", azimuth) * Rotation.from_euler("y", -elevation) * own).inv()
-    yaw, pitch, _ = in_place.as_euler("zyx")
-    azimuth_deg, elevation_deg, yaw_deg, pitch_deg = np.rad2deg([azimuth, elevation, yaw, -pitch]).tolist()
-    scale = float(radius_m / own_radius_m)
-    if max(map(abs, (azimuth_deg, elevation_deg, yaw_deg, pitch_deg, np.rad2deg(np.log(scale))))) < UNMOVED:
-        return None
-    return CameraPerturbation(
-        component="spherical",
-        level=1,
-        azimuth_deg=azimuth_deg,
-        elevation_deg=elevation_deg,
-        distance_scale=scale,
-        yaw_deg=yaw_deg,
-        pitch_deg=pitch_deg,
-    )
 
 
 def _rewrite(text: str) -> LanguagePerturbation:
     return LanguagePerturbation(component="paraphrase", level=1, text=text)
 
 
-def _same(one: str, other: str) -> bool:
-    return _letters(one) == _letters(other)
-
-
-def _letters(text: str) -> str:
-    return "".join(c for c in text.lower() if c.isalnum())
-
-
 @cache
 def _tasks_by_text() -> dict[str, Task]:
-    """Own instructions and rewrites of the tasks that the benchmark perturbs, by their letters."""
+    """Own instructions and rewrites of the tasks that the benchmark perturbs, normalised."""
     by_text: dict[str, Task] = {}
     bank = load_bank()
     for suite in TESTED_SUITES:
         for task in tasks(suite):
             rewrites = [text for texts in bank.get(suite, {}).get(task.name, {}).values() for text in texts]
             for text in (*rewrites, task.instruction):
-                by_text[_letters(text)] = task
+                by_text[normalise(text)] = task
     return by_text
 
 
 def _task_of(instruction: str) -> Task | None:
-    return _tasks_by_text().get(_letters(instruction))
+    return _tasks_by_text().get(normalise(instruction))
 
 
 def _nearest_task(rewrite: LanguagePerturbation, test: TestSet) -> Task:

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import IDS, NAME, episode, loop
 
 from pipeline.__main__ import main
+from pipeline.axes.camera_pose import AGENT_VIEWS, moved_to
 from pipeline.axes.scene import ROBOT_X_M
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
@@ -35,7 +36,7 @@ from pipeline.tables import write_table
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Episode, Floats
-from pipeline.validation.audit import AGENT_VIEWS, audit, camera
+from pipeline.validation.audit import audit
 
 TASK = find_task("libero_goal", "put_the_bowl_on_the_plate")
 OWN_M = np.array([0.6586131746834771, 0.0, 1.6103500240372423])
@@ -168,7 +169,7 @@ def test_a_pose_is_read_back_as_the_change_that_made_it(arena: Arena) -> None:
         pose = np.eye(4)
         pose[:3, :3] = (in_place * turn * own).as_matrix() @ np.diag([1.0, -1.0, -1.0])
         pose[:3, 3] = CENTRE_M + scale * turn.apply(np.array(own_m) - CENTRE_M)
-        found = camera(pose.astype(np.float32), arena)
+        found = moved_to(pose.astype(np.float32), arena)
         assert found is not None
         parameters = found.azimuth_deg, found.elevation_deg, found.yaw_deg, found.pitch_deg, found.distance_scale
         np.testing.assert_allclose(parameters, (azimuth, elevation, yaw, pitch, scale), atol=2e-3)

@@ -1,0 +1,59 @@
+"""Which change of the agent view leads to a pose: the reverse of ``CameraPerturbation.pose``."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from pipeline.axes.camera import ORBIT_CENTRE_M, CameraPerturbation
+from pipeline.libero.bddl import Arena
+from pipeline.types import Floats
+
+_TURN_WXYZ = (0.6380177736282349, 0.3048497438430786, 0.30484986305236816, 0.6380177736282349)
+_LOW_TURN_WXYZ = (0.6182166934013367, 0.3432307541370392, 0.3432314395904541, 0.6182177066802979)
+AGENT_VIEWS: dict[Arena, tuple[tuple[float, float, float], tuple[float, float, float, float]]] = {
+    "tabletop": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
+    "kitchen": ((0.6586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
+    "study": ((0.4586131746834771, 0.0, 1.6103500240372423), _TURN_WXYZ),
+    "floor": ((0.8965773716836134, 0.0, 0.65), _LOW_TURN_WXYZ),
+    "living_room": ((0.6065773716836134, 0.0, 0.96), _LOW_TURN_WXYZ),
+}
+"""Where LIBERO's agent view stands in the world (m) and how it is turned, by arena (``_setup_camera`` of LIBERO's
+problems)."""
+
+UNMOVED = 0.05
+"""Degrees; a camera nearer than this to LIBERO's own was not moved. Matrices are stored in single precision."""
+
+
+def moved_to(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
+    """The change of the agent view that leads to a pose; None where it was not moved.
+
+    A roll, which no test camera has, is left out: the distance to a test camera is then the least that it can be.
+
+    Args:
+        extrinsics: (4, 4) from the camera (z forward, y down) to the world.
+        arena: whose own agent view the pose is compared with.
+    """
+    own_m, own_wxyz = (np.array(part) for part in AGENT_VIEWS[arena])
+    offset_m, own_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, own_m - ORBIT_CENTRE_M
+    radius_m, own_radius_m = np.linalg.norm(offset_m), np.linalg.norm(own_offset_m)
+    azimuth = np.arctan2(offset_m[1], offset_m[0])
+    elevation = np.arcsin(offset_m[2] / radius_m) - np.arcsin(own_offset_m[2] / own_radius_m)
+    own = Rotation.from_quat(np.roll(own_wxyz, -1))
+    # MuJoCo's cameras look along -z, with y up.
+    turned = Rotation.from_matrix(extrinsics[:3, :3] * [1.0, -1.0, -1.0])
+    in_place = turned * (Rotation.from_euler("z", azimuth) * Rotation.from_euler("y", -elevation) * own).inv()
+    yaw, pitch, _ = in_place.as_euler("zyx")
+    azimuth_deg, elevation_deg, yaw_deg, pitch_deg = np.rad2deg([azimuth, elevation, yaw, -pitch]).tolist()
+    scale = float(radius_m / own_radius_m)
+    if max(map(abs, (azimuth_deg, elevation_deg, yaw_deg, pitch_deg, np.rad2deg(np.log(scale))))) < UNMOVED:
+        return None
+    return CameraPerturbation(
+        component="spherical",
+        level=1,
+        azimuth_deg=azimuth_deg,
+        elevation_deg=elevation_deg,
+        distance_scale=scale,
+        yaw_deg=yaw_deg,
+        pitch_deg=pitch_deg,
+    )
