@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 
@@ -36,12 +36,12 @@ from pipeline.rendering.last_scene import LastScene, scene_of_process
 from pipeline.report.sheets import Tile, describe, sheet, side_by_side
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Demo, Frame, Scene, Task
+from pipeline.types import Demo, Frame, Scene, Task, Trajectory
 
 VARIANTS, PHYSICS_VARIANTS = 11, 3
+"""With the original, three rows of four; one where each variant is a scene of its own to compile."""
 STRIP_STEPS = (0, 6, 16)
 """Control steps after the end of a push that a strip shows, beside where it begins."""
-"""With the original, three rows of four; one where each variant is a scene of its own to compile."""
 CANDIDATES = 200
 """The plan's first draws, from which the variants are chosen; most draws take well under a millisecond."""
 
@@ -84,19 +84,23 @@ class Stage:
             state = roll_out(scene, self.demo, self.replay)[push.first_step + push.steps]
         return frames_of(renderer, state, site_alpha, [Stream(view, changes) for view in views], 0)
 
+    @cached_property
+    def _twin(self) -> Trajectory:
+        """The replay without a push, which all strips show."""
+        return replay(shared(self.demo.task), self.demo, "twin", self.replay)
+
     def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
         """Steps of a pushed replay, and the agent view at each, without the push and with it.
 
         Raises:
             RefusedError: when the demonstration refuses the push, or does not reach its goal without one.
         """
-        environment = shared(self.demo.task)
-        twin = replay(environment, self.demo, "twin", self.replay)
+        twin = self._twin
         if not twin.verdict.kept:
             raise RefusedError(twin.verdict.reason)
         reference = Reference.of(twin.model_xml, twin.states, twin.actions)
         changes = of_layer((perturbation,), PhysicsPerturbation)
-        pushed = replay(environment, self.demo, "pushed", self.replay, changes, lambda: reference)
+        pushed = replay(shared(self.demo.task), self.demo, "pushed", self.replay, changes, lambda: reference)
         if (push := pushed.scene.push) is None:
             raise RefusedError(pushed.verdict.reason)
         renderer, stream = self.opened.renderer(pushed.model_xml), Stream("image", ())
