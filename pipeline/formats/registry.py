@@ -36,6 +36,12 @@ def failures_of(data: Path, options: ExportConfig, extras: Sequence[Extra] = ())
     return formats_of(data / FAILURES, options.of_failures(), (*extras, "outcome")) if options.failures else []
 
 
+def recorded(data: Path, options: ExportConfig, extras: Sequence[Extra] = ()) -> list[Format[Any]]:
+    """The datasets of a run, and those of failures as far as there are some: a run may have none."""
+    failures = failures_of(data, options, extras)
+    return [*formats_of(data, options, extras), *(one for one in failures if one.record_file.exists())]
+
+
 def columns() -> list[pa.Field]:
     """The manifest's columns of all formats."""
     return [column for kind in FORMATS for column in kind.columns]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from pipeline.files import remove
+from pipeline.formats.registry import FAILURES
 from pipeline.run.finished import FOLDER
 from pipeline.run.stage import locked
 
@@ -26,7 +27,7 @@ class Part(NamedTuple):
 def _with_failures(*formats: str) -> tuple[str, ...]:
     """Datasets and records of some formats, which one stage makes."""
     names = [name for one in formats for name in (one, f"{one}.json")]
-    return (*names, *(f"failures/{name}" for name in names))
+    return (*names, *(f"{FAILURES}/{name}" for name in names))
 
 
 PARTS = {

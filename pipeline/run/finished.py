@@ -18,7 +18,7 @@ from pipeline.axes.language import BANK_FILE
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
-from pipeline.formats.registry import failures_of, formats_of
+from pipeline.formats.registry import recorded
 from pipeline.identity import fingerprint
 from pipeline.run.export import untouched
 from pipeline.stores.frame_store import FrameStore
@@ -72,8 +72,7 @@ class Memory:
 def of_validate(config: Config) -> Memory:
     """Of what ``validate`` found: it passed on these contents, of which nothing has changed."""
     names = ("plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "inputs.json")
-    asked = (config.data, config.export, config.render.extras)
-    formats = [*formats_of(*asked), *(one for one in failures_of(*asked) if one.record_file.exists())]
+    formats = recorded(config.data, config.export, config.render.extras)
     stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
     files = [
         *(config.data / name for name in names),

@@ -10,7 +10,7 @@ from pipeline.compute.pool import Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.formats.read_back import Written
-from pipeline.formats.registry import failures_of, formats_of
+from pipeline.formats.registry import recorded
 from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.store import Store
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -30,8 +30,7 @@ def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
     }
     for name, store in stores.items():
         results[name] = _result(workers(_Reader(store), store.names(), name))
-    asked = (config.data, config.export, config.render.extras)
-    for one in (*formats_of(*asked), *(one for one in failures_of(*asked) if one.record_file.exists())):
+    for one in recorded(config.data, config.export, config.render.extras):
         name = one.folder.relative_to(config.data).as_posix()
         try:
             files = one.written()
