@@ -11,10 +11,11 @@ import numpy as np
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Intervals, PhysicsPerturbation, pick
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.types import Demo, Floats, Push, RollOut, Scene, Task
 
-STEP_S = 0.05
+STEP_S = 1 / SCHEMA.fps_hz
 """A control step."""
 
 HAND = "robot0_right_hand"
