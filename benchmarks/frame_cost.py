@@ -28,17 +28,13 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 # isort: split
 import mujoco
 import numpy as np
+from replayed_twin import replayed_twin
 
-from pipeline.compute.pool import loop
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode, to_policy
-from pipeline.planning import plan
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
-from pipeline.run.replay_stage import Replays
-from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.testset import benchmark
 from pipeline.types import Frame, Trajectory
 
 ARENAS = {
@@ -76,12 +72,8 @@ def main() -> None:
     config, drawn = load(Path("configs/starter.yaml")), Clock("mjr_render", "mjr_readPixels")
     figures = {}
     for arena, task in ARENAS.items():
-        demos = config.demos.model_copy(update={"tasks": (task,)})
-        rows = plan.make(demos.index().entries, config.plan, config.replay, benchmark.load())
-        twin = next(row for row in rows if row.role == "twin")
         with TemporaryDirectory() as folder:
-            Replays(demos, config.replay, Path(folder), loop).of([twin])
-            trajectory = TrajectoryStore(Path(folder)).load(twin.trajectory_id)
+            trajectory = replayed_twin(config, task, Path(folder))
         figures[arena] = {
             view + shadows: compared(trajectory, spec.camera, frames, bool(shadows), drawn)
             for shadows, frames in (("", arguments.frames), (" with shadows", arguments.frames // 4))

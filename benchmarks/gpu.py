@@ -31,23 +31,23 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
 # isort: split
 import numpy as np
+from replayed_twin import replayed_twin
 
 from pipeline import gl
-from pipeline.compute.pool import loop
 from pipeline.config import RenderConfig, load
 from pipeline.images.jpeg import encode, to_policy
-from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.savings import PLAIN, why_plain
-from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.testset import benchmark
 from pipeline.types import Frame
 
 CAMERAS = ("agentview", "robot0_eye_in_hand")
 TASK = "libero_goal/put_the_bowl_on_the_plate"
 COMPARED = 20
 """States whose frames are compared with Mesa's."""
+
+SOFTWARE = {"LIBGL_ALWAYS_SOFTWARE": "1", "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
+"""Environment of a process that Mesa renders in."""
 
 _ready: Barrier
 
@@ -72,7 +72,7 @@ def main() -> None:
     print(choice, flush=True)
     with TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        name = _replayed(folder)
+        name = replayed_twin(load(Path("configs/starter.yaml")), TASK, folder).trajectory_id
         ways: dict[str, dict[int, Any]] = {}
         for way, plain in (("plain", "1"), ("with savings", "")):
             os.environ[PLAIN] = plain
@@ -98,18 +98,6 @@ def main() -> None:
         "against_naive": json.loads(naive.stdout.splitlines()[-1]),
     }
     print(json.dumps(figures))
-
-
-SOFTWARE = {"LIBGL_ALWAYS_SOFTWARE": "1", "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "osmesa"}
-
-
-def _replayed(folder: Path) -> str:
-    config = load(Path("configs/starter.yaml"))
-    demos = config.demos.model_copy(update={"tasks": (TASK,)})
-    rows = plan.make(demos.index().entries, config.plan, config.replay, benchmark.load())
-    twin = next(row for row in rows if row.role == "twin")
-    Replays(demos, config.replay, folder, loop).of([twin])
-    return twin.trajectory_id
 
 
 def _by(count: int, folder: Path, name: str, seconds: float) -> dict[str, Any]:

@@ -1,0 +1,20 @@
+"""A demonstration replayed once, for benchmarks that render it again and again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pipeline.compute.pool import loop
+from pipeline.config import Config
+from pipeline.planning import plan
+from pipeline.run.replay_stage import Replays
+from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.types import Trajectory
+
+
+def replayed_twin(config: Config, task: str, folder: Path) -> Trajectory:
+    """The clean replay of a task's first demonstration, which ``folder`` has under its trajectory's id."""
+    demos = config.demos.model_copy(update={"tasks": (task,)})
+    twin = plan.twins(demos.index().entries, config.plan.seed, config.replay)[0]
+    Replays(demos, config.replay, folder, loop).of([twin])
+    return TrajectoryStore(folder).load(twin.trajectory_id)
