@@ -24,7 +24,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
 from pipeline.images.jpeg import decode
 from pipeline.libero.demonstrations import DemoEntry
-from pipeline.physics.environment import shared
+from pipeline.physics.environment import Environment
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.rendering.last_scene import scene_of_process
@@ -193,7 +193,7 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
 
 
 def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
-    environment = shared(BOWL)
+    environment = Environment(BOWL)
     environment.restore(stage.scene)
     environment.settle(10)
     begun = Trajectory(
@@ -205,6 +205,7 @@ def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
         site_alpha=np.stack([environment.site_alpha] * 2),
         verdict=Verdict(True, "kept"),
     )
+    environment.close()
     shown = stage.frames(VIEWS)
     streams = streams_of("[]")
     rendered = render(begun, BOWL, list(streams.values()), STARTER.render, stage.opened)
