@@ -140,8 +140,9 @@ def _render(folder: Path, name: str, seconds: float) -> Rendered:
 def _in_new_process(folder: Path, name: str, **environment: str) -> np.ndarray[Any, np.dtype[np.uint8]]:
     """(N, H, W, 3) frames of the first states, rendered plainly by a process of its own."""
     file = folder / "frames.npy"
-    code = f"import sys, runpy; sys.argv = ['gpu.py']; runpy.run_path({__file__!r})['_save']({str(folder)!r}, {name!r})"
-    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | {PLAIN: "1"} | environment)
+    code = f"from gpu import _save; _save({str(folder)!r}, {name!r})"
+    environment |= {PLAIN: "1", "PYTHONPATH": str(Path(__file__).parent)}
+    subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | environment)
     frames: np.ndarray[Any, np.dtype[np.uint8]] = np.load(file)
     return frames
 
