@@ -16,7 +16,7 @@ from pipeline.axes.language import load_bank
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
 from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
-from pipeline.libero.tasks import select_tasks
+from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.types import RenderedExtra
 
 
@@ -238,9 +238,11 @@ class Config(Frozen):
     @classmethod
     def _known_tasks(cls, demos: DemosConfig) -> DemosConfig:
         try:
-            select_tasks(demos.tasks)
+            chosen = select_tasks(demos.tasks)
         except PipelineError as error:
             raise ValueError(f"tasks: {error.what}, expected {error.expected}") from error
+        if demos.root is None and (own := next((task for task in chosen if task.suite not in SUITES), None)):
+            raise ValueError(f"the starter set has no demonstration of {own.suite}/{own.name}: set root")
         return demos
 
     @field_validator("export")

@@ -18,10 +18,10 @@ from pipeline.libero.relations import relation_holds
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
-STEP_M = {"libero_spatial": 0.01, "libero_object": 0.03, "libero_goal": 0.02, "libero_10": 0.01, "libero_90": 0.01}
+STEP_M = {"libero_spatial": 0.01, "libero_object": 0.03, "libero_goal": 0.02, "libero_10": 0.01}
 WIDER_M = {"LIVING_ROOM_SCENE1": 0.02}
 """Radius of LIBERO-Plus's disks at level 1, by suite, and by the scene that differs; at level k it is k times that.
-LIBERO-Plus leaves LIBERO-90 out: its tasks have the disks of the long suite, whose scenes are some of its own."""
+Tasks that LIBERO-Plus leaves out, LIBERO-90's and one's own, have the disks of the long suite."""
 
 BASE_M = {"akita_black_bowl_1": (0.35, 0.05), "cream_cheese_1": (0.15, 0.10), "wine_bottle_1": (0.0, 0.05)}
 """How far LIBERO-Plus puts things of the goal suite from LIBERO's own places before its disks apply."""
@@ -133,7 +133,9 @@ def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePertu
     """
     known = bddl.read(task.bddl_file)
     carriers = known.carriers
-    radius_m = level * next((m for name, m in WIDER_M.items() if task.name.startswith(name)), STEP_M[task.suite])
+    radius_m = level * next(
+        (m for name, m in WIDER_M.items() if task.name.startswith(name)), STEP_M.get(task.suite, 0.01)
+    )
     base_m = {
         name: shift
         for name, shift in BASE_M.items()

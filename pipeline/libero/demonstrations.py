@@ -8,7 +8,6 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, Protocol
 
@@ -19,7 +18,7 @@ import yaml
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.assets import package_folder, relocate
-from pipeline.libero.tasks import SUITES, find_task, tasks
+from pipeline.libero.tasks import SUITES, find_task, suites, tasks
 from pipeline.types import Demo, Floats, Task
 
 LARGEST_STATE = 1e10
@@ -278,6 +277,8 @@ class _Recorded(NamedTuple):
             content.update(repr(array.shape).encode())
             content.update(array.astype("<f8").tobytes())
         content.update((self.model_file or "").encode())
+        if self.task.suite not in SUITES:  # LIBERO's own tasks change with its package only.
+            content.update(self.task.bddl_file.read_bytes())
         model_xml = None if self.model_file is None else relocate(self.model_file, where=f"{where} model_file")
         whole = states if len(states) == len(actions) else None
         return Demo(*self[:4], content.hexdigest(), actions, states[0].copy(), whole, model_xml)
@@ -294,6 +295,5 @@ def _parse(demo_id: str) -> tuple[Task, str]:
     return find_task(parts[0], parts[1]), parts[2]
 
 
-@cache
 def _task_names() -> frozenset[str]:
-    return frozenset(task.name for suite in SUITES for task in tasks(suite))
+    return frozenset(task.name for suite in suites() for task in tasks(suite))

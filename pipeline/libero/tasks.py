@@ -1,4 +1,4 @@
-"""LIBERO's task list."""
+"""LIBERO's task list, and tasks of one's own beside it."""
 
 from __future__ import annotations
 
@@ -7,24 +7,55 @@ import fnmatch
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 from runpy import run_path
 
 from pipeline.errors import PipelineError
+from pipeline.libero import bddl
 from pipeline.libero.assets import libero_folder
 from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
 
-@cache
+OWN = Path("tasks")
+"""Tasks of one's own: ``<suite>/<task>.bddl`` below this folder of the one that a run is started in, as workers are."""
+
+
+def suites() -> tuple[str, ...]:
+    """LIBERO's suites, then those of one's own.
+
+    Raises:
+        PipelineError: when one of one's own has a name that cannot be used.
+    """
+    own = sorted(folder.name for folder in OWN.glob("*") if any(folder.glob("*.bddl")))
+    for name in own:
+        if name in SUITES or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+            raise PipelineError(
+                f"a suite cannot be called {name!r}",
+                where=OWN / name,
+                expected="lower-case letters, digits and _, and none of LIBERO's suites",
+                remedy="rename the folder, and that of its demonstrations",
+            )
+    return (*SUITES, *own)
+
+
 def tasks(suite: str) -> tuple[Task, ...]:
-    """A suite's tasks, in the order of LIBERO's list.
+    """A suite's tasks, in the order of LIBERO's list; those of one's own by name, with the instruction of their file.
 
     Raises:
         PipelineError: when there is no such suite.
     """
-    if suite not in SUITES:
-        raise PipelineError(f"unknown suite {suite!r}", expected=" or ".join(SUITES))
+    if suite in SUITES:
+        return _listed(suite)
+    if suite not in suites():
+        raise PipelineError(f"unknown suite {suite!r}", expected=" or ".join(suites()))
+    files = sorted((OWN / suite).absolute().glob("*.bddl"))
+    return tuple(Task(suite, file.stem, bddl.read(file).language, file) for file in files)
+
+
+@cache
+def _listed(suite: str) -> tuple[Task, ...]:
     folder = libero_folder() / "bddl_files" / suite
     return tuple(Task(suite, name, _instruction(name), folder / f"{name}.bddl") for name in _names()[suite])
 
@@ -62,7 +93,7 @@ def select_tasks(patterns: Iterable[str]) -> list[Task]:
     Raises:
         PipelineError: when a pattern matches nothing.
     """
-    known = {f"{task.suite}/{task.name}": task for suite in SUITES for task in tasks(suite)}
+    known = {f"{task.suite}/{task.name}": task for suite in suites() for task in tasks(suite)}
     chosen: set[str] = set()
     for pattern in patterns:
         matched = fnmatch.filter(known, pattern)

@@ -1,8 +1,8 @@
 """What DVC cannot read off a configuration: what it leaves to defaults, and what lies in the files that it names.
 
-Those are demonstrations, a bank of rewrites, folders of textures and objects. A stage writes out the configuration and
-lists these files each time, and other stages depend on that: a changed file is noticed, and where both are the same
-nothing runs again.
+Those are demonstrations, tasks of one's own, a bank of rewrites, folders of textures and objects. A stage writes out
+the configuration and lists these files each time, and other stages depend on that: a changed file is noticed, and where
+both are the same nothing runs again.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pydantic import BaseModel
 
 from pipeline.config import Config
 from pipeline.files import checksum
+from pipeline.libero.tasks import OWN, SUITES, select_tasks
 from pipeline.run.finished import settings_of
 
 HASHED_BYTES = 16_000_000
@@ -27,11 +28,12 @@ def listing(config: Config) -> dict[str, list[str | int]]:
     A file is named by the field of the configuration and its path in the folder that stands there, such as
     ``demos.root/libero_goal/turn_on_the_stove_demo.hdf5``: where that folder lies changes nothing.
     """
+    own = (task for task in select_tasks(config.demos.tasks) if task.suite not in SUITES)
     return {
         (PurePosixPath(field) / file.relative_to(path)).as_posix(): _state(file)
         for field, path in _paths({name: section for name, section in config if name != "folder"})
         for file in sorted(_files(path))
-    }
+    } | {f"{OWN}/{task.suite}/{task.name}.bddl": _state(task.bddl_file) for task in own}
 
 
 def settings(config: Config) -> dict[str, Any]:

@@ -10,13 +10,13 @@ from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
-from pipeline.libero.tasks import SUITES, find_task
+from pipeline.libero.tasks import find_task, suites
 from pipeline.planning.plan import twins
 from pipeline.run.outcome import MISSED
 from pipeline.run.replay_job import ReplayJob
 from pipeline.types import Task
 
-LAYOUT = f"<suite>/<task>_demo.hdf5, with a suite of {', '.join(SUITES)}"
+LAYOUT = "<suite>/<task>_demo.hdf5, with a suite of LIBERO's or of one's own, whose tasks are tasks/<suite>/<task>.bddl"
 
 
 @dataclass
@@ -74,7 +74,7 @@ def check(root: Path, replays: int, run: Workers) -> Found:
 
 def _task_of(file: Path, root: Path) -> Task:
     suite, *name = file.relative_to(root).parts
-    if suite not in SUITES or len(name) != 1 or not name[0].endswith("_demo.hdf5"):
+    if suite not in suites() or len(name) != 1 or not name[0].endswith("_demo.hdf5"):
         raise PipelineError("is not where a run looks", where=file, expected=LAYOUT, remedy="move or rename it")
     try:
         return find_task(suite, name[0].removesuffix("_demo.hdf5"))

@@ -14,7 +14,7 @@ from pipeline.axes import AXES, PhysicsPerturbation, RenderPerturbation, axes_of
 from pipeline.config import Config, DemosConfig, PlanConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
-from pipeline.libero.tasks import select_tasks
+from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.types import Extra
 
 JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
@@ -90,12 +90,15 @@ def _own(plan: PlanConfig) -> _Own:
 
 
 def _lengths(demos: DemosConfig) -> list[list[int]]:
-    """Steps of the demonstrations of each task; where its file is not there yet, as long as the starter set's one."""
-    starter = {entry.task: entry.steps for entry in StarterSource().index(select_tasks(demos.tasks)).entries}
+    """Steps of the demonstrations of each task; where LIBERO's file is not there yet, as the starter set's one."""
+    starter = StarterSource()
     if demos.root is None:
-        return [[steps] for steps in starter.values()]
-    source = HDF5Source(demos.root)
-    return [
-        source.lengths(task)[: demos.per_task] or [steps] * (demos.per_task or PUBLISHED)
-        for task, steps in starter.items()
-    ]
+        return [[entry.steps] for entry in starter.index(select_tasks(demos.tasks)).entries]
+    source, found = HDF5Source(demos.root), []
+    for task in select_tasks(demos.tasks):
+        lengths = source.lengths(task)[: demos.per_task]
+        if not lengths and task.suite in SUITES:
+            lengths = [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED)
+        if lengths:
+            found.append(lengths)
+    return found

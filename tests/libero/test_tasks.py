@@ -1,4 +1,4 @@
-"""LIBERO's task list, read without importing LIBERO."""
+"""LIBERO's task list, read without importing LIBERO, and tasks of one's own."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import pytest
 from libero.libero import get_libero_path
 from libero.libero.benchmark import task_maps
 
-from pipeline.libero.tasks import SUITES, tasks
+from pipeline.errors import PipelineError
+from pipeline.libero.tasks import SUITES, find_task, select_tasks, suites, tasks
 
 
 @pytest.mark.parametrize("suite", SUITES)
@@ -16,3 +17,27 @@ def test_names_instructions_and_files_are_liberos(suite: str) -> None:
     folder = Path(get_libero_path("bddl_files")).resolve() / suite
     theirs = [(known.name, known.language, folder / known.bddl_file) for known in task_maps[suite].values()]
     assert [(task.name, task.instruction, task.bddl_file) for task in tasks(suite)] == theirs
+
+
+def own_task(folder: Path, language: str = "Put the bowl down") -> Path:
+    """The definition of LIBERO's task of the bowl, told otherwise, as a task of one's own."""
+    text = find_task("libero_goal", "put_the_bowl_on_the_plate").bddl_file.read_text()
+    folder.mkdir(parents=True)
+    file = folder / "bowl_down.bddl"
+    file.write_text(text.replace("(:language Put the bowl on the plate)", f"(:language {language})"))
+    return file
+
+
+def test_own_tasks_stand_beside_liberos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = own_task(tmp_path / "tasks" / "my_suite")
+    assert suites() == (*SUITES, "my_suite")
+    (task,) = select_tasks(["my_suite/*"])
+    assert (task.suite, task.name, task.bddl_file) == ("my_suite", "bowl_down", file)
+    assert task.instruction == "put the bowl down"
+    assert find_task("my_suite", "bowl_down") == task
+    with pytest.raises(PipelineError, match="my_suite has no task 'bowl_up'"):
+        find_task("my_suite", "bowl_up")
+    own_task(tmp_path / "tasks" / "My suite")
+    with pytest.raises(PipelineError, match="a suite cannot be called 'My suite'"):
+        suites()

@@ -10,10 +10,13 @@ import h5py
 import numpy as np
 import pytest
 from conftest import BOWL, STOVE
+from pydantic import ValidationError
 
 from pipeline.compute.pool import loop
+from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
+from pipeline.run.inputs import listing
 from pipeline.types import Task, Trajectory
 from pipeline.validation.demonstrations import Found, check
 
@@ -89,6 +92,35 @@ def test_damage_copies_and_strange_names_are_named(root: Path) -> None:
     assert f"{bowl} data/demo_7: holds the same actions, states and model as {BOWL.suite}/{BOWL.name}/demo_0" in told
     assert "turn_of_the_stove_demo.hdf5: libero_goal has no task 'turn_of_the_stove'" in told
     assert f"{root / 'loose.hdf5'}: is not where a run looks" in told
+
+
+def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The demonstrations of LIBERO's task, and its scene, under other names, with its goal and with another one."""
+    monkeypatch.chdir(root)
+    text, goal = BOWL.bddl_file.read_text(), "(And (On akita_black_bowl_1 plate_1))"
+    assert goal in text
+    for name, wanted in {"bowl_away": goal, "bowl_cooks": goal.replace("plate_1", "flat_stove_1_cook_region")}.items():
+        definition, file = Path(f"tasks/my_suite/{name}.bddl"), Path(f"own/my_suite/{name}_demo.hdf5")
+        for path in (definition, file):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        definition.write_text(text.replace(goal, wanted))
+        shutil.copy(file_of(root, BOWL), file)
+        with h5py.File(file, "r+") as opened:
+            opened["data"].attrs["bddl_file_name"] = definition.name
+    found = check(Path("own"), 2, loop)
+    assert (found.files, found.demonstrations, found.missed) == (2, 4, ["my_suite/bowl_away/demo_1"])
+    missing = [fault.split("my_suite/")[1].split(",")[0] for fault in found.faults]
+    assert missing == [f"bowl_cooks_demo.hdf5 data/demo_{n}: misses its goal" for n in (0, 1)]
+
+    said = {"name": "own", "demos": {"root": "own", "tasks": ["my_suite/*"]}, "plan": {"episodes": {"camera": 1}}}
+    config = Config.model_validate(said)
+    before, (away, *_) = listing(config), config.demos.index().entries
+    assert "tasks/my_suite/bowl_away.bddl" in before
+    Path("tasks/my_suite/bowl_away.bddl").write_text(text.replace(goal, "(And (On plate_1 main_table))"))
+    assert listing(config) != before
+    assert config.demos.index().entries[0].sha256 != away.sha256, "the goal that it was judged by is another"
+    with pytest.raises(ValidationError, match="the starter set has no demonstration of my_suite/bowl_away: set root"):
+        Config.model_validate({**said, "demos": {"tasks": ["my_suite/*"]}})
 
 
 def test_two_files_with_one_demonstration_are_named(root: Path) -> None:
