@@ -60,7 +60,7 @@ def faces_that_show(
 ) -> int:
     """Write the corners of all faces that may cover a sample, in their order, and between them some without an area.
 
-    Three loops without branches leave out faces one after the other. With branches, most of the time would go into
+    Two loops without branches leave out faces one after the other. With branches, most of the time would go into
     those that the processor predicts wrongly.
 
     Args:
@@ -76,9 +76,7 @@ def faces_that_show(
     corners = faces.place_of_corner
     at_px, outside = _projected(matrix, near_m, far_m, faces.places_m, *size_px)
     left, doubtful, before = _facing(at_px, outside, corners, BATCH_FACES)
-    count = _reaching(at_px, corners, samples, *size_px, left, doubtful, before)
-    left, doubtful, before = left[:count], doubtful[:count], before[:count]
-    count, either_way = _covering(at_px, corners, samples, left, doubtful, before)
+    count, either_way = _covering(at_px, corners, samples, *size_px, left, doubtful, before)
     return _in_batches(
         faces.corners, corners, outside, left[:count], before[:count], either_way[:count], BATCH_FACES, found
     )
@@ -141,7 +139,7 @@ def _facing(
 
 
 @compiled
-def _reaching(
+def _covering(
     at_px: NDArray[np.float32],
     place_of_corner: NDArray[np.uint32],
     samples: NDArray[np.float32],
@@ -150,46 +148,12 @@ def _reaching(
     left_over: NDArray[np.int32],
     doubtful: NDArray[np.bool_],
     before: NDArray[np.bool_],
-) -> int:
-    """Keep the faces whose rectangle of columns and rows may hold a sample of the picture.
-
-    Returns:
-        How many are kept; they are written to the front of the last three arrays, which are those of ``_facing``.
-    """
-    margin, count = np.float32(MARGIN_PX), 0
-    for number in range(len(left_over)):
-        face = left_over[number]
-        a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
-        ax, ay, bx, by, cx, cy = at_px[a, 0], at_px[a, 1], at_px[b, 0], at_px[b, 1], at_px[c, 0], at_px[c, 1]
-        left, right, low, high = ax, ax, ay, ay
-        left, right = (bx if bx < left else left), (bx if bx > right else right)
-        left, right = (cx if cx < left else left) - margin, (cx if cx > right else right) + margin
-        low, high = (by if by < low else low), (by if by > high else high)
-        low, high = (cy if cy < low else low) - margin, (cy if cy > high else high) + margin
-        inside = False
-        for sample in range(SAMPLES):
-            x, y = samples[sample, 0], samples[sample, 1]
-            inside |= (np.ceil(left - x) + x <= right) & (np.ceil(low - y) + y <= high)
-        inside &= (right >= 0) & (left <= width_px) & (high >= 0) & (low <= height_px)
-        cut = ax + bx + cx
-        left_over[count], doubtful[count], before[count] = face, doubtful[number], before[number]
-        count += inside | (cut != cut)
-    return count
-
-
-@compiled
-def _covering(
-    at_px: NDArray[np.float32],
-    place_of_corner: NDArray[np.uint32],
-    samples: NDArray[np.float32],
-    left_over: NDArray[np.int32],
-    doubtful: NDArray[np.bool_],
-    before: NDArray[np.bool_],
 ) -> tuple[int, NDArray[np.bool_]]:
-    """Keep the faces that may cover a sample.
+    """Keep the faces that may cover a sample of the picture.
 
     Returns:
-        How many are kept, written to the front as in ``_reaching``; and of each, whether it may face either way.
+        How many are kept, written to the front of the last three arrays, which are those of ``_facing``; and of each,
+        whether it may face either way.
     """
     either_way = np.empty(len(left_over), np.bool_)
     margin, count = np.float32(MARGIN_PX), 0
@@ -198,7 +162,9 @@ def _covering(
         a, b, c = place_of_corner[face, 0], place_of_corner[face, 1], place_of_corner[face, 2]
         ax, ay, bx, by, cx, cy = at_px[a, 0], at_px[a, 1], at_px[b, 0], at_px[b, 1], at_px[c, 0], at_px[c, 1]
         left, low = min(ax, bx, cx) - margin, min(ay, by, cy) - margin
-        wide = (max(ax, bx, cx) + margin - left > 1) | (max(ay, by, cy) + margin - low > 1)
+        right, high = max(ax, bx, cx) + margin, max(ay, by, cy) + margin
+        inside = (right >= 0) & (left <= width_px) & (high >= 0) & (low <= height_px)
+        wide = (right - left > 1) | (high - low > 1)
         abx, aby, bcx, bcy, cax, cay = bx - ax, by - ay, cx - bx, cy - by, ax - cx, ay - cy
         # Of each side, how far a place is to its left, times the side's length.
         ab = margin * (abs(abx) + abs(aby)) - abx * ay + aby * ax
@@ -208,13 +174,14 @@ def _covering(
         for sample in range(SAMPLES):
             x = np.ceil(left - samples[sample, 0]) + samples[sample, 0]
             y = np.ceil(low - samples[sample, 1]) + samples[sample, 1]
-            covers |= (abx * y - aby * x + ab >= 0) & (bcx * y - bcy * x + bc >= 0) & (cax * y - cay * x + ca >= 0)
+            within = (x <= right) & (y <= high) & (abx * y - aby * x + ab >= 0)
+            covers |= within & (bcx * y - bcy * x + bc >= 0) & (cax * y - cay * x + ca >= 0)
         cut = ax + bx + cx
         unsure = margin * (abs(cax) + abs(cay) + abs(bcx) + abs(bcy) + margin)
         left_over[count], before[count] = face, before[number]
         # To OpenGL, whose numbers have the same precision, it may face either way.
         either_way[count] = cay * bcx - cax * bcy <= unsure / 8
-        count += covers | wide | doubtful[number] | (cut != cut)
+        count += (inside & (covers | wide | doubtful[number])) | (cut != cut)
     return count, either_way
 
 
