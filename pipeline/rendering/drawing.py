@@ -1,6 +1,6 @@
 """The rendering of a scene by MuJoCo's public functions alone.
 
-Any other ``Drawing`` (``savings.py``) must give the same pixels.
+Any other drawing (``savings.py``) must give the same pixels.
 """
 
 from __future__ import annotations
@@ -43,28 +43,6 @@ def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> 
     return [data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
 
 
-class Drawing(Protocol):
-    """Renders the states of one model at a time; close it before another is made."""
-
-    def adopt(self, model: mujoco.MjModel) -> bool:
-        """Go on with another model in the same OpenGL context.
-
-        Returns:
-            Whether that is possible; if not, nothing has changed. If it raises, the drawing has to be closed.
-        """
-
-    def frame(self, data: mujoco.MjData, camera: str) -> Frame:
-        """(H, W, 3) uint8 RGB in the orientation of LIBERO's raw observations; ``mj_forward`` has to be done."""
-
-    def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
-        """What each pixel of a frame shows."""
-
-    def load(self, textures: Collection[int]) -> None:
-        """Upload these textures from the model's ``tex_data``."""
-
-    def close(self) -> None: ...
-
-
 @runtime_checkable
 class SideBySide(Protocol):
     """A drawing that keeps several variants of its textures uploaded, and renders what they share once."""
@@ -82,6 +60,8 @@ class SideBySide(Protocol):
 
 class PlainDrawing:
     """Renders all of a model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in a context of its own.
+
+    Close it before another is made.
 
     Args:
         model: what to render.
@@ -111,16 +91,21 @@ class PlainDrawing:
         self._option.geomgroup[0] = 0
 
     def adopt(self, model: mujoco.MjModel) -> bool:
-        """Never: each scene gets a context of its own."""
+        """Go on with another model in the same OpenGL context, if that is possible; here it is not.
+
+        If it returns False, nothing has changed. If it raises, the drawing has to be closed.
+        """
         return False
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:
+        """(H, W, 3) uint8 RGB in the orientation of LIBERO's raw observations; ``mj_forward`` has to be done."""
         self._gl.make_current()
         self._update(data, camera)
         self._render()
         return self._pixels()
 
     def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
+        """What each pixel of a frame shows."""
         self._gl.make_current()
         self._update(data, camera)
         # A geom's colour is its number in the scene, and one more.
@@ -144,6 +129,7 @@ class PlainDrawing:
         return Surfaces(depth_m.astype(np.float32), *np.moveaxis(shown[place], -1, 0))
 
     def load(self, textures: Collection[int]) -> None:
+        """Upload these textures from the model's ``tex_data``."""
         self._gl.make_current()
         for texture in textures:
             mujoco.mjr_uploadTexture(self._model, self._context, texture)

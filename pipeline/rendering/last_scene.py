@@ -32,29 +32,25 @@ class LastScene:
             PipelineError: when nothing renders on this machine.
             ValueError: when MuJoCo refuses the scene or one of its images.
         """
-        if self._renderer is None or not self._is_last(scene):
-            model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
-            drawing = self._renderer.drawing if self._renderer and self._adopted(self._renderer, model) else None
-            if drawing is None:
-                self.close()
-                # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
-                self._renderer = Renderer(model)
-                atexit.register(self.close)
-            else:
-                self._renderer = Renderer(model, drawing)
-            self._scene = scene
-        return self._renderer
-
-    def _adopted(self, renderer: Renderer, model: mujoco.MjModel) -> bool:
+        same = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
+        if self._renderer is not None and same:
+            return self._renderer
+        model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
         try:
-            return renderer.drawing.adopt(model)
+            adopted = self._renderer is not None and self._renderer.drawing.adopt(model)
         except BaseException:
             # It holds parts of both scenes now.
             self.close()
             raise
-
-    def _is_last(self, scene: str | mujoco.MjModel) -> bool:
-        return scene is self._scene or (isinstance(scene, str) and scene == self._scene)
+        if self._renderer is not None and adopted:
+            self._renderer = Renderer(model, self._renderer.drawing)
+        else:
+            self.close()
+            self._renderer = Renderer(model)
+            # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
+            atexit.register(self.close)
+        self._scene = scene
+        return self._renderer
 
     def close(self) -> None:
         if self._renderer is not None:

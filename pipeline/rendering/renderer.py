@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import RenderPerturbation
-from pipeline.rendering.drawing import Drawing, SideBySide, Surfaces, texels
+from pipeline.rendering.drawing import PlainDrawing, SideBySide, Surfaces, texels
 from pipeline.rendering.savings import drawing_of
 from pipeline.scenes.compiled import compiled
 from pipeline.types import Frame, State
@@ -28,10 +28,10 @@ class Renderer:
         PipelineError: when nothing renders on this machine.
     """
 
-    def __init__(self, scene: str | mujoco.MjModel, drawing: Drawing | None = None):
+    def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None):
         self.model = compiled(scene) if isinstance(scene, str) else scene
         self.data = mujoco.MjData(self.model)
-        self.drawing: Drawing = drawing or drawing_of(self.model)
+        self.drawing = drawing or drawing_of(self.model)
         self._perturbations: tuple[RenderPerturbation, ...] = ()
 
     def restore(self, state: NDArray[np.float64], site_alpha: NDArray[np.float32]) -> None:

@@ -14,7 +14,7 @@ import os
 import mujoco
 
 from pipeline import gl
-from pipeline.rendering.drawing import Drawing, PlainDrawing
+from pipeline.rendering.drawing import PlainDrawing
 
 PLAIN = "PLAIN_RENDERING"
 """Environment variable: if it is set and not empty, all scenes are rendered plainly."""
@@ -26,7 +26,7 @@ DEVICE = "llvmpipe"
 """How the names of tested devices begin: Mesa's renderer without a GPU."""
 
 
-def drawing_of(model: mujoco.MjModel) -> Drawing:
+def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
     """A drawing of a model, with savings where they can be used.
 
     Raises:

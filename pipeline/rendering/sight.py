@@ -66,17 +66,12 @@ class Sight:
     def faults(self, original: Sight) -> list[str]:
         """Names of what a camera shows too little of; empty when it shows enough.
 
-        * ``task_object_not_seen``: a thing shows on fewer than ``LEAST_PX`` pixels.
-        * ``hand_not_seen``: the hand is outside of the frame for more than ``MOST_OUTSIDE`` of the steps.
-        * ``added_objects_not_seen``: fewer of these show than the layout axis asks for.
-
-        The first two do not count when the scene's own camera shows no more.
+        Of the task's things and the hand, no more is asked than the scene's own camera shows.
         """
-        lost = any(px < min(LEAST_PX, original.things_px[thing]) for thing, px in self.things_px.items())
-        away = self.hand_outside > max(MOST_OUTSIDE, original.hand_outside)
+        least_px = {thing: min(LEAST_PX, px) for thing, px in original.things_px.items()}
         faults = {
-            "task_object_not_seen": lost,
-            "hand_not_seen": away,
+            "task_object_not_seen": any(px < least_px[thing] for thing, px in self.things_px.items()),
+            "hand_not_seen": self.hand_outside > max(MOST_OUTSIDE, original.hand_outside),
             "added_objects_not_seen": bool(self.added_px) and not enough_seen(self.added_px),
         }
         return [name for name, holds in faults.items() if holds]
