@@ -50,8 +50,8 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
     low, high = np.stack([model.joint(name).range for name in ARM]).T
     arm = qpos[:, [int(model.joint(name).qposadr[0]) for name in ARM]]
     return Quality(
-        non_target_moved_m=_rounded(away_m.max(initial=0.0)),
-        non_target_left_m=_rounded(away_m[-1].max(initial=0.0)),
+        non_target_moved_m=_single(away_m.max(initial=0.0), MOVED_M),
+        non_target_left_m=_single(away_m[-1].max(initial=0.0), MOVED_M),
         touched_steps=touched,
         path_m=_single(steps_m.sum()),
         jerk_rms_m_s3=_single(_jerk(hand)),
@@ -80,13 +80,9 @@ def _displacements(model: mujoco.MjModel, qpos: Floats, named: Set[str]) -> Floa
     return distances
 
 
-def _single(value: float) -> float:
-    """As the datasets have it, in single precision."""
-    return float(np.float32(value))
-
-
-def _rounded(distance_m: float) -> float:
-    return _single(distance_m) if distance_m >= MOVED_M else 0.0
+def _single(value: float, least: float = -np.inf) -> float:
+    """As the datasets have it, in single precision; 0 for less than ``least``."""
+    return float(np.float32(value)) if value >= least else 0.0
 
 
 def _jerk(hand: Floats) -> float:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -56,13 +55,8 @@ class Reference:
 
     @classmethod
     def of(cls, model_xml: str, states: Floats, actions: Floats) -> Reference:
-        """Read a rollout; takes half a second for the model and under a millisecond for each state.
-
-        Args:
-            model_xml: MJCF of the scene that it happened in.
-            states: (K+1, S) flattened MuJoCo states.
-            actions: (K, 7).
-        """
+        """Read a rollout, its states (K+1, S) and actions (K, 7), in the scene of an MJCF; takes half a second for the
+        model and under a millisecond for each state."""
         compiled = CompiledScene(Scene(model_xml, states[0]))
         model, data = compiled.model, compiled.data
         free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
@@ -95,23 +89,13 @@ class Reference:
         }
 
 
-class _Contacts(NamedTuple):
-    """The masks of ``Reference``."""
-
-    busy: Mask
-    engaged: Mask
-    held: Mapping[str, Mask]
-    carried: Mapping[str, Mask]
-    met: Mapping[str, Mask]
-
-
 def _contacts(
     model: mujoco.MjModel,
     partners: Sequence[Mapping[int, set[int]]],
     poses: Mapping[str, Floats],
     places: Mapping[str, Floats],
-) -> _Contacts:
-    """Read the contacts at each of K+1 states; ``poses`` and ``places`` are those of ``Reference``."""
+) -> tuple[Mask, Mask, Mapping[str, Mask], Mapping[str, Mask], Mapping[str, Mask]]:
+    """``Reference``'s ``busy``, ``engaged``, ``held``, ``carried`` and ``met``, from its ``poses`` and ``places``."""
     steps, robot = len(partners), int(model.body("robot0_base").rootid[0])
     # By the joint: bodies of added objects have names of another kind.
     free = {int(model.body_rootid[model.joint(f"{name}_joint0").bodyid[0]]): name for name in poses}
@@ -144,9 +128,11 @@ def _contacts(
                 met[things[other]][let_go[body]] = True
             if touched - {robot}:
                 for region in regions:
-                    if _within(model.site(region).size, places[region], poses[name][step]):
+                    # Its origin is over the region, or under it.
+                    away_m = np.abs(poses[name][step, :2] - places[region][:2])
+                    if (away_m < model.site(region).size[:2]).all():
                         met[region][let_go[body]] = True
-    return _Contacts(busy, engaged, held, carried, met)
+    return busy, engaged, held, carried, met
 
 
 def _roots(model: mujoco.MjModel) -> set[str]:
@@ -163,11 +149,6 @@ def _places(model: mujoco.MjModel, data: mujoco.MjData) -> dict[str, Floats]:
         if model.body(model.site_bodyid[site]).name in SURFACES:
             places[model.site(site).name] = fixed_pose(data, model.site(site).name)
     return places
-
-
-def _within(half_m: Floats, region: Floats, pose: Floats) -> bool:
-    """Whether an object's origin is over a region, or under it."""
-    return bool((np.abs(pose[:2] - region[:2]) < half_m[:2]).all())
 
 
 def _partners(compiled: CompiledScene) -> dict[int, set[int]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +48,10 @@ def replay(
         scene, refused = _perturbed(environment, demo, config, perturbations)
     except UnusableSceneError as error:
         print(f"dropped {demo.demo_id}, {error.reason}: {error}", file=sys.stderr)
-        return _not_simulated(demo, trajectory_id, error)
+        scene = Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)})
+        none, alpha = np.empty((0, 7)), np.empty((1, 0), np.float32)
+        dropped = Verdict(False, error.reason)
+        return Trajectory(trajectory_id, "open_loop", scene, demo.init_state[None], none, alpha, dropped)
 
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         settle_steps, acting = (0, lambda: iter(())) if refused else (config.settle_steps, policy)
@@ -61,27 +63,19 @@ def replay(
     followed = reference() if tracks else None
     if followed is None:
         opened = rollout("open_loop", lambda: iter(demo.actions[kept_actions(demo.actions, config.noops)]))
-        if config.mode != "auto" or opened.verdict.kept or refused:
-            return opened
-        followed = reference()
-        if followed is None:
+        if config.mode != "auto" or opened.verdict.kept or refused or (followed := reference()) is None:
             return opened
     return rollout("tracked", lambda: _tracking(environment, followed))
 
 
-class _Executed(NamedTuple):
-    """As in ``Trajectory``."""
-
-    states: Floats
-    actions: Floats
-    site_alpha: NDArray[np.float32]
-    verdict: Verdict
-
-
 def _execute(
     environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
-) -> _Executed:
-    """Let a scene settle, and then take the actions that ``policy`` makes from there."""
+) -> tuple[Floats, Floats, NDArray[np.float32], Verdict]:
+    """Let a scene settle, and then take the actions that ``policy`` makes from there.
+
+    Returns:
+        States, actions, opacity of sites and verdict, as in ``Trajectory``.
+    """
     environment.restore(scene)
     # What has no first look is dropped with the state that it was put in.
     states, alphas = [environment.state], [environment.site_alpha]
@@ -99,7 +93,7 @@ def _execute(
     except RefusedError as error:
         refused = Verdict(False, error.reason)
     judged = refused or verdict(np.stack(states), np.array(succeeded, bool))
-    return _Executed(np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged)
+    return np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged
 
 
 def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:
@@ -126,18 +120,6 @@ def _perturbed(
     except RefusedError as error:
         return scene, Verdict(False, error.reason)
     return scene, None
-
-
-def _not_simulated(demo: Demo, trajectory_id: str, error: UnusableSceneError) -> Trajectory:
-    return Trajectory(
-        trajectory_id=trajectory_id,
-        mode="open_loop",
-        scene=Scene(demo.model_xml or "", demo.init_state, {"fault": str(error)}),
-        states=demo.init_state[None],
-        actions=np.empty((0, 7)),
-        site_alpha=np.empty((1, 0), np.float32),
-        verdict=Verdict(False, error.reason),
-    )
 
 
 def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
