@@ -97,8 +97,7 @@ def check(rows: Sequence[Compared], test: TestSet) -> dict[str, AxisDistance]:
     """Axis to finding, in the order of the plan."""
     found: dict[str, list[tuple[Nearest, str, Perturbation]]] = defaultdict(list)
     wanted: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)
-    known = {(row.suite, row.task) for row in rows}
-    tasks = {key: find_task(*key) for key in known}
+    tasks = {key: find_task(*key) for key in {(row.suite, row.task) for row in rows}}
     for row in rows:
         task = tasks[row.suite, row.task]
         for perturbation in from_json(row.perturbations):
@@ -147,15 +146,11 @@ def _finding(
         smallest=nearest.distance if alike else None,
         closest=closest if alike else None,
         clearance=kind.clearance,
-        measure="; ".join(dict.fromkeys(_measure(kind) for _, _, kind in found)),
+        measure="; ".join(dict.fromkeys(f"{f'{k.unit}: ' if k.unit else ''}{k.measure}" for _, _, k in found)),
         overlaps=overlaps,
         verdict="overlap" if overlaps else "unknown" if test_tasks and not comparisons else "disjoint",
         coverage=coverage,
     )
-
-
-def _measure(kind: Perturbation) -> str:
-    return kind.measure if kind.unit is None else f"{kind.unit}: {kind.measure}"
 
 
 def write(findings: dict[str, AxisDistance], path: Path) -> None:

@@ -13,15 +13,7 @@ from typing import Annotated
 
 import pyarrow as pa
 
-from pipeline.axes import (
-    Axis,
-    Perturbation,
-    PhysicsPerturbation,
-    TextPerturbation,
-    in_order,
-    of_layer,
-    to_json,
-)
+from pipeline.axes import Axis, Perturbation, PhysicsPerturbation, TextPerturbation, in_order, of_layer, to_json
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry
@@ -83,7 +75,6 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     by_task: dict[str, list[DemoEntry]] = defaultdict(list)
     for demo in demos:
         by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
-    planner = _Planner(plan.seed, replay)
     rows = [row for group in by_task.values() for row in twins(group, plan.seed, replay)]
     for name, episodes in plan.episodes.items():
         draws = Draws(name, plan.drawn_from(name), plan.seed, test)
@@ -94,14 +85,19 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
                 where=f"plan.episodes.{name}",
                 remedy="widen demos.tasks, or take it out of plan.episodes",
             )
-        for group, wanted in zip(groups, _shares(episodes, len(groups)), strict=True):
-            rows += islice(planner.candidates(draws, group, wanted), wanted + ceil(wanted * plan.reserve))
+        for place, group in enumerate(groups):
+            # Dealt out evenly; the first tasks get one more where it does not divide.
+            wanted = episodes // len(groups) + (place < episodes % len(groups))
+            candidates = islice(_candidates(draws, group), wanted + ceil(wanted * plan.reserve))
+            for rank, (demo, perturbations, variant) in enumerate(candidates):
+                row = _row(demo, perturbations, plan.seed, replay)
+                rows.append(replace(row, rank=rank, variant=variant, wanted=rank < wanted))
     return rows
 
 
 def twins(demos: Sequence[DemoEntry], seed: int, replay: ReplayConfig) -> list[Row]:
     """The clean twin of each demonstration of a task."""
-    return [_Planner(seed, replay).row(demo, (), rank) for rank, demo in enumerate(demos)]
+    return [replace(_row(demo, (), seed, replay), rank=rank) for rank, demo in enumerate(demos)]
 
 
 def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, replay: ReplayConfig) -> list[Row]:
@@ -110,15 +106,8 @@ def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, r
     rows = [*twins_of_task]
     for rank in range(wanted + ceil(wanted * reserve)):
         variant, number = divmod(rank, len(demos))
-        row = replace(
-            twins_of_task[number],
-            role="perturbed",
-            axis=RESET,
-            component=RESET,
-            rank=rank,
-            wanted=rank < wanted,
-            variant=variant,
-        )
+        row = replace(twins_of_task[number], role="perturbed", axis=RESET, component=RESET)
+        row = replace(row, rank=rank, wanted=rank < wanted, variant=variant)
         name = digest(RESET, row.trajectory_id, row.reset_seed)[:16]
         rows.append(replace(row, episode_id=name, trajectory_id=name))
     return rows
@@ -131,15 +120,8 @@ def demonstrations(rows: Sequence[Row]) -> int:
 
 def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
     """Axis or combination to the number of wanted episodes that no different draw was left for, where there are any."""
-    missing = {
-        axis: wanted - sum(row.axis == axis and row.wanted for row in rows) for axis, wanted in plan.episodes.items()
-    }
-    return {axis: number for axis, number in missing.items() if number}
-
-
-def _shares(total: int, parts: int) -> list[int]:
-    """``total`` dealt out evenly; the first parts get one more where it does not divide."""
-    return [total // parts + (index < total % parts) for index in range(parts)]
+    there = Counter(row.axis for row in rows if row.wanted)
+    return {axis: wanted - there[axis] for axis, wanted in plan.episodes.items() if wanted != there[axis]}
 
 
 @dataclass(frozen=True)
@@ -171,79 +153,62 @@ class Draws:
                 key = rng(self.seed, self.name, demo_id, variant, attempt)
                 perturbations = tuple(axis.sample(key, task, first + variant + attempt) for axis in self.axes)
                 content = tuple(p.model_dump_json() for p in perturbations)
-                if content not in drawn and self._clear(perturbations, task):
+                clear = (p.nearest(self.test, task).distance >= p.clearance for p in perturbations)
+                if content not in drawn and all(clear):
                     break
             else:
                 return
             drawn.add(content)
             yield perturbations
 
-    def _clear(self, perturbations: Sequence[Perturbation], task: Task) -> bool:
-        return all(p.nearest(self.test, task).distance >= p.clearance for p in perturbations)
+
+def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:
+    """A task's candidates and their variants: every demonstration's first variant, then every second one, and so on.
+
+    A demonstration of which no more different draws are left that keep clear of the test set is passed over; the
+    candidates end when none is left of any.
+    """
+    left = {demo: draws.of(demo.demo_id, demo.task) for demo in group}
+    for variant in count():
+        for demo, drawn in [*left.items()]:
+            if (perturbations := next(drawn, None)) is None:
+                del left[demo]
+            else:
+                yield demo, perturbations, variant
+        if not left:
+            return
 
 
-@dataclass(frozen=True)
-class _Planner:
-    """Makes rows of one plan."""
-
-    seed: int
-    replay: ReplayConfig
-
-    def candidates(self, draws: Draws, group: Sequence[DemoEntry], wanted: int) -> Iterator[Row]:
-        """A task's candidates: every demonstration's first variant, then every second one, and so on.
-
-        A demonstration of which no more different draws are left that keep clear of the test set is passed over; the
-        candidates end when none is left of any.
-        """
-        left = {demo: draws.of(demo.demo_id, demo.task) for demo in group}
-        ranks = count()
-        for variant in count():
-            for demo, drawn in [*left.items()]:
-                perturbations = next(drawn, None)
-                if perturbations is None:
-                    del left[demo]
-                    continue
-                rank = next(ranks)
-                yield self.row(demo, perturbations, rank, variant, rank < wanted)
-            if not left:
-                return
-
-    def row(
-        self,
-        demo: DemoEntry,
-        perturbations: Sequence[Perturbation],
-        rank: int,
-        variant: int = 0,
-        wanted: bool = True,
-    ) -> Row:
-        perturbations = in_order(perturbations)
-        physics = to_json(of_layer(perturbations, PhysicsPerturbation))
-        listed = to_json(perturbations)
-        instruction = demo.task.instruction
-        for change in of_layer(perturbations, TextPerturbation):
-            instruction = change.apply(instruction)
-        return Row(
-            episode_id=_identity("episode", demo.sha256, self.replay, listed),
-            twin_id=_identity("episode", demo.sha256, self.replay, "[]"),
-            trajectory_id=_identity("trajectory", demo.sha256, self.replay, physics),
-            role="perturbed" if perturbations else "twin",
-            suite=demo.task.suite,
-            task=demo.task.name,
-            demo_id=demo.demo_id,
-            demo_sha256=demo.sha256,
-            demo_source=demo.source,
-            demo_origin=demo.origin,
-            demo_steps=demo.steps,
-            axis="+".join(p.axis for p in perturbations) or "clean",
-            component="+".join(p.component for p in perturbations) or "clean",
-            level="+".join(str(p.level) for p in perturbations) or "0",
-            perturbations=listed,
-            instruction=instruction,
-            rank=rank,
-            wanted=wanted,
-            seed=self.seed,
-            variant=variant,
-        )
+def _row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, replay: ReplayConfig) -> Row:
+    """A wanted episode, the first of its kind."""
+    perturbations = in_order(perturbations)
+    physics = to_json(of_layer(perturbations, PhysicsPerturbation))
+    listed = to_json(perturbations)
+    instruction = demo.task.instruction
+    for change in of_layer(perturbations, TextPerturbation):
+        instruction = change.apply(instruction)
+    return Row(
+        episode_id=_identity("episode", demo.sha256, replay, listed),
+        twin_id=_identity("episode", demo.sha256, replay, "[]"),
+        trajectory_id=_identity("trajectory", demo.sha256, replay, physics),
+        role="perturbed" if perturbations else "twin",
+        suite=demo.task.suite,
+        task=demo.task.name,
+        demo_id=demo.demo_id,
+        demo_sha256=demo.sha256,
+        demo_source=demo.source,
+        demo_origin=demo.origin,
+        demo_steps=demo.steps,
+        axis="+".join(p.axis for p in perturbations) or "clean",
+        component="+".join(p.component for p in perturbations) or "clean",
+        level="+".join(str(p.level) for p in perturbations) or "0",
+        perturbations=listed,
+        instruction=instruction,
+        rank=0,
+        wanted=True,
+        seed=seed,
+        variant=0,
+    )
 
 
 @lru_cache(maxsize=4096)
@@ -270,14 +235,9 @@ def read(path: Path) -> list[Row]:
 def pending(
     rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
 ) -> list[str]:
-    """The trajectories that have to be replayed next, in plan order, given what is known so far.
+    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given.
 
     Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
-
-    Args:
-        rows: the plan.
-        verdicts: trajectory id to its verdict.
-        rejected: episode id to the reason why its frames were rejected.
     """
     found = _verdicts(rows, verdicts, rejected)
     return list(dict.fromkeys(row.trajectory_id for row, verdict in found if verdict is None))
@@ -289,7 +249,6 @@ def select(
     """What became of every row: kept, dropped with a reason, or a reserve that was not needed.
 
     Args:
-        rows: the plan.
         verdicts: trajectory id to its verdict.
         rejected: episode id to the reason why its frames were rejected.
     """
