@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 from bddl.parsing import scan_tokens
 
@@ -22,13 +22,6 @@ Arena = Literal["tabletop", "kitchen", "living_room", "study", "floor"]
 _ARENA = re.compile(rf"libero_({'|'.join(get_args(Arena))})(?:_tabletop)?_manipulation")
 _PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
 _LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
-
-
-class Heading(NamedTuple):
-    """What :func:`heading` reads; see :class:`Bddl`."""
-
-    problem: str
-    language: str
 
 
 @dataclass(frozen=True)
@@ -133,11 +126,7 @@ def read(path: Path) -> Bddl:
 
 
 def parse(text: str, where: object) -> Bddl:
-    """Read a definition.
-
-    Args:
-        text: of a BDDL file.
-        where: what an error names.
+    """Read a BDDL file's text; ``where`` is what an error names.
 
     Raises:
         PipelineError: when it does not define a task.
@@ -154,7 +143,7 @@ def parse(text: str, where: object) -> Bddl:
             fixtures=_declared(sections.get(":fixtures", [])),
             of_interest=tuple(sections.get(":obj_of_interest", [])),
             start=tuple(map(_fact, sections[":init"])),
-            goal=tuple(map(_fact, _conjuncts(*sections[":goal"]))),
+            goal=tuple(map(_fact, goal[1:] if (goal := sections[":goal"][0])[0] == "and" else [goal])),
         )
     except KeyError as error:
         raise PipelineError(f"has no {error.args[0]}", where=where, expected=expected) from error
@@ -162,12 +151,8 @@ def parse(text: str, where: object) -> Bddl:
         raise PipelineError(f"not a BDDL file ({error})", where=where, expected=expected) from error
 
 
-def heading(text: str, where: object) -> Heading:
-    """The problem and the instruction of a definition; of 10,030 test tasks, most need no more, and parsing is slow.
-
-    Args:
-        text: of a BDDL file.
-        where: what an error names.
+def heading(text: str, where: object) -> tuple[str, str]:
+    """``problem`` and ``language`` of a BDDL file's text; of 10,030 test tasks, most need no more, and parsing is slow.
 
     Raises:
         PipelineError: when it has no problem or no instruction.
@@ -176,7 +161,7 @@ def heading(text: str, where: object) -> Heading:
     problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
     if problem is None or language is None:
         raise PipelineError("not a BDDL file", where=where, expected="a BDDL problem with :language")
-    return Heading(problem[1], " ".join(language[1].split()))
+    return problem[1], " ".join(language[1].split())
 
 
 def arena(problem: str) -> Arena:
@@ -222,10 +207,6 @@ def _declared(listed: list[str]) -> dict[str, str]:
         else:
             names.append(word)
     return categories
-
-
-def _conjuncts(goal: list[Any]) -> list[Any]:
-    return goal[1:] if goal[0] == "and" else [goal]
 
 
 def _fact(expression: Any) -> Fact:

@@ -48,6 +48,10 @@ class DemoEntry:
     def demo_id(self) -> str:
         return f"{self.task.suite}/{self.task.name}/{self.key}"
 
+    @classmethod
+    def of(cls, demo: Demo) -> DemoEntry:
+        return cls(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -75,7 +79,6 @@ class DemoSource(Protocol):
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         """The first ``per_task`` usable demonstrations of each task (all by default), and what was unusable."""
-        ...
 
     def load(self, demo_id: str) -> Demo:
         """One demonstration, by ``<suite>/<task>/<key>``.
@@ -83,7 +86,6 @@ class DemoSource(Protocol):
         Raises:
             PipelineError: when it is not there or cannot be used.
         """
-        ...
 
 
 class StarterSource:
@@ -94,7 +96,7 @@ class StarterSource:
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         del per_task  # There is one for each task, and a count is at least one.
-        return DemoIndex([_entry(self.of(task)) for task in wanted], [])
+        return DemoIndex([DemoEntry.of(self.of(task)) for task in wanted], [])
 
     def load(self, demo_id: str) -> Demo:
         task, key = _parse(demo_id)
@@ -150,7 +152,7 @@ class HDF5Source:
                         if usable == per_task:
                             break
                         try:
-                            entry = _entry(self._read(task, key, data))
+                            entry = DemoEntry.of(self._read(task, key, data))
                             first = first_with.setdefault(entry.sha256, entry)
                             if first is not entry:
                                 # Episodes are identified by content: two copies would make two rows with one id.
@@ -282,10 +284,6 @@ class _Recorded(NamedTuple):
         model_xml = None if self.model_file is None else relocate(self.model_file, where=f"{where} model_file")
         whole = states if len(states) == len(actions) else None
         return Demo(*self[:4], content.hexdigest(), actions, states[0].copy(), whole, model_xml)
-
-
-def _entry(demo: Demo) -> DemoEntry:
-    return DemoEntry(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
 
 
 def _parse(demo_id: str) -> tuple[Task, str]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from runpy import run_path
+from typing import Any
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
@@ -61,12 +62,9 @@ def _listed(suite: str) -> tuple[Task, ...]:
 
 
 @cache
-def _names() -> Mapping[str, Sequence[str]]:
-    """Suite to LIBERO's list; only the file that holds it is run."""
-    listed: Mapping[str, Sequence[str]] = run_path(str(libero_folder() / "benchmark" / "libero_suite_task_map.py"))[
-        "libero_task_map"
-    ]
-    return listed
+def _names() -> Any:
+    """Suite to LIBERO's list of names; only the file that holds it is run."""
+    return run_path(str(libero_folder() / "benchmark" / "libero_suite_task_map.py"))["libero_task_map"]
 
 
 def _instruction(name: str) -> str:

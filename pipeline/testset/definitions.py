@@ -17,7 +17,7 @@ import numpy as np
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
-from pipeline.libero.bddl import Bddl, Heading
+from pipeline.libero.bddl import Bddl
 from pipeline.libero.tasks import tasks
 
 Value = str | int | float
@@ -113,7 +113,7 @@ class Reader:
             parameters = {"severity": severity + 1, **self._severities[component][severity]}
             return TestChange(base.name, "noise", component, parameters)
         if number := match["language"]:
-            text = self._heading(suite, f"{base.name}_language_{number}").language
+            _, text = self._heading(suite, f"{base.name}_language_{number}")
             return TestChange(base.name, "language", "rewrite", {"text": text})
         if (number := match["robot"]) and int(number):
             return TestChange(base.name, "robot", "initial_joints", {"id": int(number)})
@@ -125,7 +125,7 @@ class Reader:
             moved = _displacement(self._scene(suite, name), bddl.read(base.bddl_file))
             drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
             return TestChange(base.name, "pose", "pose", {**drawn, **moved})
-        problem = self._heading(suite, name).problem
+        problem, _ = self._heading(suite, name)
         if light := _LIGHT.fullmatch(problem):
             return TestChange(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
         component = "theme" if match["theme"] else "surface"
@@ -133,7 +133,7 @@ class Reader:
 
     def scene_files(self, suite: str, name: str) -> SceneFiles:
         """What a task's arena is made from; a class that does not say leaves it to the class of its arena."""
-        problem = self._heading(suite, name).problem
+        problem, _ = self._heading(suite, name)
         settings = self._classes[_BASE_CLASS.match(problem)[0]] | self._classes[problem]  # type: ignore[index]
         floor, wall = self._floors[settings["floor_style"]], self._walls[settings["wall_style"]]
         return SceneFiles(settings["scene_xml"], f"textures/{floor}", f"textures/{wall}")
@@ -150,11 +150,11 @@ class Reader:
         return {"_".join(re.sub("([A-Z0-9])", r" \1", name).split()).lower(): path for name, path in listed}
 
     def _scene(self, suite: str, name: str) -> Bddl:
-        file = _file(suite, name)
+        file = f"bddl_files/{suite}/{name}.bddl"
         return bddl.parse(self._text(file), file)
 
-    def _heading(self, suite: str, name: str) -> Heading:
-        file = _file(suite, name)
+    def _heading(self, suite: str, name: str) -> tuple[str, str]:
+        file = f"bddl_files/{suite}/{name}.bddl"
         return bddl.heading(self._text(file), file)
 
     def _textures(self, problem: str, theme: bool) -> dict[str, Value]:
@@ -170,10 +170,6 @@ class Reader:
             surface, wall = self._floors[settings["floor_style"]], None
         files: dict[str, Value] = {"arena": bddl.arena(problem), "surface": surface}
         return files | {"wall": wall or self._walls[settings["wall_style"]]} if theme else files
-
-
-def _file(suite: str, name: str) -> str:
-    return f"bddl_files/{suite}/{name}.bddl"
 
 
 def _camera(azimuth: int, elevation: int, percent: int, yaw: int, pitch: int) -> tuple[str, dict[str, Value]]:
