@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import http.client
 import json
 import os
 import time
-import urllib.error
 import urllib.parse
-import urllib.request
 from dataclasses import dataclass
+from functools import cache
+
+import httpx
 
 from pipeline.errors import PipelineError
 
@@ -33,13 +33,6 @@ class _BusyError(Exception):
     def __init__(self, fault: str, wait_s: float = 0.0):
         super().__init__(fault)
         self.wait_s = wait_s
-
-
-class _StayHere(urllib.request.HTTPRedirectHandler):
-    """Follows no redirect: it would drop the question, and show the key to whoever it leads to."""
-
-    def redirect_request(self, *_: object) -> None:
-        return None
 
 
 @dataclass(frozen=True)
@@ -94,46 +87,41 @@ class LanguageModel:
 
     def _post(self, prompt: str) -> bytes:
         question = {"model": self.model, "messages": [{"role": "user", "content": prompt}]}
-        headers = {"Content-Type": "application/json"}
-        if key := os.environ.get("OPENAI_API_KEY", "").strip():
-            headers["Authorization"] = f"Bearer {key}"
-        request = urllib.request.Request(self._url, json.dumps(question).encode(), headers)
+        key = os.environ.get("OPENAI_API_KEY", "").strip()
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        client, body = _client(), b""
         deadline = time.monotonic() + self.timeout_s
         try:
-            with urllib.request.build_opener(_StayHere).open(request, timeout=self.timeout_s) as response:
-                return self._read(response, deadline)
-        except urllib.error.HTTPError as error:
-            fault = f"HTTP status {error.code} {error.reason}: {_said(error)}".rstrip(": ")
-            if error.code == 429 or error.code >= 500:
-                after = error.headers.get("Retry-After", "")
-                raise _BusyError(fault, float(after) if after.isdigit() else 0.0) from error
-            raise PipelineError(
-                f"the endpoint refuses the question ({fault})",
-                where=self._url,
-                expected=f"a chat completion by the model {self.model!r}",
-                remedy="check the endpoint, the model's name and the environment variable OPENAI_API_KEY",
-            ) from error
-        except (OSError, http.client.HTTPException) as error:
-            raise _BusyError(str(getattr(error, "reason", error)) or type(error).__name__) from error
-
-    def _read(self, response: http.client.HTTPResponse, deadline: float) -> bytes:
-        """The body; the timeout of a socket is for each piece of it, so a trickle is cut off here."""
-        body = b""
-        while piece := response.read1(65536):
-            body += piece
-            if len(body) > MAX_ANSWER_BYTES:
-                raise UnusableError(f"an answer of more than {MAX_ANSWER_BYTES} bytes")
-            if time.monotonic() > deadline:
-                raise TimeoutError(f"no whole answer within {self.timeout_s:g} s")
-        return body
+            # Follows no redirect, which would show the key to whoever it leads to.
+            with client.stream("POST", self._url, json=question, headers=headers, timeout=self.timeout_s) as response:
+                for piece in response.iter_bytes():
+                    body += piece
+                    if len(body) > MAX_ANSWER_BYTES:
+                        raise UnusableError(f"an answer of more than {MAX_ANSWER_BYTES} bytes")
+                    # The timeout is for each piece.
+                    if time.monotonic() > deadline:
+                        raise TimeoutError(f"no whole answer within {self.timeout_s:g} s")
+        except (OSError, httpx.HTTPError) as error:
+            raise _BusyError(str(error) or type(error).__name__) from error
+        if response.is_success:
+            return body
+        said = " ".join(body[:300].decode(errors="replace").split())
+        fault = f"HTTP status {response.status_code} {response.reason_phrase}: {said}".rstrip(": ")
+        if response.status_code == 429 or response.is_server_error:
+            after = response.headers.get("Retry-After", "")
+            raise _BusyError(fault, float(after) if after.isdigit() else 0.0)
+        raise PipelineError(
+            f"the endpoint refuses the question ({fault})",
+            where=self._url,
+            expected=f"a chat completion by the model {self.model!r}",
+            remedy="check the endpoint, the model's name and the environment variable OPENAI_API_KEY",
+        )
 
 
-def _said(error: urllib.error.HTTPError) -> str:
-    """The beginning of what came with an error."""
-    try:
-        return " ".join(error.read(300).decode(errors="replace").split())
-    except (OSError, http.client.HTTPException):
-        return ""
+@cache
+def _client() -> httpx.Client:
+    """Of this process: making one takes 0.05 s."""
+    return httpx.Client()
 
 
 def _content(body: bytes) -> str:
