@@ -39,15 +39,12 @@ class DemosConfig(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _source_of_root(cls, raw: Any) -> Any:
-        if isinstance(raw, Mapping) and raw.get("root") is not None:
-            return {"source": "hdf5", **raw}
-        return raw
-
-    @model_validator(mode="after")
-    def _root_with_hdf5(self) -> DemosConfig:
-        if (self.source == "hdf5") != (self.root is not None):
+        if not isinstance(raw, Mapping):
+            return raw
+        fitting = "starter" if raw.get("root") is None else "hdf5"
+        if "hdf5" in {fitting, source := raw.get("source", fitting)} and source != fitting:
             raise ValueError("root goes with source: hdf5, and only with it")
-        return self
+        return {**raw, "source": source}
 
     def open(self) -> DemoSource:
         return StarterSource() if self.root is None else HDF5Source(self.root)
@@ -95,20 +92,15 @@ class PlanConfig(Frozen):
 
     @model_validator(mode="after")
     def _axes_match_episodes(self) -> PlanConfig:
-        configured = {*self.axes.drawn()}
-        drawn = {axis for name in self.episodes for axis in axes_of(name)}
-        if configured != drawn:
-            raise ValueError(f"axes and episodes must name the same axes, got {sorted(configured)} and {sorted(drawn)}")
+        named, drawn = {*self.axes.drawn()}, {axis for name in self.episodes for axis in axes_of(name)}
+        if named != drawn:
+            raise ValueError(f"axes and episodes must name the same axes, got {sorted(named)} and {sorted(drawn)}")
         for name in self.episodes:
             self.drawn_from(name)
         return self
 
     def drawn_from(self, name: str) -> tuple[Axis, ...]:
-        """What the episodes called ``name`` draw from, one axis after the other.
-
-        Raises:
-            ValueError: when one of them has nothing left to draw beside the others.
-        """
+        """What the episodes called ``name`` draw from, one axis after the other; ValueError as of ``Axis.beside``."""
         names, axes = axes_of(name), self.axes.drawn()
         return tuple(axes[one].beside(names) for one in names)
 
@@ -131,10 +123,6 @@ class ReplayConfig(Frozen):
     noops: Literal["drop", "trim_ends", "keep"] = "drop"
     settle_steps: int = Field(default=10, ge=0, le=200)
     fixture_seed: int = Field(default=0, ge=0, lt=2**32)
-
-
-def _each_once(extras: tuple[RenderedExtra, ...]) -> tuple[RenderedExtra, ...]:
-    return tuple(sorted(set(extras)))
 
 
 class FilterConfig(Frozen):
@@ -172,7 +160,7 @@ class RenderConfig(Frozen):
 
     encoding: Literal["jpeg"] = "jpeg"
     jpeg_quality: int = Field(default=95, ge=50, le=100)
-    extras: Annotated[tuple[RenderedExtra, ...], AfterValidator(_each_once)] = ()
+    extras: Annotated[tuple[RenderedExtra, ...], AfterValidator(lambda extras: tuple(sorted(set(extras))))] = ()
 
 
 class SlurmConfig(Frozen):
@@ -207,7 +195,7 @@ class ComputeConfig(Frozen):
     slurm: SlurmConfig | None = None
 
     @model_validator(mode="after")
-    def _whole(self) -> ComputeConfig:
+    def _slurm_with_slurm(self) -> ComputeConfig:
         if self.cluster == "slurm" and self.workers is None:
             raise ValueError("cluster: slurm needs a number of workers")
         if self.cluster != "slurm" and self.slurm is not None:
@@ -257,41 +245,26 @@ class Config(Frozen):
         return named
 
     @model_validator(mode="after")
-    def _pushes_where_they_were_sampled(self) -> Config:
-        if self.plan.axes.disturbance and self.replay.noops != "drop":
+    def _sections_agree(self) -> Config:
+        chosen, axes = select_tasks(self.demos.tasks), self.plan.axes
+        if axes.disturbance and self.replay.noops != "drop":
             raise ValueError("pushes count steps without no-ops: the axis disturbance goes with replay.noops: drop")
-        return self
-
-    @model_validator(mode="after")
-    def _rewrites_of_every_task(self) -> Config:
-        """LIBERO-90 has none among those that are shipped."""
-        if self.plan.axes.language is None:
-            return self
-        banks = [load_bank(), *([load_bank(bank)] if (bank := self.plan.axes.language.bank) else [])]
-        without = [
-            f"{task.suite}/{task.name}"
-            for task in select_tasks(self.demos.tasks)
-            if not any(one.get(task.suite, {}).get(task.name) for one in banks)
-        ]
-        if without:
-            raise ValueError(
-                f"plan.axes.language: no rewrites of {len(without)} tasks, such as {without[0]}; leave language out, "
-                "leave them out of demos.tasks, or name a bank that has some (the command rewrite makes one)"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _something_where(self) -> Config:
-        if (where := self.export.where) is None:
-            return self
-        axes = {axis for name in self.plan.episodes for axis in axes_of(name)}
+        if axes.language:
+            # LIBERO-90 has no rewrites among those that are shipped.
+            banks = [load_bank(), *([load_bank(axes.language.bank)] if axes.language.bank else [])]
+            without = [f"{t.suite}/{t.name}" for t in chosen if not any(b.get(t.suite, {}).get(t.name) for b in banks)]
+            if without:
+                raise ValueError(
+                    f"plan.axes.language: no rewrites of {len(without)} tasks, such as {without[0]}; leave language "
+                    "out, leave them out of demos.tasks, or name a bank that has some (the command rewrite makes one)"
+                )
         known = {
             "axis": {CLEAN, *self.plan.episodes},
-            "component": {CLEAN, *(component for axis in axes for component in components_of(axis))},
-            "suite": {task.suite for task in select_tasks(self.demos.tasks)},
+            "component": {CLEAN, *(component for axis in axes.drawn() for component in components_of(axis))},
+            "suite": {task.suite for task in chosen},
         }
         for field, names in known.items():
-            if unknown := [name for name in getattr(where, field) or () if name not in names]:
+            if unknown := [name for name in getattr(self.export.where, field, None) or () if name not in names]:
                 raise ValueError(f"export.where.{field}: the run has no {unknown[0]!r}, expected of {sorted(names)}")
         return self
 
@@ -308,15 +281,13 @@ def load(path: Path) -> Config:
         PipelineError: naming the file, every field that is wrong, and what would have worked.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        return Config.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
     except (OSError, UnicodeDecodeError) as error:
         raise PipelineError(
             f"cannot read the configuration ({error})",
             where=path,
             remedy=f"one of {sorted(map(str, Path('configs').glob('*')))}",
         ) from error
-    try:
-        return Config.model_validate(yaml.safe_load(text))
     except (yaml.YAMLError, RecursionError) as error:
         raise PipelineError(f"not valid YAML: {error}", where=path, expected="a file like those of configs/") from error
     except ValidationError as error:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib.metadata import version
 from itertools import count
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from packaging.version import Version
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -95,13 +94,6 @@ class LeRobotConfig(_Frozen):
                 "which the installation on Python 3.12 or later has"
             )
         return language
-
-    @model_validator(mode="before")
-    @classmethod
-    def _first_name(cls, raw: Any) -> Any:
-        if isinstance(raw, Mapping) and "parts" in raw:
-            raise ValueError("parts is called shards now, as in rlds")
-        return raw
 
 
 CLEAN = "clean"

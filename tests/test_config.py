@@ -90,7 +90,7 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
         ("carrier pigeon", ("compute",), "compute"),
         ("my_set", ("export", "rlds", "name"), "export.rlds.name"),
         ("libero_aloha", ("export", "rlds", "name"), "a name with libero and without aloha in it"),
-        (4, ("export", "lerobot", "parts"), "export.lerobot: Value error, parts is called shards now"),
+        (4, ("export", "lerobot", "parts"), "export.lerobot.parts: Extra inputs"),
         (0.6, ("export", "rlds", "validation"), "export.rlds.validation: Input should be less than or equal to 0.5"),
         (1e-320, ("export", "lerobot", "validation"), "export.lerobot.validation"),
         ({"background": {"colour_scale": [0.2, 0.4, 0.6, 0.8, 2.0]}}, ("plan", "axes"), "colour_scale.4"),
