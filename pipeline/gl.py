@@ -91,14 +91,10 @@ def choose() -> GlChoice:
         return GlChoice(backend, device, reason, device_named)
 
     what = "; ".join(f"{backend} fails: {fault}" for backend, fault in faults.items())
-    if not asked:
-        raise PipelineError(f"no OpenGL renders here ({what})", expected=" or ".join(BACKENDS), remedy=REMEDY)
-    working = _working_backends()
     raise PipelineError(
-        f"MUJOCO_GL={asked} does not render here ({what or 'unknown, or it needs a display'})",
-        where="environment",
-        expected=" or ".join(working) or f"{' or '.join(BACKENDS)}, though neither works on this machine",
-        remedy="unset MUJOCO_GL" if working else REMEDY,
+        f"{f'MUJOCO_GL={asked} does not render' if asked else 'no OpenGL renders'} here ({what or 'unknown'})",
+        expected=" or ".join(BACKENDS),
+        remedy=f"unset MUJOCO_GL; {REMEDY}" if asked else REMEDY,
     )
 
 
@@ -183,17 +179,6 @@ def left_out() -> Iterator[None]:
 
 class _NoDeviceError(Exception):
     """A back end that rendered nothing, and why."""
-
-
-def _working_backends() -> list[str]:
-    working = []
-    for backend in BACKENDS:
-        try:
-            device, _ = _best_device(backend)
-        except _NoDeviceError:
-            continue
-        working.append(f"{backend} ({device})")
-    return working
 
 
 def _best_device(backend: str) -> tuple[str, str | None]:

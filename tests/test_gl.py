@@ -55,14 +55,12 @@ def devices(monkeypatch: pytest.MonkeyPatch) -> dict[tuple[str, str | None], str
     return there
 
 
-def test_a_back_end_that_cannot_work_is_refused_with_those_that_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_back_end_that_cannot_work_is_refused_with_those_that_may(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     with pytest.raises(PipelineError, match="MUJOCO_GL=glfw does not render here") as caught:
         choose()
-    assert caught.value.expected is not None
-    assert "egl (" in caught.value.expected
-    assert "osmesa (" in caught.value.expected
-    assert caught.value.remedy == "unset MUJOCO_GL"
+    assert caught.value.expected == "egl or osmesa"
+    assert str(caught.value.remedy).startswith("unset MUJOCO_GL")
 
 
 @pytest.mark.slow
