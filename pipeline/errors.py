@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 
 class PipelineError(Exception):
     """Says what is wrong, where, what was expected and what to try.
@@ -24,11 +26,8 @@ class PipelineError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only arguments need this to survive the trip back from a worker process.
-        return _rebuild, (self.what, None if self.where is None else str(self.where), self.expected, self.remedy)
-
-
-def _rebuild(what: str, where: str | None, expected: str | None, remedy: str | None) -> PipelineError:
-    return PipelineError(what, where=where, expected=expected, remedy=remedy)
+        where = None if self.where is None else str(self.where)
+        return partial(PipelineError, self.what, where=where, expected=self.expected, remedy=self.remedy), ()
 
 
 class RefusedError(Exception):

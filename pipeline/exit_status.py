@@ -45,10 +45,8 @@ def exit_status(command: Callable[[], int]) -> int:
             return command()
     except PipelineError as error:
         return _told(str(error), 1)
-    except Terminated:
-        return _told(f"stopped; {GO_ON}", 143)
-    except KeyboardInterrupt:
-        return _told(f"stopped; {GO_ON}", 130)
+    except KeyboardInterrupt as stopped:
+        return _told(f"stopped; {GO_ON}", 143 if isinstance(stopped, Terminated) else 130)
     except MemoryError:
         return _told(f"not enough memory\n  try: fewer workers, and {GO_ON}", 1)
     except OSError as error:
