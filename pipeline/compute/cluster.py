@@ -15,7 +15,7 @@ from functools import cache
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 from uuid import uuid4
 
 from packaging.requirements import Requirement
@@ -80,17 +80,11 @@ _entered: Workplace | None = None
 """The run that this process worked for last."""
 
 
-@dataclass(frozen=True)
-class InPlace(Generic[Item, Result]):
-    """A function that runs in a worker as it would where the run was started."""
-
-    fn: Callable[[Item], Result]
-    workplace: Workplace
-
-    def __call__(self, item: Item) -> Result:
-        self.workplace.enter()
-        with chdir(self.workplace.folder):
-            return self.fn(item)
+def in_place(fn: Callable[[Item], Result], workplace: Workplace, item: Item) -> Result:
+    """Call a function in a worker as it would be where the run was started."""
+    workplace.enter()
+    with chdir(workplace.folder):
+        return fn(item)
 
 
 @cache

@@ -13,7 +13,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
 
-from pipeline.compute.cluster import InPlace, Workplace, workplace_of
+from pipeline.compute.cluster import Workplace, in_place, workplace_of
 from pipeline.compute.local import local_cluster
 from pipeline.compute.progress import progress_of
 from pipeline.compute.slurm import slurm_cluster
@@ -94,7 +94,6 @@ def runner(
     With the first work comes a ``PipelineError`` when no scheduler answers, or a worker cannot work for this run.
 
     Args:
-        config: where to run.
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
         opengl: for work that renders, ``gl.WorkerSetup``: gives what each local worker calls with its number.
     """
@@ -155,18 +154,13 @@ def _started(
             yield _Workers(client, workplace)
 
 
-@dataclass(frozen=True)
-class _Limited(Generic[Item, Result]):
-    """In a worker: a function whose process is ended when an item takes too long, also where it hangs in a library."""
-
-    fn: Expendable[Item, Result]
-
-    def __call__(self, item: Item) -> Result:
-        faulthandler.dump_traceback_later(self.fn.limit_s(item), exit=True)
-        try:
-            return self.fn(item)
-        finally:
-            faulthandler.cancel_dump_traceback_later()
+def _limited(fn: Expendable[Item, Result], item: Item) -> Result:
+    """In a worker, whose process is ended when an item takes too long, also where it hangs in a library."""
+    faulthandler.dump_traceback_later(fn.limit_s(item), exit=True)
+    try:
+        return fn(item)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 @dataclass(frozen=True)
@@ -188,8 +182,8 @@ class _Workers:
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         from distributed import KilledWorker
 
-        limited = _Limited(fn) if isinstance(fn, Expendable) else fn
-        work = limited if self.workplace is None else InPlace(limited, self.workplace)
+        limited = partial(_limited, fn) if isinstance(fn, Expendable) else fn
+        work = limited if self.workplace is None else partial(in_place, limited, self.workplace)
         results: dict[int, Result] = {}
         deadly: list[int] = []
         sizes = _sizes(fn, items)

@@ -11,27 +11,12 @@ def progress_of(description: str, total: int) -> Iterator[Callable[[int], None]]
     """A bar with rate and ETA on a terminal; a line every tenth of the way where there is none."""
     # Every process of a run imports this module, and few show how far they are.
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TextColumn("elapsed"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    shown = (MofNCompleteColumn(), "{task.fields[rate]}", "elapsed", TimeElapsedColumn(), "left", TimeRemainingColumn())
+    progress = Progress("{task.description}", BarColumn(), *shown, console=console, disable=not console.is_terminal)
+    with progress:
         task = progress.add_task(description, total=total, rate="")
 
         def advance(size: int) -> None:
