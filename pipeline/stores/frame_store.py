@@ -85,13 +85,7 @@ class FrameStore(Store):
         return self.root / trajectory_id
 
     def save(self, trajectory_id: str, rendered: Rendered, device: str) -> None:
-        """Store what was rendered, in a file of its own.
-
-        Args:
-            trajectory_id: which trajectory it shows.
-            rendered: the frames.
-            device: what rendered them, as OpenGL names it.
-        """
+        """Store what ``device``, as OpenGL names it, rendered of a trajectory, in a file of its own."""
         attributes = {
             "device": device,
             "replay_mode": rendered.replay_mode,
@@ -119,7 +113,6 @@ class FrameStore(Store):
         """Read the named streams of a trajectory.
 
         Args:
-            trajectory_id: which trajectory.
             streams: ids of streams, one at least.
             geometry: ids of the geometry to read with them.
 
@@ -148,7 +141,6 @@ class FrameStore(Store):
         """What files hold of the named streams of a trajectory, each stream once; a damaged file counts as missing.
 
         Args:
-            trajectory_id: which trajectory.
             streams: id of a stream to the id of its geometry.
             device: which must have rendered them.
         """

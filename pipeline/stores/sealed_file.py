@@ -75,12 +75,7 @@ class SealedFile:
         return name in self._arrays
 
     def array(self, name: str) -> NDArray[Any]:
-        """An array, whole.
-
-        Raises:
-            KeyError: when there is none of this name.
-            BrokenSealError: when it is not what was written.
-        """
+        """An array, whole; KeyError when there is none, BrokenSealError when it is not what was written."""
         stored = self._arrays[name]
         with _reading():
             values: NDArray[Any] = stored[()]
@@ -93,20 +88,12 @@ class SealedFile:
         return len(self._arrays[name])
 
     def groups(self, name: str) -> list[str]:
-        """Names of the groups in a group.
-
-        Raises:
-            BrokenSealError: when they cannot be read.
-        """
+        """Names of the groups in a group; BrokenSealError when they cannot be read."""
         with _reading():
             return sorted(self._file[name])
 
     def check_all(self) -> None:
-        """Read and check every array.
-
-        Raises:
-            BrokenSealError: when one is not what was written.
-        """
+        """Read every array; BrokenSealError when one is not what was written."""
         for name in self._arrays:
             self.array(name)
 

@@ -78,12 +78,7 @@ class Store(ABC):
 
     @contextmanager
     def created(self, name: str, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
-        """A new file to fill with arrays; it takes its place when the block ends.
-
-        Args:
-            name: of the file.
-            attributes: JSON-serialisable, what it says beside its arrays.
-        """
+        """A new file to fill with arrays, with ``attributes`` as JSON; it takes its place when the block ends."""
         with (
             replaced(self.path(name)) as temporary,
             sealed(temporary, {**attributes, "made_by": self.made_by}) as file,
@@ -203,29 +198,19 @@ class Store(ABC):
         """Why finished files count as missing, to how many do for this reason.
 
         Those that are damaged are not counted, nor those with other settings: whoever changed these wants new files.
-
-        Args:
-            names: of the files to look at.
         """
         current, known = self.rows(), self._known()
         reasons: Counter[str] = Counter()
         for name in names:
-            made_by = self._made_by(name) if name not in current else None
-            if made_by is None:
+            if name in current or not self.path(name).exists():
                 continue
-            then = known.get(made_by)
+            try:
+                with unsealed(self.path(name)) as file:
+                    then = known.get(str(file.attributes["made_by"]))
+            except (BrokenSealError, KeyError):
+                continue
             if then is None:
                 reasons["something that was not written down"] += 1
             elif then["settings"] == self._made_with["settings"]:
                 reasons[differences(then["made_with"], self._made_with["made_with"])] += 1
         return reasons
-
-    def _made_by(self, name: str) -> str | None:
-        """The fingerprint that a file has; None when it is missing or damaged."""
-        if not self.path(name).exists():
-            return None
-        try:
-            with unsealed(self.path(name)) as file:
-                return str(file.attributes["made_by"])
-        except (BrokenSealError, KeyError):
-            return None

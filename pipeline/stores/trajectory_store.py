@@ -76,8 +76,7 @@ class TrajectoryStore(Store):
             PipelineError: when its file is missing, damaged or not current, or what its scene is made of is not here.
         """
         with self.opened(trajectory_id) as file:
-            posture_rad = file.attributes["posture_rad"]
-            push = file.attributes.get("push")
+            posture_rad, push = file.attributes["posture_rad"], file.attributes.get("push")
             scene = Scene(
                 model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
                 state=file.array("start"),
