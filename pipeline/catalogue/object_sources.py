@@ -155,17 +155,13 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         }
         if _about(name) != about:
             with _locked(), _made(name, about) as folder:
-                _convert_own(path, folder)
+                if path.suffix == ".obj":
+                    convert(path, folder)
+                    _check_size(folder / "model.xml", path)
+                else:
+                    _check_size(path, path)
+                    _copy(path, folder)
         yield converted(name)
-
-
-def _convert_own(path: Path, folder: Path) -> None:
-    if path.suffix == ".obj":
-        convert(path, folder)
-        _check_size(folder / "model.xml", path)
-    else:
-        _check_size(path, path)
-        _copy(path, folder)
 
 
 def _check_size(mjcf: Path, path: Path) -> None:

@@ -77,6 +77,7 @@ class Texture:
         licence: as its source states it.
         sha256: of the image file; of the recipe (generator's version, family, index) of a procedural one, so that
             rounding on another processor does not make it another texture.
+        load: gives (H, W, 3) RGB, or a PipelineError when the file is gone or no image.
         own: the file, where it is a user's.
     """
 
@@ -84,21 +85,13 @@ class Texture:
     source: str
     licence: str
     sha256: str
-    _read: Callable[[], Frame] = field(repr=False, compare=False)
+    load: Callable[[], Frame] = field(repr=False, compare=False)
     own: Path | None = field(default=None, repr=False, compare=False)
 
     @property
     def family(self) -> str | None:
         """Of :data:`pipeline.catalogue.procedural.FAMILIES`; None for an image."""
         return self.name.partition(":")[2].partition("/")[0] if self.source == "procedural" else None
-
-    def load(self) -> Frame:
-        """(H, W, 3) RGB.
-
-        Raises:
-            PipelineError: when the file is gone or no image.
-        """
-        return self._read()
 
 
 def offered(source: Source) -> Iterator[Texture]:
@@ -187,7 +180,7 @@ def _procedural() -> Iterator[Texture]:
                 source="procedural",
                 licence=_LICENCES["procedural"],
                 sha256=seeding.digest("texture", procedural.RECIPE, family, index),
-                _read=partial(procedural.texture, family, index),
+                load=partial(procedural.texture, family, index),
             )
 
 
@@ -199,7 +192,7 @@ def _in_wheel(source: Package, path: Path) -> Iterator[Texture]:
                 source=source,
                 licence=_LICENCES[source],
                 sha256=hashlib.sha256(archive.read(member)).hexdigest(),
-                _read=partial(_member, path, member),
+                load=partial(_member, path, member),
             )
 
 
@@ -220,15 +213,10 @@ def _decode(content: bytes, where: object) -> Frame:
         with Image.open(io.BytesIO(content)) as header:
             width_px, height_px = header.size
         if width_px * height_px > LARGEST_PX:
-            raise PipelineError(
-                f"{width_px} x {height_px} pixels",
-                where=where,
-                expected=f"at most {LARGEST_PX}",
-                remedy="make it smaller",
-            )
-        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR)
+            raise ValueError(f"{width_px} x {height_px} pixels, at most {LARGEST_PX} are read")
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR_RGB)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError, cv2.error) as error:
         raise PipelineError(f"not a readable image ({error})", where=where, remedy=REPLACE) from error
     if image is None:
         raise PipelineError("not a readable image", where=where, remedy=REPLACE)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    return np.asarray(image, np.uint8)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import re
 from functools import cache, lru_cache
-from typing import get_args
+from typing import cast, get_args
 
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.texture_sources import Package, Source, Texture, kept, libero_images, offered
@@ -99,12 +99,10 @@ def find(name: str, sha256: str) -> Texture:
     Raises:
         PipelineError: when it is not there, or has changed since.
     """
-    texture: Texture | None = None
-    if name.startswith("folder:"):
-        texture = kept(name, sha256)
-    for package in get_args(Package):
-        if name.startswith(f"{package}:"):
-            texture = catalogue((package,)).get(name)
+    source = name.partition(":")[0]
+    texture = kept(name, sha256) if source == "folder" else None
+    if source in get_args(Package):
+        texture = catalogue((cast(Package, source),)).get(name)
     if texture is None:
         raise PipelineError(f"there is no texture {name}", remedy="run the plan stage again with this version")
     if texture.sha256 != sha256:

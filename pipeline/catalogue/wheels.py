@@ -12,13 +12,7 @@ from pipeline.catalogue.downloads import fetched
 
 
 class Wheel(NamedTuple):
-    """One release of a pure Python package.
-
-    Attributes:
-        name: as the package index spells it.
-        sha256: of the file.
-        content: what it is fetched for, in words.
-    """
+    """One release of a pure Python package; ``content`` is what it is fetched for, in words."""
 
     name: str
     version: str
