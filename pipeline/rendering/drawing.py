@@ -5,9 +5,9 @@ Any other drawing (``savings.py``) must give the same pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from contextlib import ExitStack
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -41,21 +41,6 @@ def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> 
     data = model.tex_data if tex_data is None else tex_data
     ends = model.tex_adr + model.tex_height * model.tex_width * model.tex_nchannel
     return [data[first:end] for first, end in zip(model.tex_adr, ends, strict=True)]
-
-
-@runtime_checkable
-class SideBySide(Protocol):
-    """A drawing that keeps several variants of its textures uploaded, and renders what they share once."""
-
-    def hold(self, textures: Collection[int]) -> Callable[[], None]:
-        """Keep what is uploaded for these textures as a variant; before the next frame they have to be loaded again.
-
-        Returns:
-            A function that selects the variant for the next frames.
-        """
-
-    def let_go(self) -> None:
-        """Delete all variants, and render with the model's own textures."""
 
 
 class PlainDrawing:

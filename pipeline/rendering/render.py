@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
+from pipeline.axes import RenderPerturbation
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import named
 from pipeline.images.jpeg import encode
 from pipeline.planning.streams import Stream
-from pipeline.rendering.drawing import SideBySide
 from pipeline.rendering.frames import changes_of, frames_of
 from pipeline.rendering.geometry import see
 from pipeline.rendering.instances import Instances
@@ -27,8 +27,7 @@ def render(
 
     Streams with the same render perturbations share a scene and its clean frames. A stream is rejected, with a reason,
     when the first frame of its scene is refused (``FirstFrame``). Streams that differ in colours alone share their
-    geometry. Scenes that differ in textures alone are rendered in turn, step by step, by a backend that gains by it
-    (``SideBySide``).
+    geometry.
     """
     renderer = opened.renderer(trajectory.model_xml)
     instances = Instances(renderer.model, trajectory, task) if named(config.extras) else None
@@ -43,21 +42,18 @@ def render(
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}
-    for scenes in _scenes(streams, in_turn=isinstance(renderer.drawing, SideBySide)):
-        with renderer.side_by_side([changes_of(scene[0]) for scene in scenes]) as shows:
-            kept = []
-            for show, scene in zip(shows, scenes, strict=True):
-                show()
-                if fault := first_frame.fault(scene):
-                    rejected |= {stream.stream_id: fault for stream in scene}
-                else:
-                    kept.append((show, scene))
+    scenes: dict[tuple[RenderPerturbation, ...], list[Stream]] = {}
+    for stream in streams:
+        scenes.setdefault(changes_of(stream), []).append(stream)
+    for changes, scene in scenes.items():
+        with renderer.perturbed(changes):
+            if fault := first_frame.fault(scene):
+                rejected |= {stream.stream_id: fault for stream in scene}
+                continue
             for step in steps:
-                for show, scene in kept:
-                    show()
-                    frames = frames_of(renderer, trajectory.states[step], trajectory.site_alpha[step], scene, step)
-                    for stream, frame in zip(scene, frames, strict=True):
-                        encoded[stream.stream_id].append(encode(frame, config))
+                frames = frames_of(renderer, trajectory.states[step], trajectory.site_alpha[step], scene, step)
+                for stream, frame in zip(scene, frames, strict=True):
+                    encoded[stream.stream_id].append(encode(frame, config))
     views = dict.fromkeys(stream.geometry for stream in streams if stream.stream_id not in rejected)
     return Rendered(
         replay_mode=trajectory.mode,
@@ -71,11 +67,3 @@ def render(
         instances=instances.names if instances else (),
         quality=trajectory.quality,
     )
-
-
-def _scenes(streams: Iterable[Stream], in_turn: bool) -> list[list[list[Stream]]]:
-    """The streams of each scene; with ``in_turn``, scenes that differ in textures alone are in one list."""
-    groups: dict[str, dict[str, list[Stream]]] = {}
-    for stream in streams:
-        groups.setdefault(stream.scene(textures=not in_turn), {}).setdefault(stream.scene(), []).append(stream)
-    return [[*scenes.values()] for scenes in groups.values()]

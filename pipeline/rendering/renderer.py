@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import RenderPerturbation
-from pipeline.rendering.drawing import PlainDrawing, SideBySide, Surfaces, texels
+from pipeline.rendering.drawing import PlainDrawing, Surfaces, texels
 from pipeline.rendering.savings import drawing_of
 from pipeline.scenes.compiled import compiled
 from pipeline.types import Frame, State
@@ -62,47 +61,7 @@ class Renderer:
         if tuple(perturbations) == self._perturbations:
             yield
             return
-        former = self._perturbations
-        with self._applied(perturbations):
-            self._perturbations = tuple(perturbations)
-            try:
-                yield
-            finally:
-                self._perturbations = former
-
-    @contextmanager
-    def side_by_side(self, choices: Sequence[Sequence[RenderPerturbation]]) -> Iterator[list[Callable[[], None]]]:
-        """Switch between scenes that differ in textures alone.
-
-        Args:
-            choices: the perturbations of each scene. More than one need a drawing that is ``SideBySide``.
-
-        Returns:
-            A function for each choice; frames show the one whose function was called last.
-        """
-        if len(choices) == 1:
-            with self.perturbed(choices[0]):
-                yield [lambda: None]
-            return
-        if not isinstance(self.drawing, SideBySide):
-            raise TypeError(f"{type(self.drawing).__name__} holds one choice of textures, not {len(choices)}")
-        shows: list[Callable[[], None]] = []
-        with self.perturbed([change for change in choices[0] if not change.paints]):
-            try:
-                for choice in choices:
-                    with self._applied([change for change in choice if change.paints]) as textures:
-                        shows.append(partial(self._show, choice, self.drawing.hold(textures)))
-                yield shows
-            finally:
-                self.drawing.let_go()
-
-    def _show(self, choice: Sequence[RenderPerturbation], held: Callable[[], None]) -> None:
-        held()
-        self._perturbations = tuple(choice)
-
-    @contextmanager
-    def _applied(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[list[int]]:
-        """Apply perturbations, and undo them at the end; gives the textures that they changed."""
+        outer = self._perturbations
         fields = {name for perturbation in perturbations for name in perturbation.fields}
         former = {name: getattr(self.model, name).copy() for name in fields}
         textures: list[int] = []
@@ -113,8 +72,10 @@ class Renderer:
                 pairs = zip(texels(self.model), texels(self.model, former["tex_data"]), strict=True)
                 textures = [number for number, (now, then) in enumerate(pairs) if not np.array_equal(now, then)]
             self.drawing.load(textures)
-            yield textures
+            self._perturbations = tuple(perturbations)
+            yield
         finally:
+            self._perturbations = outer
             for name, values in former.items():
                 getattr(self.model, name)[:] = values
             self.drawing.load(textures)

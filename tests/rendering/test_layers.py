@@ -6,16 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-import arenas
 import mujoco
 import numpy as np
 import pytest
-from arenas import TASKS, both_ways
+from arenas import both_ways
 from numpy.typing import NDArray
 
 from pipeline import seeding
-from pipeline.axes.background import BackgroundAxis
-from pipeline.episode_schema import SCHEMA
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.drawing import Shot, SoftwareDrawing
@@ -147,33 +144,3 @@ def test_a_changed_look_is_seen(pair: Pair, field: str, value: float) -> None:
     array[..., -1 if field == "geom_rgba" else slice(None)] = value
     assert pair.same("fixed")
     assert not np.array_equal(pair.opened.frame("fixed"), before)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arena", TASKS)
-def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(arena: str) -> None:
-    rng = seeding.rng("test_layers", arena)
-    axis = BackgroundAxis(image_share=0.0)
-    choices = [[], *([axis.sample(rng, TASKS[arena], place)] for place in range(2))]
-    opened = arenas.renderer(arena)
-    cameras = [view.camera for view in SCHEMA.views.values()]
-    states = [np.concatenate([[0.0], opened.data.qpos, opened.data.qvel]) for _ in range(3)]
-    site_alpha = opened.model.site_rgba[:, 3].astype(np.float32)
-    for step, state in enumerate(states):
-        state[1:8] += 0.1 * step
-    with both_ways(opened) as (ours, plain):
-        with opened.side_by_side(choices) as shows:
-            assert ours._painted.any()
-            made = []
-            for state in states:
-                opened.restore(state, site_alpha)
-                for show in shows:
-                    show()
-                    made.append([opened.frame(camera) for camera in cameras])
-        for number, choice in enumerate(choices):
-            beside = Renderer(opened.model, plain)
-            with beside.perturbed(choice):
-                for step, state in enumerate(states):
-                    beside.restore(state, site_alpha)
-                    expected = [beside.frame(camera) for camera in cameras]
-                    assert np.array_equal(made[step * len(choices) + number], expected), (number, step)

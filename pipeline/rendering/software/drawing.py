@@ -8,9 +8,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
-from functools import partial
 from typing import NamedTuple
 
 import mujoco
@@ -21,7 +20,6 @@ from pipeline.axes.base import FIELDS
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.software.culling import Culling, Picture
 from pipeline.rendering.software.mujoco_3_2_7 import context as private
-from pipeline.rendering.software.mujoco_3_2_7.context import HeldTextures
 from pipeline.rendering.software.mujoco_3_2_7.meshes import Meshes
 from pipeline.rendering.software.mujoco_3_2_7.passes import Pass, Purpose
 from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
@@ -63,8 +61,7 @@ class SoftwareDrawing(PlainDrawing):
             self._meshes = Meshes(self._context, bare, [])
             self._skinned = SkinnedMeshes(self._skins, self._samples, self._meshes, np.zeros(bare.ngeom, np.bool_))
             self._still: dict[str, Still] = {}
-            self._underlays: dict[tuple[str, str], Underlay] = {}
-            self._held: HeldTextures | None = None
+            self._underlays: dict[str, Underlay] = {}
             self._show(model)
             undo.pop_all()
 
@@ -84,7 +81,7 @@ class SoftwareDrawing(PlainDrawing):
     def _show(self, model: mujoco.MjModel) -> None:
         private.adopt_textures(self._context, model, self._model)
         private.adopt_size(self._context, model)
-        self._model, self._painted = model, np.zeros(model.ngeom, np.bool_)
+        self._model = model
         self._culling = Culling(model, np.flatnonzero(np.logical_not(self._option.geomgroup)).tolist())
         shown = self._culling.shown
         rendered = np.unique(model.geom_dataid[shown & (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)]).tolist()
@@ -97,22 +94,6 @@ class SoftwareDrawing(PlainDrawing):
         if textures:
             self._forget_underlays()
 
-    def hold(self, textures: Collection[int]) -> Callable[[], None]:
-        self._gl.make_current()
-        if self._held is None:
-            self._held = HeldTextures(self._context)
-        names = self._held.hold(textures)
-        of_material = np.isin(self._model.mat_texid, [*textures]).reshape(self._model.nmat, -1).any(axis=1)
-        self._painted |= np.append(of_material, False)[self._model.geom_matid]
-        return partial(self._held.show, names)
-
-    def let_go(self) -> None:
-        self._gl.make_current()
-        if self._held is not None:
-            self._held.let_go()
-        self._held, self._painted = None, np.zeros(self._model.ngeom, np.bool_)
-        self._forget_underlays()
-
     def _forget_underlays(self) -> None:
         self._still.clear()
         for underlay in self._underlays.values():
@@ -122,42 +103,28 @@ class SoftwareDrawing(PlainDrawing):
         self._gl.make_current()
         shot = Shot(data, camera, self._culling.picture(data, camera))
         if shot.picture.underlaid:
-            self._draw_over_underlays(shot)
+            self._draw_over_still(shot)
         else:
             self._draw(shot, shot.picture.opaque)
         return self._pixels()
 
-    def _draw_over_underlays(self, shot: Shot) -> None:
-        """Render a picture over an underlay: of the geoms without a held texture, or of those that stand still."""
-        opaque = shot.picture.opaque & ~shot.picture.mirror
-        painted = opaque & self._painted
+    def _draw_over_still(self, shot: Shot) -> None:
+        """Render a picture over an underlay of the geoms that stand still."""
+        camera, opaque = shot.camera, shot.picture.opaque & ~shot.picture.mirror
         view, places = self._view(shot), np.concatenate([shot.data.geom_xpos, shot.data.geom_xmat], axis=1)
         places = places.astype(np.float32)
-
-        def underlay(name: str, geoms: NDArray[np.bool_], render: Callable[[], None]) -> Underlay:
-            """An underlay of the camera's pictures, rendered anew if its content has changed."""
-            if (shot.camera, name) not in self._underlays:
-                height, width = self._rectangle.height, self._rectangle.width
-                self._underlays[shot.camera, name] = Underlay(self._context, height, width)
-            found, content = self._underlays[shot.camera, name], view + geoms.tobytes() + places[geoms].tobytes()
-            if found.content != content:
-                render()
-                found.keep(content)
-            return found
-
-        def draw_over_still(geoms: NDArray[np.bool_], last: bool) -> None:
-            if shot.camera not in self._still:
-                self._still[shot.camera] = Still(self._model)
-            still = self._still[shot.camera].geoms(view, places, geoms) & geoms
-            behind = underlay("still", still, partial(self._draw, shot, still, last=False)) if still.any() else None
-            self._draw(shot, geoms & ~still, behind, last)
-
-        if painted.any():
-            rest = opaque & ~painted
-            behind = underlay("not painted", rest, partial(draw_over_still, rest, last=False))
-            self._draw(shot, painted, behind)
-        else:
-            draw_over_still(opaque, last=True)
+        if camera not in self._still:
+            self._still[camera] = Still(self._model)
+        still = self._still[camera].geoms(view, places, opaque) & opaque
+        underlay = None
+        if still.any():
+            if camera not in self._underlays:
+                self._underlays[camera] = Underlay(self._context, self._rectangle.height, self._rectangle.width)
+            underlay, content = self._underlays[camera], view + still.tobytes() + places[still].tobytes()
+            if underlay.content != content:
+                self._draw(shot, still, last=False)
+                underlay.keep(content)
+        self._draw(shot, opaque & ~still, underlay)
 
     def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
         """Render opaque geoms (ngeom,) of a picture over an underlay.

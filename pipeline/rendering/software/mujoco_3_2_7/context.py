@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
 from operator import attrgetter
 
 import mujoco
@@ -99,32 +98,3 @@ def adopt_textures(context: mujoco.MjrContext, model: mujoco.MjModel, former: mu
     for texture in copied:
         mujoco.mjr_uploadTexture(model, context, texture)
         check("mjr_uploadTexture")
-
-
-class HeldTextures:
-    """Several variants of a context's textures, each under OpenGL names of its own."""
-
-    def __init__(self, context: mujoco.MjrContext):
-        self._context, self._own = context, context.texture.copy()
-        self._held: list[int] = []
-
-    def hold(self, textures: Collection[int]) -> dict[int, int]:
-        """Keep what is uploaded for these textures. The model's own get new names and have to be uploaded again.
-
-        Returns:
-            Texture to the name of what was kept.
-        """
-        names = {texture: int(self._context.texture[texture]) for texture in textures}
-        self._held += names.values()
-        for texture in textures:
-            self._own[texture] = self._context.texture[texture] = calls().glGenTextures(1)
-        return names
-
-    def show(self, names: Mapping[int, int]) -> None:
-        """Render with what was kept, and otherwise with the model's own textures."""
-        self._context.texture[:] = self._own
-        self._context.texture[[*names]] = [*names.values()]
-
-    def let_go(self) -> None:
-        self.show({})
-        calls().glDeleteTextures(self._held)
