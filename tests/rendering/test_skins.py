@@ -13,7 +13,6 @@ from arenas import both_ways
 from numpy.typing import NDArray
 
 from pipeline import gl, seeding
-from pipeline.rendering import opengl
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.faces import Faces
@@ -276,15 +275,16 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
 def test_display_lists_may_be_numbered_downwards(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mesa 22 counts on, Mesa 25 fills gaps, so that a later block may have lower numbers."""
     gl.prepare()
-    functions, lowest = opengl._functions(), 0
-    upwards = functions.glGenLists
+    from OpenGL import GL
+
+    lowest, upwards = 0, GL.glGenLists
 
     def downwards(count: int) -> int:
         nonlocal lowest
         lowest = (lowest or upwards(1000) + 1000) - count
         return lowest
 
-    monkeypatch.setattr(functions, "glGenLists", downwards)
+    monkeypatch.setattr(GL, "glGenLists", downwards)
     opened = Renderer(scene(shadows=False))
     with both_ways(opened) as (ours, plain):
         mujoco.mj_forward(opened.model, opened.data)
