@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from pipeline.errors import PipelineError
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
 
@@ -32,10 +31,7 @@ if TYPE_CHECKING:
 class Layer(IntEnum):
     """The cheapest thing that has to be made again when an axis changes; lower is cheaper."""
 
-    TEXT = 0
-    PIXELS = 1
-    RENDER = 2
-    PHYSICS = 3
+    TEXT, PIXELS, RENDER, PHYSICS = range(4)
 
 
 class Frozen(BaseModel):
@@ -50,26 +46,16 @@ LEVELS: tuple[Level, ...] = get_args(Level)
 
 
 class Nearest(NamedTuple):
-    """How close a perturbation comes to the benchmark's test tasks.
-
-    Attributes:
-        distance: to the nearest of them, in the axis's own measure; infinite when there is none to compare with.
-        compared: how many it was compared with.
-    """
+    """The distance to the nearest of the benchmark's test tasks, in the axis's own measure, and how many were compared;
+    infinite where there is none."""
 
     distance: float
     compared: int
 
 
 class Credit(NamedTuple):
-    """Something of others' that a perturbation shows.
-
-    Attributes:
-        name: such as ``robosuite:clay.png`` or ``sweethome3d/scopia_teapot``.
-        kind: ``texture`` or ``object``.
-        licence: as its source states it.
-        attribution: who made it and what was changed, where that is more than the licence says.
-    """
+    """A ``texture`` or an ``object`` of others' that a perturbation shows; ``attribution`` tells who made it and what
+    was changed, where that is more than the licence says."""
 
     name: str
     kind: str
@@ -125,10 +111,9 @@ class Perturbation(Frozen):
 
     def apart(self, others: Sequence[Self]) -> Floats:
         """The distance to each of N draws of this class (N,), as ``distances`` measures it; NaN where there is nothing
-        to compare. By default 0 to a draw that is equal, else 1.
+        to compare. At least one, on the same LIBERO task where the axis compares ``per_task``.
 
-        Args:
-            others: at least one, on the same LIBERO task where the axis compares ``per_task``.
+        By default 0 to a draw that is equal, else 1.
         """
         return np.array([float(self != other) for other in others])
 
@@ -159,12 +144,9 @@ class Axis(Frozen):
         return True
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> Perturbation:
-        """One draw for a task that the axis applies to.
+        """One draw for a task that the axis applies to; what is random comes from ``rng`` alone.
 
-        Args:
-            rng: what is random comes from here alone.
-            task: what is perturbed.
-            place: counts a demonstration's draws, for axes that take the entries of a list in turn.
+        ``place`` counts a demonstration's draws, for axes that take the entries of a list in turn.
         """
         raise NotImplementedError
 
@@ -172,11 +154,7 @@ class Axis(Frozen):
         return pick(rng, self.levels)
 
     def beside(self, axes: Collection[str]) -> Axis:
-        """The axis where the episodes are perturbed on these axes together.
-
-        Raises:
-            ValueError: when nothing is left to draw from.
-        """
+        """The axis where episodes are perturbed on these axes together; ValueError where nothing is left to draw."""
         return self
 
     @classmethod
@@ -192,8 +170,7 @@ class Axis(Frozen):
 @cache
 def _on_task(test: TestSet, task: Task, axis: str) -> NDArray[np.intp]:
     """Which of an axis's test tasks perturb ``task``: their places in ``test.of(axis)``."""
-    bases = [(tested.suite, tested.base) for tested in test.of(axis)]
-    return np.flatnonzero([base == (task.suite, task.name) for base in bases])
+    return np.flatnonzero([(one.suite, one.base) == (task.suite, task.name) for one in test.of(axis)])
 
 
 class TextPerturbation(Perturbation):
@@ -238,9 +215,6 @@ class RenderPerturbation(Perturbation):
         paints: whether it writes textures and nothing else.
         sees_otherwise: whether it sees other surfaces: from another place, through another lens, or through what was
             opaque.
-
-    Raises:
-        PipelineError: when a class is made whose ``fields`` has another one.
     """
 
     layer: ClassVar[Layer] = Layer.RENDER
@@ -250,14 +224,11 @@ class RenderPerturbation(Perturbation):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: object) -> None:
-        for field in cls.fields:
-            if field not in FIELDS:
-                raise PipelineError(
-                    f"a render perturbation writes {field}, which pictures would not follow",
-                    where=f"{cls.__module__}.{cls.__qualname__}",
-                    expected=f"fields of {', '.join(FIELDS)}",
-                    remedy="make it a PhysicsPerturbation, which changes the scene before it is replayed",
-                )
+        if others := {*cls.fields} - {*FIELDS}:
+            raise TypeError(
+                f"{cls.__name__} writes {sorted(others)}, which pictures would not follow: make it a "
+                "PhysicsPerturbation, which changes the scene before it is replayed"
+            )
         cls.paints = cls.fields == ("tex_data",)
         cls.sees_otherwise = not {*CAMERA_FIELDS, *OPACITY_FIELDS}.isdisjoint(cls.fields)
 
@@ -276,11 +247,9 @@ class PhysicsPerturbation(Perturbation):
     layer: ClassVar[Layer] = Layer.PHYSICS
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene that ``demo`` is replayed in.
+        """The changed ``scene``, in which ``demo`` is replayed.
 
         Args:
-            scene: what the perturbation changes.
-            demo: the demonstration.
             roll_out: gives the states that the demonstration's actions lead to from a scene; costs a whole replay.
 
         Raises:
