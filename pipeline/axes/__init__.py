@@ -10,15 +10,13 @@ from typing import Annotated, Any, TypeVar, get_args
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline.axes.background import BackgroundAxis
-from pipeline.axes.base import (
-    Axis,
-    Frozen,
-    Perturbation,
-    PhysicsPerturbation,
-    PixelPerturbation,
-    RenderPerturbation,
-    TextPerturbation,
-)
+from pipeline.axes.base import Axis as Axis
+from pipeline.axes.base import Frozen
+from pipeline.axes.base import Perturbation as Perturbation
+from pipeline.axes.base import PhysicsPerturbation as PhysicsPerturbation
+from pipeline.axes.base import PixelPerturbation as PixelPerturbation
+from pipeline.axes.base import RenderPerturbation as RenderPerturbation
+from pipeline.axes.base import TextPerturbation as TextPerturbation
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.disturbance import DisturbanceAxis
 from pipeline.axes.language import LanguageAxis
@@ -119,21 +117,3 @@ def from_json(text: str) -> tuple[Perturbation, ...]:
 def of_layer(perturbations: Iterable[Perturbation], layer: type[Kind]) -> tuple[Kind, ...]:
     """Those that act on one layer, named by its class."""
     return tuple(p for p in perturbations if isinstance(p, layer))
-
-
-__all__ = [
-    "AXES",
-    "Axes",
-    "Axis",
-    "Perturbation",
-    "PhysicsPerturbation",
-    "PixelPerturbation",
-    "RenderPerturbation",
-    "TextPerturbation",
-    "axes_of",
-    "components_of",
-    "from_json",
-    "in_order",
-    "of_layer",
-    "to_json",
-]
