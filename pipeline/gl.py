@@ -13,7 +13,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from itertools import count
@@ -102,9 +102,6 @@ def choose() -> GlChoice:
 def gpus() -> tuple[str, ...]:
     """EGL's indices of all GPUs like the chosen one, for worker processes to share; none where there is no choice, or
     where ``CUDA_VISIBLE_DEVICES`` names them otherwise than by numbers.
-
-    Raises:
-        PipelineError: when nothing renders here, as in ``choose``.
     """
     choice = choose()
     if choice.software or choice.device_named or choice.backend != "egl":
@@ -125,11 +122,7 @@ def gpus() -> tuple[str, ...]:
 
 
 class WorkerSetup:
-    """What renders here, for worker processes of this machine: they need not try it again.
-
-    Raises:
-        PipelineError: when nothing renders here, as in ``choose``.
-    """
+    """What renders here, for worker processes of this machine: they need not try it again. Raises as ``choose``."""
 
     def __init__(self) -> None:
         self._choice, self._gpus = choose(), gpus()
@@ -146,11 +139,7 @@ class WorkerSetup:
 
 
 def prepare() -> GlChoice:
-    """Choose, and have MuJoCo render with the choice, also where it was imported before without OpenGL.
-
-    Raises:
-        PipelineError: when nothing renders here, as in ``choose``.
-    """
+    """``choose``, and have MuJoCo render with the choice, also where it was imported before without OpenGL."""
     choice = choose()
     # mujoco.Renderer looks its context class up here; MuJoCo itself fills it in by MUJOCO_GL, but only when imported.
     context: Any = import_module("mujoco.gl_context")
@@ -183,27 +172,15 @@ class _NoDeviceError(Exception):
 
 def _best_device(backend: str) -> tuple[str, str | None]:
     """The first GPU, or else the first renderer, as its name and the ``MUJOCO_EGL_DEVICE_ID`` it needs."""
-    indices: list[str | None] = [os.environ.get("MUJOCO_EGL_DEVICE_ID")]
+    index = os.environ.get("MUJOCO_EGL_DEVICE_ID")
     # Render on the GPU that the job was given, where EGL and CUDA count alike: robosuite goes by the same rule, and
     # refuses a device that is not in this list. Without an index mujoco takes the first device that answers.
     first_visible = os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")[0]
-    if backend == "egl" and indices == [None] and first_visible.isdigit():
-        indices.insert(0, first_visible)
-
-    found: list[tuple[str, str | None]] = []
-    fault = ""
-    for index in indices:
-        try:
-            device = _probe(backend, index)
-        except _NoDeviceError as error:
-            fault = str(error)
-            continue
-        if not _is_software(device):
-            return device, index
-        found.append((device, index))
-    if not found:
-        raise _NoDeviceError(fault)
-    return found[0]
+    if backend == "egl" and index is None and first_visible.isdigit():
+        with suppress(_NoDeviceError):
+            if not _is_software(device := _probe(backend, first_visible)):
+                return device, first_visible
+    return _probe(backend, index), index
 
 
 def _probe(backend: str, index: str | None) -> str:
