@@ -27,13 +27,7 @@ DUMMY_ACTION = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0])
 
 
 class UnusableSceneError(PipelineError):
-    """A scene or a state that cannot be simulated.
-
-    Args:
-        reason: ``scene_refused`` or ``state_mismatch``, as the manifest says it.
-        what: the fault, as in ``PipelineError``.
-        task: whose scene it should be.
-    """
+    """A scene or a state that cannot be simulated: ``scene_refused`` or ``state_mismatch``, as the manifest says it."""
 
     def __init__(self, reason: str, what: str, task: Task):
         super().__init__(
@@ -48,11 +42,9 @@ class UnusableSceneError(PipelineError):
 class Environment:
     """One task's environment; every ``restore`` forgets what happened before it.
 
-    Building one parses the BDDL file and loads every mesh (1 to 3 s), so keep an environment for all demonstrations
-    of its task.
+    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task.
 
     Args:
-        task: the task to build.
         scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
         scene_xml: absolute path of another file for the arena.
         images: whether the models that LIBERO's resets compile have their images, which take more time than all else.
@@ -98,13 +90,10 @@ class Environment:
         return self._placed[seed]
 
     def reset(self, seed: int) -> str:
-        """LIBERO's own first reset under ``seed``, as the one that made its initial states; 1.3 s.
+        """The scene of LIBERO's own first reset under ``seed``, as MJCF, as of its initial states; 1.3 s.
 
         Fixtures and objects stand where ``place_fixtures`` and the BDDL file have them, and the arm at home with
         robosuite's default noise, which LIBERO's ``ControlEnv`` leaves out. The environment stays there.
-
-        Returns:
-            The scene as MJCF.
         """
         self._reset_under(seed, initialization_noise="default")
         return self._as_mjcf()
@@ -116,8 +105,7 @@ class Environment:
         # one of them: without this, the second placement under a seed differs from the first.
         del env.object_property_initializers[self._openings :]
         self._scene = None
-        # Each reset makes the robot anew, from this.
-        usual = env.robot_configs[0]
+        usual = env.robot_configs[0]  # each reset makes the robot anew from this
         env.robot_configs[0] = {**usual, **robot}
         try:
             with seeded(seed), self._compiling():
@@ -167,9 +155,8 @@ class Environment:
                 self._open(scene.model_xml)
             except (ValueError, KeyError, mujoco.FatalError) as error:
                 # What MuJoCo raises when it compiles, and robosuite when a name that it looks up is not in the model.
-                raise UnusableSceneError(
-                    "scene_refused", f"the scene is refused ({error!s:.300})", self.task
-                ) from error
+                what = f"the scene is refused ({error!s:.300})"
+                raise UnusableSceneError("scene_refused", what, self.task) from error
             self._check_names()
             self._scene, self._site_rgba = scene.model_xml, env.sim.model.site_rgba.copy()
         else:
@@ -199,11 +186,7 @@ class Environment:
         self._push, self._steps = scene.push, 0
 
     def settle(self, steps: int) -> None:
-        """Do nothing for some control steps, with the gripper open, while the arm and objects come to rest.
-
-        Raises:
-            RefusedError: see ``step``.
-        """
+        """Do nothing for some control steps, with the gripper open, while arm and objects come to rest; as ``step``."""
         # Before the first look, from which a push counts.
         self._steps = -steps
         for _ in range(steps):
@@ -222,12 +205,11 @@ class Environment:
 
     def _reset_in_place(self) -> None:
         """LIBERO's reset of the scene that is there, which otherwise would draw one anew."""
-        env = self._env.env
-        env.deterministic_reset = True
+        self._env.env.deterministic_reset = True
         try:
-            env.reset()
+            self._env.env.reset()
         finally:
-            env.deterministic_reset = False
+            self._env.env.deterministic_reset = False
 
     def _check_names(self) -> None:
         """What is looked up by name later, besides what LIBERO's own reset has looked up already."""
@@ -246,11 +228,11 @@ class Environment:
         if len(state) != expected:
             what = f"the recorded state has {len(state)} numbers, the scene's has {expected}"
             raise UnusableSceneError("state_mismatch", what, self.task)
-        for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-            first = 1 + model.jnt_qposadr[joint] + 3
-            if not state[first : first + 4].any():
-                what = f"the recorded state gives {model.joint(joint).name} a rotation of length 0"
-                raise UnusableSceneError("state_mismatch", what, self.task)
+        free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
+        turns = state[4 + model.jnt_qposadr[free, None] + np.arange(4)]
+        for joint in free[~turns.any(axis=1)]:
+            what = f"the recorded state gives {model.joint(joint).name} a rotation of length 0"
+            raise UnusableSceneError("state_mismatch", what, self.task)
 
     def step(self, action: Floats) -> None:
         """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1].
@@ -290,10 +272,8 @@ class Environment:
     def pose(self, name: str) -> Floats:
         """(7,) position in m and rotation wxyz of an object, a fixture or a region, by its name in the BDDL file."""
         data = self.sim.data._data
-        if f"{name}_joint0" not in self.sim.model.joint_names:
-            return fixed_pose(data, name)
-        pose: Floats = data.joint(f"{name}_joint0").qpos.copy()
-        return pose
+        joint = f"{name}_joint0"
+        return np.array(data.joint(joint).qpos) if joint in self.sim.model.joint_names else fixed_pose(data, name)
 
     @property
     def state(self) -> Floats:
