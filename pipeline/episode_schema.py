@@ -167,11 +167,7 @@ def named(extras: Collection[Extra]) -> bool:
 
 
 def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
-    """Refuse an episode that training would misread or choke on.
-
-    Args:
-        episode: to be written.
-        extras: what it must have beside the frames.
+    """Refuse an episode that training would misread or choke on; it must have the ``extras`` beside the frames.
 
     Raises:
         PipelineError: naming the episode and the field.

@@ -103,11 +103,7 @@ def versions() -> dict[str, str]:
 
 
 def made_with(step: Step) -> dict[str, str]:
-    """What files of a step are made with, by name, for people: recipes, package versions and machine code.
-
-    Raises:
-        PipelineError: when NumPy computes with other machine code than is fixed.
-    """
+    """What files of a step are made with, by name, for people: recipes, package versions and ``fixed_machine_code``."""
     recipes, packages, machine_code = _parts(step)
     named = {f"recipe of {each}": str(number) for each, number in recipes.items()}
     return {**named, **packages, "machine code": machine_code}
@@ -146,7 +142,7 @@ def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
     Args:
         found: what and why, to the number of files.
         where: they lie.
-        allow: how to allow it, in words.
+        allow: how, in words.
 
     Raises:
         PipelineError: when there is any, and the environment does not allow it. Nothing was changed.

@@ -139,8 +139,6 @@ def changed_goal(text: str, task: Task, hints: bool) -> str | None:
     """What of the task's goal ``text`` does not keep; None when it keeps all that is checked.
 
     Args:
-        text: the rewrite.
-        task: whose goal.
         hints: whether things may be described by what one knows of them, and a drawer by exclusion; else by name only.
 
     Raises:

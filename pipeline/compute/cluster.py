@@ -112,9 +112,7 @@ def setup() -> dict[str, str]:
 def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
     """Check every worker that a Dask client has now; later ones are checked when they get their first work.
 
-    Args:
-        client: of a running cluster.
-        folder: what the run writes into.
+    The run writes into ``folder``.
 
     Raises:
         PipelineError: naming every worker that cannot work for this run, and why.

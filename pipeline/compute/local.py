@@ -23,9 +23,7 @@ def local_cluster(
 ) -> Iterator[tuple[Any, Callable[[], None]]]:
     """A client of so many workers, one for each core when left out, and what brings back those that died.
 
-    Args:
-        workers: how many.
-        opengl: as in ``runner``.
+    ``opengl`` is that of ``runner``.
 
     Raises:
         PipelineError: when the workers end while they start.

@@ -25,7 +25,6 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
 
     Args:
         out: the folder to use as ``demos.root`` afterwards.
-        suites: such as ``libero_goal``.
         endpoint: address of a mirror of the hub, when not the hub itself.
 
     Raises:

@@ -24,11 +24,6 @@ def recorded_start(demo: Demo, model_xml: str, settles: bool = True) -> Scene:
     asks for. What settles does so as in an evaluation, which puts a state in after a reset: the controller has
     the reset's posture. What does not, and what starts too far from home for a reset, such as the demonstrations of
     ``demos expand``, is held where it is.
-
-    Args:
-        demo: the demonstration.
-        model_xml: the recorded scene, or what stands for it.
-        settles: whether the scene settles before the first action.
     """
     # After the time, a flattened state has the arm's seven joints.
     near = float(np.linalg.norm(demo.init_state[1:8] - HOME_RAD)) <= SCATTER_RAD

@@ -37,9 +37,6 @@ def replay(
 
     Args:
         environment: of the demonstration's task.
-        demo: what to replay.
-        trajectory_id: names the result.
-        config: how to replay.
         perturbations: what to change before the first step.
         reference: gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
             ``tracked``; the result says how its actions came about.
@@ -105,11 +102,7 @@ def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats
 def _perturbed(
     environment: Environment, demo: Demo, config: ReplayConfig, perturbations: Sequence[PhysicsPerturbation]
 ) -> tuple[Scene, Verdict | None]:
-    """Where the replay starts, and the reason if a perturbation cannot be made there.
-
-    Raises:
-        UnusableSceneError: when the demonstration cannot be simulated at all.
-    """
+    """Where the replay starts, and the reason if a perturbation cannot be made there."""
     model_xml = demo.model_xml or environment.place_fixtures(config.fixture_seed)
     scene = recorded_start(demo, model_xml, settles=config.settle_steps > 0)
     # Before perturbations compile it themselves, which would fail in ways of their own.

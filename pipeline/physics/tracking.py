@@ -82,7 +82,6 @@ class Route:
         last contact. Where several are met at once, what the hand moves comes first, then what it meets for longest.
 
         Args:
-            reference: a rollout that reached the goal.
             hand: where the hand starts.
             poses: object, fixture or region to its pose (7,) in the scene; those that are left out have not moved.
 
@@ -126,12 +125,8 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
 
     The index along the route advances by one a step, so that grasp and release keep their timing, and more slowly while
     the hand is far from where it should be. While something is carried, it is brought where it was in the reference
-    rather than the hand, because it may have been grasped differently.
-
-    Args:
-        route: where to go.
-        hand: where the hand is.
-        pose: object to where it is (7,).
+    rather than the hand, because it may have been grasped differently. ``hand`` and ``pose`` give where the hand and an
+    object (7,) are.
     """
     reference = route.reference
     turns = (route.rotations * reference.rotations.inv()).as_rotvec()
