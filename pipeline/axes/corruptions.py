@@ -1,8 +1,8 @@
 """The image corruptions of the noise axis, each a frozen record of its parameters that acts on one frame.
 
 They are those of ImageNet-C (Hendrycks and Dietterich, 2019) as LIBERO-Plus applies them. What the benchmark computes
-with ImageMagick, scikit-image and SciPy is computed here in NumPy and Numba with the same arithmetic, in the same order
-where that decides a grey level, because every component but motion ends by truncation.
+with ImageMagick, scikit-image and SciPy is computed here with the same arithmetic, in the same order where that decides
+a grey level, because every component but motion ends by truncation.
 """
 
 from __future__ import annotations
@@ -31,28 +31,12 @@ def _to_frame(image: NDArray[np.floating]) -> Frame:
     return (image.clip(0, 1) * 255).astype(np.uint8, order="C")
 
 
-@compiled
-def _blur_columns(image: Floats, half_kernel: Floats) -> Floats:
-    """(N, M) convolved along axis 0 with a symmetric kernel, given from its centre outwards; edges repeated."""
-    blurred: Floats = image * half_kernel[0]
-    last = len(image) - 1
-    for y in range(len(image)):
-        for k in range(len(half_kernel) - 1, 0, -1):  # outermost pair first, as SciPy sums them
-            above, below = image[max(y - k, 0)], image[min(y + k, last)]
-            for x in range(image.shape[1]):
-                blurred[y, x] += (above[x] + below[x]) * half_kernel[k]
-    return blurred
-
-
 def _gaussian_blur(image: Floats, sigma_px: float) -> Floats:
     """(H, W, 3) blurred per channel by a Gaussian cut at 4 sigma, edges repeated."""
-    radius = int(4 * sigma_px + 0.5)
-    kernel = np.exp(-0.5 / sigma_px**2 * np.arange(-radius, radius + 1) ** 2)
-    half_kernel = (kernel / kernel.sum())[radius:]
-    for _ in range(2):  # down the columns, then along the rows
-        blurred: Floats = _blur_columns(image.reshape(len(image), -1), half_kernel)
-        image = blurred.reshape(image.shape).swapaxes(0, 1)
-    return image
+    from scipy.ndimage import gaussian_filter  # takes long, and every process of a run imports the axes
+
+    blurred: Floats = gaussian_filter(image, (sigma_px, sigma_px, 0), mode="nearest", truncate=4)
+    return blurred
 
 
 class Motion(Frozen):
