@@ -93,13 +93,6 @@ def _flattened(vertices_m: NDArray[np.float32], normals: NDArray[np.float32]) ->
 
 def _kinds(rows: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
     """The number of one row of each kind, and for each row its kind."""
-    bits = np.ascontiguousarray(rows).view(np.uint32)
-    mixed: NDArray[np.uint64] = np.zeros(len(rows), np.uint64)
-    for column in bits.T:
-        mixed = (mixed ^ column) * np.uint64(0x9E3779B97F4A7C15)
-        mixed ^= mixed >> np.uint64(29)
-    _, first, kind = np.unique(mixed, return_index=True, return_inverse=True)
-    if not np.array_equal(bits[first[kind]], bits):
-        # Two kinds were mixed to one number: each row is taken for one of its own.
-        first = kind = np.arange(len(rows))
+    bits = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()
+    _, first, kind = np.unique(bits, return_index=True, return_inverse=True)
     return first, kind.astype(np.uint32)
