@@ -148,19 +148,24 @@ class LanguageAxis(Axis):
 
 @cache
 def load_bank(file: Path = BANK_FILE) -> Bank:
-    """A bank as stored; the one that is shipped by default.
+    """``read_bank``, once a process; the one that is shipped by default."""
+    return read_bank(file)
+
+
+def read_bank(file: Path) -> Bank:
+    """A bank as stored.
 
     Raises:
         PipelineError: when the file does not have the bank's form.
     """
     try:
-        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), yaml.CSafeLoader))
+        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), yaml.CSafeLoader) or {})
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         raise PipelineError(
-            f"the bank of rewrites cannot be read ({error})",
+            f"not a bank of rewrites ({error})",
             where=file,
             expected=f"ASCII YAML: suite, task name, class ({', '.join(CLASSES)}), list of sentences",
-            remedy="restore the file, or make it again with the command rewrite",
+            remedy="correct or restore the file, or make it again with the command rewrite",
         ) from error
 
 

@@ -15,9 +15,9 @@ from itertools import takewhile
 from pathlib import Path
 
 import yaml
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
-from pipeline.axes.language import CLASSES, LENGTH, REMEDY, Bank, Component, lint, load_bank, normalise
+from pipeline.axes.language import CLASSES, LENGTH, REMEDY, Bank, Component, lint, load_bank, normalise, read_bank
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.bddl import Fact, read
@@ -132,7 +132,7 @@ def extend(
     Raises:
         PipelineError: when a file cannot be read, the model cannot be reached, or too few rewrites were acceptable.
     """
-    told, bank = brief(bddl_file), _read(out)
+    told, bank = brief(bddl_file), read_bank(out) if out.exists() else {}
     task = told.task
     stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
     _check(stored, task, out)
@@ -236,20 +236,6 @@ def tidy(text: str) -> str:
     """In lower case, without surplus white space, quotation marks around it and punctuation at its end."""
     plain = " ".join(text.lower().replace("\N{RIGHT SINGLE QUOTATION MARK}", "'").split())
     return plain.strip("\"'`, \N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}").rstrip(".!? ")
-
-
-def _read(path: Path) -> Bank:
-    if not path.exists():
-        return {}
-    try:
-        return TypeAdapter(Bank).validate_python(yaml.safe_load(path.read_text(encoding="ascii")) or {})
-    except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
-        raise PipelineError(
-            f"not a bank of rewrites ({error})",
-            where=path,
-            expected=f"ASCII YAML: suite, task name, class ({', '.join(CLASSES)}), list of sentences",
-            remedy="correct it, or name another file with --out",
-        ) from error
 
 
 def _write(bank: Bank, path: Path) -> None:
