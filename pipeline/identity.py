@@ -39,20 +39,10 @@ RECIPES: dict[Step, int] = {
     "checks": 3,
     "pictures": 2,
 }
-"""2 of ``physics``: tracking keeps to a place until what is put there is let go; added objects show in the agent view.
-3: a stored scene names its files by package; states and actions are those of 2. 4: scenes settle before the first
-action, with the gripper's command and the controller's posture of a recording; added objects stand where the
-benchmark's do. 5: the command and the posture are those of the recording among added objects, too.
-6: a kept trajectory comes with figures of its quality.
-2 of ``pixels``: cameras that lose sight of the task are refused. 3: frames come with the matrices of their cameras;
-lamps are changed from where changes show, and added objects that do not show are refused. 4: lamps stay where they
-are, and frames begin where the scene has settled. 5: the sky shows past a room's edge.
-3 of ``rlds``, 6 of ``lerobot``: the seed is a number, quality is told, features and videos are described, and there is
-a ``meta/modality.json``. 5 of ``lerobot``: files are written directly, and camera matrices stand once for each episode.
+"""What a number stands for, the commit tells that raised it.
+
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
-2 of it: joint angles are held against the replay's. 3: figures of quality too, against the manifest's.
-``pictures``: what ``summary`` shows, and the report.
-2 of it: a contact sheet is spread over the run, and shows other starts at the first frame."""
+``pictures``: what ``summary`` shows, and the report."""
 
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),
