@@ -174,12 +174,10 @@ def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     """
     steps = len(episode)
     if steps < SCHEMA.min_steps:
-        raise _fault(
-            episode, "action", f"has {steps} steps", f"at least {SCHEMA.min_steps}, the chunk policies predict"
-        )
-    _check_array(episode, "state", episode.state, SCHEMA.state, steps)
-    _check_array(episode, "joint_state", episode.joint_state, SCHEMA.joint_state, steps)
-    _check_array(episode, "action", episode.action, SCHEMA.action, steps)
+        expected = f"at least {SCHEMA.min_steps}, the chunk policies predict"
+        raise _fault(episode, "action", f"has {steps} steps", expected)
+    for name in MOTION:
+        _check_array(episode, name, getattr(episode, name), getattr(SCHEMA, name), steps)
     low, high = SCHEMA.action.range
     if episode.action.min() < low or episode.action.max() > high:
         found = f"spans [{episode.action.min():g}, {episode.action.max():g}]"

@@ -17,14 +17,9 @@ def digest(*key: object) -> str:
     return hashlib.sha256(_CANONICAL.encode(key).encode()).hexdigest()
 
 
-def rng(*key: Key) -> np.random.Generator:
+def rng(first: Key, *more: Key) -> np.random.Generator:
     """A Philox generator keyed by values such as ``(seed, axis, demo_id, variant)``.
 
     There is no default: a generator without a key cannot be asked for, so nothing runs unseeded.
-
-    Raises:
-        TypeError: when the key is empty or holds something other than str and int.
     """
-    if not key or not all(isinstance(part, (str, int)) for part in key):
-        raise TypeError(f"seeding.rng wants one or more str or int as its key, got {key!r}")
-    return np.random.Generator(np.random.Philox(key=int(digest(*key)[:32], 16)))
+    return np.random.Generator(np.random.Philox(key=int(digest(first, *more)[:32], 16)))

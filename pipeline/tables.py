@@ -49,12 +49,7 @@ def write_table(table: pa.Table, path: Path) -> None:
 
 
 def read_table(path: Path, columns: Collection[str], remedy: str) -> pa.Table:
-    """A table as it was written.
-
-    Args:
-        path: of the file.
-        columns: what it must have at least.
-        remedy: how it is made again.
+    """A table as it was written, with these columns at least; ``remedy`` tells how it is made again.
 
     Raises:
         PipelineError: when it is missing or damaged, or lacks columns.

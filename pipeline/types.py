@@ -72,7 +72,6 @@ class Demo:
     """One recorded human demonstration.
 
     Attributes:
-        task: the task it solves.
         key: its name in its source, such as ``demo_0``.
         source: where it came from, for provenance (never parsed).
         origin: who made it, ``human``, or ``expanded`` when it was made from a human one.
@@ -228,7 +227,7 @@ class Rendered:
         streams: stream id to K encoded frames.
         rejected: stream id to the reason why it was not rendered.
         geometry: id of a stream's geometry to what it is.
-        object_poses: (K, 24, 7), None where they were not asked for.
+        object_poses: (K, 24, 7) float32, None where they were not asked for.
         instances: names of the things that segmentation and poses number; none without those.
         quality: the trajectory's.
     """
@@ -259,14 +258,11 @@ class Episode:
     Attributes:
         episode_id: identity by content, joins RLDS, LeRobot and manifest.
         frames: view name (``image``, ``wrist_image``) to T JPEG files, already rotated.
-        state: (T, 8) float32.
-        joint_state: (T, 7) float32.
-        action: (T, 7) float32.
+        state, joint_state, action: (T, 8), (T, 7) and (T, 7) float32.
         instruction: the text the policy is prompted with.
         provenance: the columns named in ``schemas/episode.json``.
         geometry: view name to where it is seen from.
-        object_poses: (T, 24, 7) float32, None where they were not asked for.
-        instances: names of the things that segmentation and poses number; none without those.
+        object_poses, instances: as in ``Rendered``.
         rewrites: other wordings of its task, for training; none where they were not asked for.
         subtasks: what is done one after the other; none where they were not asked for.
     """

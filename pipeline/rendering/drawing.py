@@ -48,9 +48,6 @@ class PlainDrawing:
 
     Close it before another is made.
 
-    Args:
-        model: what to render.
-
     Raises:
         PipelineError: when nothing renders on this machine.
     """

@@ -20,15 +20,8 @@ from pipeline.types import Extra, Floats, Geometry, Trajectory
 def see(
     renderer: Renderer, trajectory: Trajectory, stream: Stream, instances: Instances | None, extras: Collection[Extra]
 ) -> Geometry:
-    """The geometry of a view: its matrices, and with extras its depth and segmentation before each executed action.
-
-    Args:
-        renderer: of the trajectory's scene.
-        trajectory: gives the states.
-        stream: the view, and the perturbations that change what it sees beside colours.
-        instances: gives the ids of segmentation.
-        extras: what to make beside the matrices.
-    """
+    """The geometry of a view of a trajectory's scene: its matrices, and with extras its depth and segmentation before
+    each executed action, by the ids of ``instances``."""
     view = SCHEMA.views[stream.view]
     maps: dict[Extra, list[bytes]] = {name: [] for name in MAPS if name in extras}
     with renderer.perturbed(of_layer(stream.perturbations, RenderPerturbation)):

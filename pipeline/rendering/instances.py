@@ -26,11 +26,6 @@ class Instances:
 
     After ``COMMON`` come the fixtures and then the objects in the order of the task's BDDL file, under their names
     there, so that an id means the same in all episodes of a task. Objects that the layout axis added come last.
-
-    Args:
-        model: of the trajectory.
-        trajectory: tells which objects were added.
-        task: names the others.
     """
 
     def __init__(self, model: mujoco.MjModel, trajectory: Trajectory, task: Task):

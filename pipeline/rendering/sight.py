@@ -41,12 +41,9 @@ class Sight:
 
     @classmethod
     def of(cls, renderer: Renderer, task: Task, hand_m: Floats) -> Sight:
-        """What the agent view of a renderer sees in the restored state.
+        """What the agent view sees in the restored state, of what LIBERO lists as of interest in the task.
 
-        Args:
-            renderer: of a scene of the task.
-            task: tells which things are meant: those that LIBERO lists as of interest, target and receptacle.
-            hand_m: (T, 3) where the grip site is at each step, in the world.
+        ``hand_m`` (T, 3) is where the grip site is at each step, in the world.
         """
         model, data = renderer.model, renderer.data
         seen = renderer.geoms(CAMERA)
@@ -78,16 +75,10 @@ class Sight:
 
 
 class FirstFrame:
-    """Judges perturbed scenes of a trajectory by its first frame.
+    """Judges perturbed scenes of a trajectory by its first frame; the renderer is not perturbed at first.
 
     A perturbed scene is refused when a frame is black or blown out (``exposure``), or when the agent view shows too
     little (``Sight``).
-
-    Args:
-        renderer: of the trajectory's scene, not perturbed.
-        trajectory: whose first state is rendered.
-        task: tells which things must be seen.
-        hand_m: as in ``Sight.of``.
     """
 
     def __init__(self, renderer: Renderer, trajectory: Trajectory, task: Task, hand_m: Floats):
@@ -97,11 +88,7 @@ class FirstFrame:
         self._original = Sight.of(renderer, task, hand_m)
 
     def fault(self, streams: Sequence[Stream]) -> str | None:
-        """What is wrong with the scene that the renderer shows now; None when nothing is.
-
-        Args:
-            streams: those of the scene.
-        """
+        """What is wrong with the streams' scene, which the renderer shows now; None when nothing is."""
         self._renderer.restore(*self._first)
         changes = changes_of(streams[0])
         faults: list[str] = []

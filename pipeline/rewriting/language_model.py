@@ -23,12 +23,7 @@ class UnusableError(Exception):
 
 
 class _BusyError(Exception):
-    """The endpoint may answer later.
-
-    Args:
-        fault: what happened.
-        wait_s: how long it asked to be left alone.
-    """
+    """The endpoint may answer later; ``wait_s`` is how long it asked to be left alone."""
 
     def __init__(self, fault: str, wait_s: float = 0.0):
         super().__init__(fault)

@@ -124,9 +124,7 @@ def extend(
 
     Args:
         bddl_file: the task, ``<suite>/<task>.bddl``.
-        out: the bank to extend, or to begin.
-        per_class: how many rewrites of each class there shall be.
-        ask: answers a prompt, such as a ``Chat``.
+        ask: answers a prompt, such as a ``LanguageModel``.
         report: told of progress.
 
     Raises:

@@ -80,11 +80,7 @@ def put_images(scene: ET.Element, taken: Mapping[str, Mapping[str, str]]) -> Non
 
 
 class CompiledScene:
-    """A scene's model, not to be written into, and data at its state.
-
-    Args:
-        scene: what to compile, as ``physics_to_read`` does.
-    """
+    """A scene's model, as of ``physics_to_read``, not to be written into, and data at its state."""
 
     def __init__(self, scene: Scene):
         self.model = physics_to_read(scene.model_xml)

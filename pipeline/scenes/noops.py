@@ -12,17 +12,11 @@ NOOP_NORM = 1e-4
 
 
 def kept_actions(actions: Floats, noops: str) -> NDArray[np.bool_]:
-    """Which actions are executed; the others are skipped without stepping the physics.
+    """(T,) which of the actions (T, 7) are executed; the others are skipped without stepping the physics.
 
     A no-op moves the arm by less than ``NOOP_NORM`` and leaves the gripper as the last executed action had it
-    (OpenVLA's rule; the very first action is a no-op by its motion alone).
-
-    Args:
-        actions: (T, 7).
-        noops: ``drop``, ``trim_ends`` or ``keep``.
-
-    Returns:
-        (T,) mask.
+    (OpenVLA's rule; the very first action is a no-op by its motion alone). ``noops`` is ``drop``, ``trim_ends`` or
+    ``keep``.
     """
     if noops == "keep":
         return np.ones(len(actions), bool)

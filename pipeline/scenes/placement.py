@@ -98,17 +98,7 @@ def _with(model_xml: str, objects: Sequence[ObjectModel], names: Sequence[str]) 
 
 
 class _Placement:
-    """A scene with objects in it whose places are still open.
-
-    Args:
-        scene: without the objects.
-        states: (K+1, S) that the demonstration leads through in it.
-        objects: to add.
-        known: the task, which tells the arena and the things that must stay in sight.
-
-    Attributes:
-        model_xml: of the scene with the objects.
-    """
+    """A scene, through whose states (K+1, S) a demonstration leads, with objects in it whose places are still open."""
 
     def __init__(self, scene: Scene, states: Floats, objects: Sequence[ObjectModel], known: Bddl):
         names = [f"{_BODY}{number}" for number in range(len(objects))]

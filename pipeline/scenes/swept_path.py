@@ -52,11 +52,8 @@ class SweptPath:
         mujoco.mj_kinematics(model, self._data)
 
     def clear(self, poses: Floats, clearance_m: float) -> bool:
-        """Whether nothing comes closer than that to an object, or an object to another, all along the demonstration.
-
-        Args:
-            poses: (N, 7) of the objects.
-        """
+        """Whether nothing comes closer than that to objects at poses (N, 7), nor they to one another, all along the
+        demonstration."""
         model, data = self._model, self._data
         model.geom_margin[self._added] = clearance_m
         model.body_margin[model.geom_bodyid[self._added]] = clearance_m

@@ -53,9 +53,7 @@ class FrameStore(Store):
     (ids of those that were rendered) and ``rejected`` (JSON, stream id to the reason why it was not). A file's name is
     ``<trajectory id>/<digest of its streams>``.
 
-    Args:
-        root: the folder.
-        config: how frames are encoded; what was encoded otherwise counts as missing.
+    What was encoded otherwise than ``config`` says counts as missing.
     """
 
     step, stage, pattern = "encoding", "render", "*/*.h5"

@@ -40,7 +40,6 @@ class Store(ABC):
     """The files of one stage.
 
     Args:
-        root: the folder.
         settings: JSON-serialisable, those of the user that the bytes depend on; files with others count as missing.
         form: what else of this project they depend on, by its name for people.
     """

@@ -91,7 +91,7 @@ class Culling:
         seen = self.shown & view.shows(corners_m)
         with_shadows = np.flatnonzero(self._model.light_castshadow & self._model.light_active)
         lamps = tuple(self._lamp(data, view, corners_m, seen, lamp) for lamp in with_shadows.tolist())
-        images = np.zeros_like(seen)
+        images, sites_alpha = np.zeros_like(seen), self._model.site_rgba[:, 3]
         if mirror is not None and seen[mirror]:
             images = self.shown & self._images(data, view, corners_m, mirror)
         return Picture(
@@ -104,7 +104,7 @@ class Culling:
             sites=self._sites(bool(lamps)),
             projection=view.projection(),
             # Each light with shadows renders what it lights once more, so an underlay gains little.
-            underlaid=not lamps and not self._sites_see_through(),
+            underlaid=not lamps and not ((sites_alpha > 0) & (sites_alpha < 1)).any(),
         )
 
     def everything(self) -> Picture:
@@ -116,21 +116,14 @@ class Culling:
     def _images(self, data: mujoco.MjData, view: _View, corners_m: Floats, mirror: int) -> NDArray[np.bool_]:
         """(ngeom,) which geoms show in a mirror."""
         heights_m = self._heights(data, mirror, corners_m)
-        image_m = corners_m - 2 * heights_m[..., None] * self._normal(data, mirror)
+        image_m = corners_m - 2 * heights_m[..., None] * data.geom_xmat[mirror, 2::3]
         half_x_m, half_y_m, _ = self._model.geom_size[mirror]
         square_m = REFLECTING_SQUARE * [half_x_m, half_y_m, self._face_m(mirror)]
         opening_m = data.geom_xpos[mirror] + square_m @ data.geom_xmat[mirror].reshape(3, 3).T
         above = (heights_m > 0).any(axis=1)
         return np.asarray(above & view.shows(image_m) & view.shows_through(image_m, opening_m))
 
-    def _lamp(
-        self,
-        data: mujoco.MjData,
-        view: _View,
-        corners_m: Floats,
-        seen: NDArray[np.bool_],
-        lamp: int,
-    ) -> Lamp:
+    def _lamp(self, data: mujoco.MjData, view: _View, corners_m: Floats, seen: NDArray[np.bool_], lamp: int) -> Lamp:
         model, origin_m, clear = self._model, data.light_xpos[lamp], self._see_through()
         # What can be seen through is rendered in the last pass, with what is rendered there of meshes.
         if model.light_directional[lamp]:
@@ -167,13 +160,9 @@ class Culling:
                 break
         return None, True
 
-    def _normal(self, data: mujoco.MjData, mirror: int) -> Floats:
-        normal: Floats = data.geom_xmat[mirror].reshape(3, 3)[:, 2]
-        return normal
-
     def _heights(self, data: mujoco.MjData, mirror: int, places_m: Floats) -> Floats:
         """(...) of ``places_m`` (..., 3) above the reflecting side: that of a plane, or a box's face."""
-        heights_m: Floats = (places_m - data.geom_xpos[mirror]) @ self._normal(data, mirror) - self._face_m(mirror)
+        heights_m: Floats = (places_m - data.geom_xpos[mirror]) @ data.geom_xmat[mirror, 2::3] - self._face_m(mirror)
         return heights_m
 
     def _face_m(self, mirror: int) -> float:
@@ -192,10 +181,6 @@ class Culling:
         robosuite hides some by a negative opacity: MuJoCo renders them, and only where lamps cast shadows they show.
         """
         return np.asarray((self._model.site_rgba[:, 3] > 0) | shadows)
-
-    def _sites_see_through(self) -> bool:
-        opacity = self._model.site_rgba[:, 3]
-        return bool(((opacity > 0) & (opacity < 1)).any())
 
 
 def _in_cone(middles_m: Floats, radii_m: Floats, tip_m: Floats, axis: Floats, angle: float) -> NDArray[np.bool_]:

@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from contextlib import ExitStack
 from typing import NamedTuple
 
@@ -133,25 +133,17 @@ class SoftwareDrawing(PlainDrawing):
             last: whether this completes the picture, with what is in no underlay: mirror, transparent geoms, sites,
                 shadows and sky.
         """
-        picture = shot.picture
-        if not last:
-            self._render_passes(shot, opaque, [Pass(Purpose.CAMERA, picture.seen & opaque)], underlay, last)
-            return
-        rendered, passes = opaque | picture.mirror | picture.clear, []
-        if picture.mirror.any():
-            # A geom that is there for its image alone is not rendered before the camera.
-            rendered = rendered | picture.images
-            passes.append(Pass(Purpose.MIRROR, picture.images | picture.clear))
-        passes.append(Pass(Purpose.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear))
-        for lamp in picture.lamps:
-            passes += [Pass(Purpose.LAMP_MAP, lamp.casts), Pass(Purpose.LAMP_LIGHT, lamp.lights)]
-        self._render_passes(shot, rendered, passes, underlay, last)
-
-    def _render_passes(
-        self, shot: Shot, rendered: NDArray[np.bool_], passes: Sequence[Pass], underlay: Underlay | None, last: bool
-    ) -> None:
-        """Render geoms (ngeom,); each pass renders the meshes that it needs."""
         model, picture, flags = self._model, shot.picture, self._scene.flags
+        rendered, passes = opaque, [Pass(Purpose.CAMERA, picture.seen & opaque)]
+        if last:
+            rendered = opaque | picture.mirror | picture.clear
+            passes = [Pass(Purpose.CAMERA, picture.seen & (opaque | picture.mirror) | picture.clear)]
+            if picture.mirror.any():
+                # A geom that is there for its image alone is not rendered before the camera.
+                rendered = rendered | picture.images
+                passes.insert(0, Pass(Purpose.MIRROR, picture.images | picture.clear))
+            for lamp in picture.lamps:
+                passes += [Pass(Purpose.LAMP_MAP, lamp.casts), Pass(Purpose.LAMP_LIGHT, lamp.lights)]
         groups, site_groups = model.geom_group.copy(), model.site_group.copy()
         try:
             model.geom_group[:] = np.where(rendered, groups, CULLED)

@@ -21,10 +21,8 @@ class SkinnedMeshes:
     """Gives each geom of a large mesh a skin, which renders chosen faces of it.
 
     Args:
-        skins: of a context.
         samples: (SAMPLES, 2) place of each sample in its pixel.
-        meshes: display lists of a model.
-        shown: (ngeom,) which geoms of it can be rendered.
+        shown: (ngeom,) which geoms can be rendered.
         former: those of the model that the context was for before.
     """
 
@@ -60,13 +58,7 @@ class SkinnedMeshes:
     def put(
         self, scene: mujoco.MjvScene, data: mujoco.MjData, projection: Projection, wanted: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Have the skins follow their meshes in a scene, with the faces that a picture can show.
-
-        Args:
-            scene: of all that is rendered.
-            data: says where the meshes are.
-            projection: of the picture.
-            wanted: (ngeom,) which geoms are looked at.
+        """Have the skins follow their meshes in a scene, with the faces that a picture can show of ``wanted`` geoms.
 
         Returns:
             (nmesh,) which meshes have their skins in the scene.

@@ -48,8 +48,6 @@ class Meshes:
         closing: (nmesh,) number, as MuJoCo numbers meshes, of the closing mesh of each mesh that is rendered.
 
     Args:
-        context: whose meshes they become.
-        model: whose meshes they are.
         rendered: numbers of the meshes that are rendered.
         former: the display lists of the model before; unusable afterwards. Lists of meshes that both have are kept.
     """
@@ -83,11 +81,7 @@ class Meshes:
         self._passes: dict[Hashable, list[_Lists]] = {}
 
     def _give_up(self) -> dict[bytes, int]:
-        """Delete all but the lists of faces and the context's own.
-
-        Returns:
-            Hash of a mesh to the number of its list of faces.
-        """
+        """Delete all lists but the context's own and those of faces, which are given by the hash of their mesh."""
         for lists in (lists for made in self._passes.values() for lists in made):
             calls().glDeleteLists(lists.base, 2 * len(self._meshes) + 1)
         calls().glDeleteQueries(1, [self._nothing])

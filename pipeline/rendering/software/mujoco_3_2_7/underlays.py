@@ -38,16 +38,12 @@ void main() {
 class Underlay:
     """A part of a picture that is rendered once and used in many: colour and depth of every sample.
 
-    The context must be the current one.
+    The context must be the current one. Pictures begin in the corner of its off-screen buffer.
 
     Attributes:
         number: of the display list that writes the underlay into the off-screen buffer, at samples where nothing nearer
             was rendered; at equal depth the underlay wins. MuJoCo calls it after all opaque geoms (``Meshes``).
         content: identifies what was kept; empty at first.
-
-    Args:
-        context: of MuJoCo, with the off-screen buffer that pictures are rendered into.
-        height, width: of the pictures, which begin in that buffer's corner.
     """
 
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
