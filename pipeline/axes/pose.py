@@ -17,7 +17,6 @@ from pydantic import Field
 
 from pipeline.axes.base import Axis, PhysicsPerturbation, pick, point
 from pipeline.axes.scene import ScenePerturbation, draw_scene
-from pipeline.errors import PipelineError
 from pipeline.libero import bddl
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
@@ -124,20 +123,7 @@ class PoseAxis(Axis):
         return [(component, name) for component in self.components for name in named[component]]
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
-        """One draw for a task that the axis applies to.
-
-        Raises:
-            PipelineError: when the task moves nothing.
-        """
-        choices = self._choices(task)
-        if not choices:
-            raise PipelineError(
-                f"the task {task.suite}/{task.name} has no {' or '.join(self.components)} that could be displaced",
-                where="axis pose",
-                expected="a task whose goal puts an object somewhere",
-                remedy="choose another task or another axis",
-            )
-        component, moved = pick(rng, choices)
+        component, moved = pick(rng, self._choices(task))
         level = self.draw_level(rng)
         if component == "scene":
             return draw_scene(rng, level, task)

@@ -34,17 +34,13 @@ def resized(frame: Frame, height_px: int, width_px: int) -> Frame:
 def encode(frame: Frame, config: RenderConfig) -> bytes:
     """JPEG file of an RGB frame; every dataset carries these bytes or pixels decoded from them."""
     bgr = cv2.cvtColor(frame, cv2.COLOR_RGB2BGR)
-    done, packed = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
-    if not done:
-        raise RuntimeError("OpenCV could not encode a frame as JPEG")
+    _, packed = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
     return packed.tobytes()
 
 
 def encode_exactly(pixels: NDArray[Any]) -> bytes:
     """PNG file of (H, W) uint8 or uint16."""
-    done, packed = cv2.imencode(".png", pixels)
-    if not done:
-        raise RuntimeError("OpenCV could not encode a picture as PNG")
+    _, packed = cv2.imencode(".png", pixels)
     return packed.tobytes()
 
 

@@ -143,7 +143,7 @@ def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
     The same recordings make the same bytes.
     """
     bddl = task.bddl_file.read_text()
-    problem = _in_bddl(bddl, "problem")
+    (problem,), (language,) = (re.findall(rf"\({key}\s+([^()]+)\)", bddl) for key in ("problem", ":language"))
     bddl_file = f"libero/libero/bddl_files/{task.suite}/{task.name}.bddl"
     controller = package_folder("robosuite") / "controllers" / "config" / "osc_pose.json"
     env_kwargs = {
@@ -172,7 +172,7 @@ def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
     problem_info = {
         "problem_name": problem.lower(),
         "domain_name": "robosuite",
-        "language_instruction": _in_bddl(bddl, ":language").lower(),
+        "language_instruction": language.strip().lower(),
     }
     with replaced(path) as temporary, h5py.File(temporary, "w") as file:
         data, total, count = file.create_group("data"), 0, 0
@@ -205,15 +205,6 @@ def _write_demo(group: h5py.Group, recording: Recording) -> None:
         **{f"obs/{name}": values for name, values in recording.obs.items()},
     }
     for name, values in content.items():
-        if len(values) != steps:
-            raise ValueError(f"{name} has {len(values)} rows for {steps} actions")
         group.create_dataset(name, data=values)
     group.attrs.update(num_samples=steps, model_file=recording.model_file, init_state=recording.states[0])
     group.attrs.update(recording.attrs)
-
-
-def _in_bddl(bddl: str, keyword: str) -> str:
-    match = re.search(rf"\({keyword}\s+([^()]+)\)", bddl)
-    if match is None:
-        raise PipelineError(f"the BDDL file has no ({keyword} ...)", remedy="reinstall LIBERO")
-    return match[1].strip()

@@ -6,14 +6,15 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from importlib.util import find_spec, module_from_spec, spec_from_file_location
-from pathlib import Path
+from runpy import run_path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from pipeline import gl
 from pipeline.errors import PipelineError
+from pipeline.libero.assets import package_folder
 from pipeline.types import Task
 
 PLACEMENT_TRIES = 50
@@ -39,17 +40,10 @@ def _set_macros() -> None:
 
     The flags lie in a module of the package, and importing that module would import the package first.
     """
-    package = find_spec("robosuite")
-    if package is None or package.origin is None:
-        raise PipelineError("robosuite is not installed", remedy="bash setup.sh")
-    spec = spec_from_file_location("robosuite.macros", Path(package.origin).with_name("macros.py"))
-    if spec is None or spec.loader is None:
-        raise PipelineError("robosuite has no macros.py", where=package.origin, remedy="rm -rf .venv && bash setup.sh")
-    macros = module_from_spec(spec)
-    spec.loader.exec_module(macros)
-    macros.MUJOCO_GPU_RENDERING = False  # type: ignore[attr-defined]
-    macros.FILE_LOGGING_LEVEL = None  # type: ignore[attr-defined]
-    sys.modules[spec.name] = macros
+    macros, flags = ModuleType("robosuite.macros"), run_path(str(package_folder("robosuite") / "macros.py"))
+    flags |= {"__name__": macros.__name__, "MUJOCO_GPU_RENDERING": False, "FILE_LOGGING_LEVEL": None}
+    vars(macros).update(flags)
+    sys.modules[macros.__name__] = macros
 
 
 def until_placed(reset: Callable[[], Any], task: Task) -> Any:

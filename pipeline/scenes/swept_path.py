@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.errors import PipelineError
 from pipeline.types import Floats
 
 SURFACES = ("table", "study_table", "living_room_table", "floor")
@@ -23,21 +22,13 @@ class SweptPath:
         model: the scene with the objects; their joints are its last.
         added: (ngeom,) which geoms are the objects'.
         path: (K+1, nq) positions of all other joints along the demonstration.
-
-    Raises:
-        PipelineError: when the arena has no surface that is known.
     """
 
     def __init__(self, model: mujoco.MjModel, added: NDArray[np.bool_], path: Floats):
         self._model, self._added, self._path = copy.copy(model), added, path
         model = self._model
-        surfaces = [
-            number for name in SURFACES if (number := mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)) >= 0
-        ]
-        if not surfaces:
-            raise PipelineError(
-                "the scene has no working surface to put objects on", expected=f"a body named {' or '.join(SURFACES)}"
-            )
+        numbers = (mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in SURFACES)
+        surfaces = [number for number in numbers if number >= 0]
         roots = model.body_rootid[model.geom_bodyid]
         touches = (model.geom_contype | model.geom_conaffinity) != 0
         stands_on = touches & np.isin(roots, [*surfaces, 0])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.rendering.drawing import texels
-from pipeline.rendering.opengl import calls, check, failure
+from pipeline.rendering.opengl import calls, check
 
 SKINS = 64
 """As many with places in a texture, and as many without; LIBERO's scenes have up to 50 large meshes."""
@@ -48,14 +48,8 @@ def fixed(model: mujoco.MjModel) -> list[bytes]:
 
 
 def samples(count: int) -> NDArray[np.float32]:
-    """(count, 2) where in a pixel of the current context its samples are, 0 to 1 to the right and up.
-
-    Raises:
-        PipelineError: when OpenGL cannot render each of them by itself.
-    """
+    """(count, 2) where in a pixel of the current context its samples are, 0 to 1 to the right and up."""
     opengl = calls()
-    if opengl.glGetIntegerv(opengl.GL_MAJOR_VERSION) < 4:
-        raise failure("OpenGL has no shaders that run once for each sample, as underlays need")
     places = [opengl.glGetMultisamplefv(opengl.GL_SAMPLE_POSITION, sample) for sample in range(count)]
     return np.array(places, np.float32)
 
