@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -89,7 +89,7 @@ VERSIONS = {
 @cache
 def versions() -> dict[str, str]:
     """Package name to version, for the packages of ``VERSIONS``."""
-    return _versions(VERSIONS)
+    return {name: version(name) for name in VERSIONS}
 
 
 def made_with(step: Step) -> dict[str, str]:
@@ -154,9 +154,5 @@ def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
 @cache
 def _parts(step: Step) -> tuple[dict[str, int], dict[str, str], str]:
     steps = (*AFTER.get(step, ()), step)
-    packages = [name for each in steps for name in PACKAGES.get(each, ())]
-    return {each: RECIPES[each] for each in steps}, _versions(packages), fixed_machine_code()
-
-
-def _versions(packages: Iterable[str]) -> dict[str, str]:
-    return {name: version(name) for name in packages}
+    packages = {name: version(name) for each in steps for name in PACKAGES.get(each, ())}
+    return {each: RECIPES[each] for each in steps}, packages, fixed_machine_code()

@@ -159,3 +159,10 @@ def _partners(compiled: CompiledScene) -> dict[int, set[int]]:
         partners.setdefault(one, set()).add(other)
         partners.setdefault(other, set()).add(one)
     return partners
+
+
+def runs(mask: Mask, gap: int) -> list[tuple[int, int]]:
+    """First and last index of each stretch of True; within one, neighbours are up to ``gap`` apart."""
+    indices = np.flatnonzero(mask)
+    parts = np.split(indices, np.flatnonzero(np.diff(indices) > gap) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts if len(part)]

@@ -13,11 +13,11 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl, Fact
 from pipeline.libero.task_goal import called, where
+from pipeline.physics.reference import Mask, runs
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.types import Floats, State, Subtask, Task, Trajectory
 
@@ -42,8 +42,6 @@ VERBS = {
     "turnoff": ("turn off", "turn on"),
 }
 """State to what brings something into it, and out of it."""
-
-Mask = NDArray[np.bool_]
 
 
 class _Deed(NamedTuple):
@@ -159,6 +157,4 @@ def _far(one: Floats, other: Floats) -> Floats:
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:
     """First step, and the one after the last, of each stretch of a mask, with gaps of ``GAP`` at most in it."""
-    steps = np.flatnonzero(mask)
-    parts = np.split(steps, np.flatnonzero(np.diff(steps) > GAP + 1) + 1)
-    return [(int(part[0]), int(part[-1]) + 1) for part in parts if len(part)]
+    return [(first, last + 1) for first, last in runs(mask, GAP + 1)]

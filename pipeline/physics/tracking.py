@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from pipeline.errors import RefusedError
-from pipeline.physics.reference import Mask, Reference
+from pipeline.physics.reference import Reference, runs
 from pipeline.types import Floats
 
 OUTPUT_MAX = np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5])
@@ -171,20 +171,20 @@ def _followed(reference: Reference, name: str) -> Floats:
     """(K+1,) share of a moved object's displacement that the hand has to take over at each state."""
     weights: Floats = np.zeros(len(reference) + 1)
     if _moves(reference, name):
-        held, carried = reference.held[name], _runs(reference.carried[name])
+        held, carried = reference.held[name], runs(reference.carried[name], FLICKER)
         carried = [(first, last) for first, last in carried if last - first >= MARGIN]
         first = int(np.flatnonzero(held)[0])
         # Carried off, or pushed all the way: the displacement is given back until it is put down.
         taken, put_down = carried[0] if carried else (first, int(np.flatnonzero(held)[-1]))
         return np.maximum(weights, _window(reference, first, max(taken, first), put_down - MARGIN))
-    for first, last in _runs(reference.met[name]):
+    for first, last in runs(reference.met[name], FLICKER):
         # Something may have been in the hand for long, pushed along the table, before it meets a place.
         since = min(
             (
                 run[0]
                 for other in reference.held
                 if name in reference.places and _moves(reference, other)
-                for run in _runs(reference.held[other])
+                for run in runs(reference.held[other], FLICKER)
                 if run[0] <= first <= run[1]
             ),
             default=first,
@@ -236,16 +236,6 @@ def _smooth(x: Floats) -> Floats:
     """From 0 to 1 over the unit interval with the least jerk, at rest at both ends (Flash and Hogan 1985)."""
     share: Floats = np.clip(x, 0.0, 1.0)
     return np.asarray(share**3 * (10 - 15 * share + 6 * share**2))
-
-
-def _runs(mask: Mask) -> list[tuple[int, int]]:
-    """First and last index of each stretch of True, across gaps of up to ``FLICKER``."""
-    indices = np.flatnonzero(mask)
-    if not len(indices):
-        return []
-    breaks = np.flatnonzero(np.diff(indices) > FLICKER)
-    firsts, lasts = indices[np.r_[0, breaks + 1]], indices[np.r_[breaks, len(indices) - 1]]
-    return list(zip(firsts.tolist(), lasts.tolist(), strict=True))
 
 
 def _rotation(pose: Floats) -> Rotation:

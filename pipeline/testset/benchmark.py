@@ -152,8 +152,6 @@ def read(wheel: Path) -> TestSet:
         reader = Reader(archive)
         return TestSet(
             tuple(
-                TestTask(suite=suite, name=name, **reader.change(suite, name)._asdict())
-                for suite in TESTED_SUITES
-                for name in reader.names[suite]
+                TestTask(suite, *reader.change(suite, name)) for suite in TESTED_SUITES for name in reader.names[suite]
             )
         )

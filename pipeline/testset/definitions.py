@@ -41,15 +41,6 @@ _NOISE = {
 """Component to the benchmark's function and this project's names of its parameters, in the benchmark's order."""
 
 
-class TestChange(NamedTuple):
-    """What a test task changes; the fields are those of ``pipeline.testset.benchmark.TestTask``."""
-
-    base: str
-    axis: str
-    component: str
-    parameters: dict[str, Value]
-
-
 class SceneFiles(NamedTuple):
     """What a test task's scene is made from, by paths below the benchmark's assets.
 
@@ -96,8 +87,8 @@ class Reader:
                 settings = re.findall(r'"(scene_xml|floor_style|wall_style)": "([^"]+)"', body)
                 yield name.lower(), dict(settings)
 
-    def change(self, suite: str, name: str) -> TestChange:
-        """What a test task changes, by its name and, where that is not enough, its BDDL file.
+    def change(self, suite: str, name: str) -> tuple[str, str, str, str, dict[str, Value]]:
+        """The fields of a ``TestTask`` after ``suite``, by its name and, where that is not enough, its BDDL file.
 
         Raises:
             PipelineError: when the name is not in the benchmark's grammar.
@@ -111,25 +102,25 @@ class Reader:
             kind, severity = divmod(int(number) - 1, 10)
             component = list(_NOISE)[kind]
             parameters = {"severity": severity + 1, **self._severities[component][severity]}
-            return TestChange(base.name, "noise", component, parameters)
+            return base.name, name, "noise", component, parameters
         if number := match["language"]:
             _, text = self._heading(suite, f"{base.name}_language_{number}")
-            return TestChange(base.name, "language", "rewrite", {"text": text})
+            return base.name, name, "language", "rewrite", {"text": text}
         if (number := match["robot"]) and int(number):
-            return TestChange(base.name, "robot", "initial_joints", {"id": int(number)})
+            return base.name, name, "robot", "initial_joints", {"id": int(number)}
         if view := match["view"]:
-            return TestChange(base.name, "camera", *_camera(*map(int, view.split("_"))))
+            return base.name, name, "camera", *_camera(*map(int, view.split("_")))
         if match["layout"]:
-            return TestChange(base.name, "layout", "objects", _added(self._scene(suite, name)))
+            return base.name, name, "layout", "objects", _added(self._scene(suite, name))
         if match["level"]:
             moved = _displacement(self._scene(suite, name), bddl.read(base.bddl_file))
             drawn = {"level": int(match["level"]), "sample": int(match["sample"])}
-            return TestChange(base.name, "pose", "pose", {**drawn, **moved})
+            return base.name, name, "pose", "pose", {**drawn, **moved}
         problem, _ = self._heading(suite, name)
         if light := _LIGHT.fullmatch(problem):
-            return TestChange(base.name, "light", "unknown", {"prefix": light[1], "number": int(light[2])})
+            return base.name, name, "light", "unknown", {"prefix": light[1], "number": int(light[2])}
         component = "theme" if match["theme"] else "surface"
-        return TestChange(base.name, "background", component, self._textures(problem, component == "theme"))
+        return base.name, name, "background", component, self._textures(problem, component == "theme")
 
     def scene_files(self, suite: str, name: str) -> SceneFiles:
         """What a task's arena is made from; a class that does not say leaves it to the class of its arena."""
