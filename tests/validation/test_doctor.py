@@ -15,7 +15,7 @@ from conftest import BOWL, MILK, REPOSITORY, STOVE, link_testset, tiny_config
 
 from pipeline import __main__ as command_line
 from pipeline import gl
-from pipeline.catalogue import wheels
+from pipeline.catalogue import downloads
 from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig, load
 from pipeline.errors import PipelineError
 from pipeline.identity import made_with
@@ -217,7 +217,7 @@ def test_what_is_to_be_fetched_needs_something_to_fetch_it_with(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(wheels, "pip", lambda: ["pip"])
+    monkeypatch.setattr(downloads, "pip", lambda: ["pip"])
     found = {finding.name: finding for finding in doctor.check(tmp_path, need_gb=0.001)}
     # Every plan asks for the test set; further sources are for configurations that name them.
     assert {name for name, finding in found.items() if finding.status == "fail"} == {"test set"}
