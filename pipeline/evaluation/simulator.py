@@ -98,10 +98,10 @@ class Simulator(Environment):
 
     def __init__(self, task: Task, files: SceneFiles | None = None):
         if files is None:
-            super().__init__(task, images=True)
+            super().__init__(task)
         else:
             styles = _styles({"floor": files.floor, "wall": files.wall})
-            super().__init__(task, styles, files.scene_xml, images=True)
+            super().__init__(task, styles, files.scene_xml)
         self._rewind: _Rewind | None = None
 
     @property

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import lru_cache, partial
 from typing import Any
 
@@ -18,7 +17,7 @@ from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
-from pipeline.scenes.compiled import fixed_pose, physics_of, put_images, take_images
+from pipeline.scenes.compiled import fixed_pose, physics_of
 from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Push, Scene, Task
 
@@ -47,18 +46,10 @@ class Environment:
     Args:
         scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
         scene_xml: absolute path of another file for the arena.
-        images: whether the models that LIBERO's resets compile have their images, which take more time than all else.
     """
 
-    def __init__(
-        self,
-        task: Task,
-        scene_properties: Mapping[str, str] | None = None,
-        scene_xml: str | None = None,
-        images: bool = False,
-    ):
+    def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
         self.task = task
-        self._images: dict[str, dict[str, str]] | None = None if images else {}
         build = partial(
             control_env(),
             bddl_file_name=str(task.bddl_file),
@@ -69,7 +60,7 @@ class Environment:
             scene_properties=scene_properties,
             scene_xml=scene_xml,
         )
-        with seeded(0), self._compiling():
+        with seeded(0):
             self._env = until_placed(build, task)
         self._control_step = ControlStep(self._env.env)
         self._openings = len(self._env.env.object_property_initializers)
@@ -108,37 +99,17 @@ class Environment:
         usual = env.robot_configs[0]  # each reset makes the robot anew from this
         env.robot_configs[0] = {**usual, **robot}
         try:
-            with seeded(seed), self._compiling():
+            with seeded(seed):
                 until_placed(env.reset, self.task)
         finally:
             env.robot_configs[0] = usual
         self._control_step = ControlStep(env)
 
     def _as_mjcf(self) -> str:
-        """The scene that LIBERO's last reset compiled, with its images and the masses of an evaluation."""
+        """The scene that LIBERO's last reset compiled, with the masses of an evaluation."""
         scene = ET.fromstring(self._env.sim.model.get_xml())
-        put_images(scene, self._images or {})
         as_evaluated(scene)
         return ET.tostring(scene, encoding="unicode")
-
-    @contextmanager
-    def _compiling(self) -> Iterator[None]:
-        """Have robosuite leave out the images of the scenes that it compiles, unless they were asked for."""
-        from robosuite.utils.binding_utils import MjSim
-
-        compiled = vars(MjSim)["from_xml_string"]
-
-        def without_images(model_xml: str) -> MjSim:
-            scene = ET.fromstring(model_xml)
-            self._images = take_images(scene)
-            return MjSim(mujoco.MjModel.from_xml_string(ET.tostring(scene, encoding="unicode")))
-
-        if self._images is not None:
-            MjSim.from_xml_string = without_images
-        try:
-            yield
-        finally:
-            MjSim.from_xml_string = compiled
 
     def restore(self, scene: Scene) -> None:
         """Put the environment where a scene starts; nothing from before has an effect on what follows.

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import posixpath
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
 from functools import lru_cache
 
 import mujoco
@@ -16,9 +14,6 @@ from pipeline.rotations import axis_angle
 from pipeline.types import Floats, Scene, State
 
 Joints = NDArray[np.intp]
-
-WRITTEN = ("type", "name", "file")
-"""Attributes that MuJoCo writes of an image, in its order; LIBERO's have no others."""
 
 
 def physics_of(model_xml: str) -> mujoco.MjModel:
@@ -51,32 +46,10 @@ def compiled(model_xml: str) -> mujoco.MjModel:
 def physics_to_read(model_xml: str) -> mujoco.MjModel:
     """The same model for all who ask, not to be written into: a copy takes 100 MB."""
     scene = ET.fromstring(model_xml)
-    take_images(scene)
-    return compiled(ET.tostring(scene, encoding="unicode"))
-
-
-def take_images(scene: ET.Element) -> dict[str, dict[str, str]]:
-    """Put a plain colour in place of each image of a scene.
-
-    Returns:
-        Attributes of the ``<texture>`` elements that had one, by their names.
-    """
-    taken = {}
     for texture in scene.iterfind("asset/texture[@name][@file]"):
-        taken[texture.attrib["name"]] = dict(texture.attrib)
         del texture.attrib["file"]
         texture.attrib.update(builtin="flat", width="1", height="1")
-    return taken
-
-
-def put_images(scene: ET.Element, taken: Mapping[str, Mapping[str, str]]) -> None:
-    """Undo ``take_images``, in a scene that MuJoCo compiled without its images and wrote as MJCF since."""
-    for texture in scene.iterfind("asset/texture[@name]"):
-        if (attributes := taken.get(texture.attrib["name"])) is not None:
-            texture.attrib.clear()
-            texture.attrib.update((name, attributes[name]) for name in WRITTEN if name in attributes)
-            # MuJoCo writes paths without "..".
-            texture.set("file", posixpath.normpath(attributes["file"]))
+    return compiled(ET.tostring(scene, encoding="unicode"))
 
 
 class CompiledScene:

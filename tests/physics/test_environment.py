@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 import pytest
-from arenas import TASKS
 from conftest import STOVE
 
 from pipeline.libero.tasks import find_task
@@ -73,18 +72,6 @@ def test_another_scene_between_leaves_no_trace(stove: Environment, whole: dict[T
         reached.append(stove.state)
     assert np.array_equal(reached[0], reached[2])
     assert not np.array_equal(reached[0], reached[1]), "the stove stands elsewhere"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arena", TASKS)
-def test_a_scene_has_the_images_that_its_environment_leaves_out(arena: str) -> None:
-    written = []
-    for images in (True, False):
-        environment = Environment(TASKS[arena], images=images)
-        written.append(environment.place_fixtures(3))
-        assert bool((environment.sim.model.tex_width > 600).any()) is images
-        environment.close()
-    assert written[0] == written[1]
 
 
 @pytest.mark.slow
