@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from functools import lru_cache, partial
@@ -17,7 +18,7 @@ from pipeline.errors import PipelineError, RefusedError
 from pipeline.libero.assets import as_evaluated
 from pipeline.physics.control_env import control_env, seeded, until_placed
 from pipeline.physics.stepping import ControlStep
-from pipeline.scenes.compiled import fixed_pose, physics_of
+from pipeline.scenes.compiled import fixed_pose, physics_to_read
 from pipeline.scenes.swept_path import SURFACES
 from pipeline.types import Floats, Push, Scene, Task
 
@@ -167,7 +168,7 @@ class Environment:
         """As robosuite's ``reset_from_xml_string``, but a scene that was compiled lately is not compiled again."""
         from robosuite.utils.binding_utils import MjSim
 
-        env, model = self._env.env, physics_of(model_xml)
+        env, model = self._env.env, copy.copy(physics_to_read(model_xml))
         env.close()
         env.sim = MjSim(model)
         env.sim.forward()
