@@ -14,7 +14,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from rich import box
@@ -27,23 +26,20 @@ from pipeline.axes.base import Nearest
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
 from pipeline.libero.tasks import find_task
+from pipeline.planning.plan import Row
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 
 
-class Compared(Protocol):
-    """An episode that is compared with the test tasks, such as a row of the plan; its fields are named as there."""
+@dataclass(frozen=True)
+class Compared:
+    """What of an episode is compared with the test tasks, named as in a row of the plan."""
 
-    @property
-    def episode_id(self) -> str: ...
-    @property
-    def suite(self) -> str: ...
-    @property
-    def task(self) -> str: ...
-    @property
-    def perturbations(self) -> str: ...
-    @property
-    def wanted(self) -> bool: ...
+    episode_id: str
+    suite: str
+    task: str
+    perturbations: str
+    wanted: bool = True
 
 
 @dataclass(frozen=True)
@@ -93,7 +89,7 @@ class AxisDistance:
     coverage: dict[str, Coverage]
 
 
-def check(rows: Sequence[Compared], test: TestSet) -> dict[str, AxisDistance]:
+def check(rows: Sequence[Row | Compared], test: TestSet) -> dict[str, AxisDistance]:
     """Axis to finding, in the order of the plan."""
     found: dict[str, list[tuple[Nearest, str, Perturbation]]] = defaultdict(list)
     wanted: dict[str, list[tuple[Perturbation, Task]]] = defaultdict(list)

@@ -27,7 +27,7 @@ from pipeline.formats.lerobot_columns import EPISODE_ID, camera_column
 from pipeline.formats.tfrecord import METADATA, columns, records
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task, tasks
-from pipeline.planning.leakage import AxisDistance
+from pipeline.planning.leakage import AxisDistance, Compared
 from pipeline.planning.leakage import check as compare
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TESTED_SUITES, TestSet
@@ -52,17 +52,6 @@ class Found:
     suite: str | None = None
     task: str | None = None
     perturbations: str | None = None
-
-
-@dataclass(frozen=True)
-class Labelled:
-    """An episode as ``leakage.check`` compares it: a row of the plan, as far as that asks for it."""
-
-    episode_id: str
-    suite: str
-    task: str
-    perturbations: str
-    wanted: bool = True
 
 
 @dataclass(frozen=True)
@@ -105,7 +94,7 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
     """
     known = {} if manifest is None else _manifest(manifest)
     episodes = [_labelled(one, known) for one in read(dataset)]
-    rows: list[Labelled] = []
+    rows: list[Compared] = []
     strangers = 0
     for one in episodes:
         task = find_task(one.suite, one.task) if one.suite and one.task else _task_of(one.instruction)
@@ -223,7 +212,7 @@ def _labelled(one: Found, known: Mapping[str, Mapping[str, Any]]) -> Found:
     return replace(one, suite=row["suite"], task=row["task"], perturbations=row["perturbations"])
 
 
-def _row(one: Found, task: Task | None, test: TestSet) -> Labelled:
+def _row(one: Found, task: Task | None, test: TestSet) -> Compared:
     """What an episode shows in the axes' own parameters; what only labels tell is taken from these."""
     labels = () if one.perturbations is None else from_json(one.perturbations)
     seen: list[Perturbation] = [p for p in labels if p.axis != "language"]
@@ -237,7 +226,7 @@ def _row(one: Found, task: Task | None, test: TestSet) -> Labelled:
     own = task is not None and normalise(one.instruction) == normalise(task.instruction)
     rewrites = [] if own else [_rewrite(one.instruction)]
     task = task or _nearest_task(rewrites[0], test)
-    return Labelled(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
+    return Compared(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
 
 
 def _rewrite(text: str) -> LanguagePerturbation:
