@@ -42,7 +42,8 @@ class DemosConfig(Frozen):
         if not isinstance(raw, Mapping):
             return raw
         fitting = "starter" if raw.get("root") is None else "hdf5"
-        if "hdf5" in {fitting, source := raw.get("source", fitting)} and source != fitting:
+        source = raw.get("source", fitting)
+        if source != fitting and "hdf5" in (source, fitting):
             raise ValueError("root goes with source: hdf5, and only with it")
         return {**raw, "source": source}
 
@@ -101,8 +102,7 @@ class PlanConfig(Frozen):
 
     def drawn_from(self, name: str) -> tuple[Axis, ...]:
         """What the episodes called ``name`` draw from, one axis after the other; ValueError as of ``Axis.beside``."""
-        names, axes = axes_of(name), self.axes.drawn()
-        return tuple(axes[one].beside(names) for one in names)
+        return tuple(self.axes.drawn()[axis].beside(axes_of(name)) for axis in axes_of(name))
 
 
 class ReplayConfig(Frozen):
@@ -144,8 +144,7 @@ class FilterConfig(Frozen):
     def fault(self, quality: Mapping[str, Any]) -> str | None:
         """The first column whose figure is refused."""
         for name, limit in self.model_dump(exclude_none=True).items():
-            figure = quality[name]
-            if figure < limit if name == "joint_margin_rad" else figure > limit:
+            if quality[name] < limit if name == "joint_margin_rad" else quality[name] > limit:
                 return name
         return None
 

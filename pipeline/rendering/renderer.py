@@ -22,9 +22,6 @@ class Renderer:
     Args:
         scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
         drawing: renders the model already; by default one is made.
-
-    Raises:
-        PipelineError: when nothing renders on this machine.
     """
 
     def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None):

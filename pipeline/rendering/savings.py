@@ -27,11 +27,7 @@ DEVICE = "llvmpipe"
 
 
 def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
-    """A drawing of a model, with savings where they can be used.
-
-    Raises:
-        PipelineError: when nothing renders on this machine.
-    """
+    """A drawing of a model, with savings where they can be used."""
     if why_plain() is None:
         from pipeline.rendering.software.drawing import SoftwareDrawing
 
