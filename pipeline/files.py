@@ -97,11 +97,7 @@ def replaced(path: Path) -> Iterator[Path]:
         yield temporary
         put_in_place(temporary, path)
     finally:
-        # After a failure other workers may still be writing into a folder: see remove_leftovers.
-        if temporary.is_dir():
-            shutil.rmtree(temporary, ignore_errors=True)
-        else:
-            temporary.unlink(missing_ok=True)
+        _discard(temporary)
 
 
 def put_in_place(whole: Path, path: Path) -> None:
@@ -166,11 +162,15 @@ def remove_leftovers(folder: Path) -> None:
     process still lives on another host.
     """
     for temporary in folder.glob(".*.tmp"):
-        if temporary.is_dir():
-            # A worker of the killed process may still be writing into it: the rest goes next time.
-            shutil.rmtree(temporary, ignore_errors=True)
-        else:
-            temporary.unlink(missing_ok=True)
+        _discard(temporary)
+
+
+def _discard(temporary: Path) -> None:
+    """Delete what other workers may still be writing into: the rest goes next time (``remove_leftovers``)."""
+    if temporary.is_dir():
+        shutil.rmtree(temporary, ignore_errors=True)
+    else:
+        temporary.unlink(missing_ok=True)
 
 
 def remove_if_empty(folder: Path) -> None:

@@ -103,15 +103,6 @@ class Store(ABC):
             # The stage believes its table, and does not read every file again.
             raise PipelineError(f"damaged ({error})", where=path, remedy=f"delete the file and {remedy}") from error
 
-    def check_all(self, name: str) -> None:
-        """Compare all of a file with its checksums.
-
-        Raises:
-            PipelineError: when it is missing, damaged, or not current.
-        """
-        with self.opened(name) as file:
-            file.check_all()
-
     def rows(self) -> dict[str, dict[str, Any]]:
         """Name of a file to its row, for every current one that can be read."""
         return self._rows()[0]

@@ -48,7 +48,8 @@ class _Reader:
 
     def __call__(self, file: str) -> list[str]:
         try:
-            self.store.check_all(file)
+            with self.store.opened(file) as opened:
+                opened.check_all()
         except PipelineError as error:
             return [str(error)]
         return []
