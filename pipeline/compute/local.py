@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -34,7 +34,7 @@ def local_cluster(
     workers = workers or CPU_COUNT
     # So would software GL; where workers are fewer than cores, it uses the others.
     os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
-    with _started(workers) as cluster, Client(cluster) as client:
+    with _ended(_started(workers)) as cluster, Client(cluster) as client:
         client.run(_leave_interrupts_to_the_run)
         if opengl is not None:
             _have_called(opengl(), client)
@@ -66,6 +66,17 @@ def _started(workers: int) -> Any:
         expected="workers that live: the system may have ended them because memory ran out",
         remedy=f"see the system's log, use fewer workers, and {GO_ON}",
     ) from failure
+
+
+@contextmanager
+def _ended(cluster: Any) -> Iterator[Any]:
+    """End the workers. On a busy machine they may take longer than Dask waits: they then end with this process, and
+    what they finished counts."""
+    try:
+        yield cluster
+    finally:
+        with suppress(TimeoutError):
+            cluster.close()
 
 
 def _have_called(prepare: Callable[[int], None], client: Any) -> None:

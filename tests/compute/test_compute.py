@@ -15,6 +15,7 @@ from pathlib import Path
 import psutil
 import pytest
 from conftest import REPOSITORY
+from distributed import Nanny
 
 from pipeline import gl
 from pipeline.compute.pool import TRIES, Expendable, loop, runner
@@ -156,6 +157,20 @@ def test_workers_that_die_while_they_start_are_started_again(deaths: int, tmp_pa
 
 def _workers_here() -> list[psutil.Process]:
     return [each for each in psutil.Process().children() if any("spawn_main" in word for word in each.cmdline())]
+
+
+@pytest.mark.slow
+def test_workers_that_are_slow_to_end_do_not_undo_their_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a busy machine, where Dask no longer waits for the process that it has killed."""
+    kill = Nanny.kill
+
+    async def killed_too_late(self: Nanny, *arguments: object, **options: object) -> None:
+        await kill(self, *arguments, **options)
+        raise TimeoutError
+
+    monkeypatch.setattr(Nanny, "kill", killed_too_late)
+    with runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run:
+        assert run(square, [3], "squares") == [9]
 
 
 @pytest.mark.slow
