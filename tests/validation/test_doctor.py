@@ -26,6 +26,7 @@ from pipeline.testset.benchmark import TestSet
 from pipeline.types import Extra
 from pipeline.validation import doctor
 from pipeline.validation.disk import needed_mb
+from pipeline.validation.duration import REFERENCE
 
 REAL_TRIAL = machine.trial
 
@@ -34,7 +35,7 @@ REAL_TRIAL = machine.trial
 def trial(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """A trial that takes no time; the real one is run on its own."""
     result = {"OpenGL device": "one", "ten steps": "0123", "one frame": "4567"}
-    monkeypatch.setattr(machine, "trial", lambda: result)
+    monkeypatch.setattr(machine, "trial", lambda: machine.Trial(result, REFERENCE))
     return result
 
 

@@ -1,0 +1,108 @@
+"""Time that a run takes: from what it renders, and from how fast this machine simulates and renders.
+
+The constants are CPU times of one core of the machine that ``REFERENCE`` describes. Those of frames are by
+``benchmarks/frame_cost.py``, with savings; the others are from the stages of ``configs/starter.yaml`` and of a run of
+988 episodes (``docs/cost.md``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.axes import AXES, PhysicsPerturbation, RenderPerturbation, axes_of
+from pipeline.config import ComputeConfig, Config
+from pipeline.episode_schema import SCHEMA
+from pipeline.libero import bddl
+from pipeline.libero.bddl import Arena
+from pipeline.run.machine import Speed
+from pipeline.types import Floats, Task
+from pipeline.validation.disk import lengths
+
+REFERENCE = Speed(step_s=0.007, frame_s=0.125)
+
+FRAME_S: dict[Arena, tuple[float, float]] = {
+    "tabletop": (0.040, 0.051),
+    "floor": (0.028, 0.043),
+    "kitchen": (0.051, 0.041),
+    "living_room": (0.030, 0.059),
+    "study": (0.035, 0.044),
+}
+"""A frame of the agent view and of the wrist view, with savings."""
+SHADOWS_S, SHADOWS = 0.16, 0.4
+"""What shadows add to a frame, and the share of the light episodes that have them."""
+ENCODE_S = 0.004
+"""Of a frame: the JPEG, and the noise where there is some. A GPU does not make it quicker."""
+SCENE_S, TRIES = 3.0, 1.4
+"""A trajectory besides its control steps; how often its steps are run, as tracking follows a replay that missed."""
+RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.003, 0.0013
+"""A step of an episode in the exports and in ``validate``."""
+FIXED_S = 120.0
+"""Starting the stages, previews, sheets and report: on the clock, however many workers there are."""
+
+
+def needed_s(config: Config, speed: Speed) -> dict[str, float]:
+    """Stage to the seconds that one core takes for it; under ``rest``, seconds that more cores do not make fewer.
+
+    Every planned episode counts as kept, and so does the clean twin of every demonstration. Savings are taken to gain
+    as much as on the reference machine.
+
+    Args:
+        config: of the run.
+        speed: of the machine.
+    """
+    tasks, plan = lengths(config.demos), config.plan
+    frame_s = _frame_s(tasks, speed)
+    twin_steps = sum(map(sum, tasks.values()))
+    mean_steps = twin_steps / sum(map(len, tasks.values()))
+    trajectories, frames_s = float(sum(map(len, tasks.values()))), twin_steps * float(frame_s.sum())
+    for name, episodes in plan.episodes.items():
+        kinds = [AXES[axis].draws[0] for axis in axes_of(name)]
+        trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
+        for view, view_s in zip(SCHEMA.views, frame_s, strict=True):
+            here = [kind for kind in kinds if view in kind.views]
+            rendered = any(issubclass(kind, PhysicsPerturbation | RenderPerturbation) for kind in here)
+            shadows_s = SHADOWS_S * SHADOWS * ("light" in axes_of(name)) * speed.frame_s / REFERENCE.frame_s
+            frames_s += episodes * mean_steps * (rendered * (view_s + shadows_s) + ENCODE_S * bool(here))
+    steps = twin_steps + sum(plan.episodes.values()) * mean_steps
+    processor = speed.step_s / REFERENCE.step_s
+    formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
+    return {
+        "replay": trajectories * (SCENE_S * processor + TRIES * mean_steps * speed.step_s),
+        "render": frames_s,
+        "export": processor * steps * sum(formats[name] for name in config.export.formats),
+        "validate": processor * steps * VALIDATE_S * len(config.export.formats),
+        "rest": processor * FIXED_S,
+    }
+
+
+def in_words(stages_s: Mapping[str, float], workers: int) -> str:
+    """Some stages' time on the clock, with so many cores."""
+    times_s = {stage: s if stage == "rest" else s / workers for stage, s in stages_s.items()}
+    parts = ", ".join(f"{stage} {_time(s)}" for stage, s in times_s.items())
+    return f"about {_time(sum(times_s.values()))} with {workers} worker{'s' * (workers > 1)}: {parts}"
+
+
+def workers_of(compute: ComputeConfig) -> int:
+    """Processes that work at the same time; as many as this machine has cores, where a cluster elsewhere decides."""
+    from dask.system import CPU_COUNT
+
+    return 1 if compute.cluster == "loop" else compute.workers or CPU_COUNT
+
+
+def _time(seconds: float) -> str:
+    return (
+        f"{seconds / 3600:.1f} h"
+        if seconds >= 5400
+        else f"{seconds / 60:.0f} min"
+        if seconds >= 90
+        else f"{seconds:.0f} s"
+    )
+
+
+def _frame_s(tasks: Mapping[Task, list[int]], speed: Speed) -> Floats:
+    """Mean of the frames of all demonstrations, of each view (2,)."""
+    weights = [sum(steps) for steps in tasks.values()]
+    drawn_s = np.average([FRAME_S[bddl.read(task.bddl_file).arena] for task in tasks], axis=0, weights=weights)
+    return np.asarray(drawn_s * speed.frame_s / REFERENCE.frame_s + ENCODE_S)

@@ -1,0 +1,46 @@
+"""The estimate of a run's time: what it follows, and that the stages' own speed is what `doctor` finds."""
+
+from __future__ import annotations
+
+import pytest
+from conftest import REPOSITORY
+
+from pipeline.config import Config, load
+from pipeline.run.machine import Speed
+from pipeline.validation.duration import REFERENCE, in_words, needed_s
+
+STARTER = load(REPOSITORY / "configs" / "starter.yaml")
+
+
+def planned(**episodes: int) -> Config:
+    plan = {"episodes": {name.replace("_", "+"): number for name, number in episodes.items()}}
+    return Config.model_validate({"name": "estimate", "demos": {"tasks": ["libero_goal/*"]}, "plan": plan})
+
+
+def test_what_costs_frames_and_physics_is_counted() -> None:
+    """Of 10 demonstrations and 100 episodes: twins alone, noise on their frames, one view, two views, own physics."""
+    language, noise, camera, light, robot = (
+        needed_s(planned(**{axis: 100}), REFERENCE) for axis in ("language", "noise", "camera", "light", "robot")
+    )
+    assert language["render"] < noise["render"] < camera["render"] < light["render"]
+    assert language["replay"] == noise["replay"] == light["replay"]
+    assert robot["replay"] == pytest.approx(11 * language["replay"])
+    assert robot["render"] == pytest.approx(11 * language["render"], rel=0.01)
+    assert {one["export"] for one in (noise, camera, light, robot)} == {language["export"]}
+    joint = needed_s(planned(camera_robot=100), REFERENCE)
+    assert joint == robot
+
+
+def test_it_follows_the_machine() -> None:
+    here = needed_s(STARTER, REFERENCE)
+    gpu = needed_s(STARTER, Speed(REFERENCE.step_s, REFERENCE.frame_s / 100))
+    slow = needed_s(STARTER, Speed(REFERENCE.step_s * 2, REFERENCE.frame_s))
+    assert gpu["render"] < 0.15 * here["render"], "what is left of a frame is its JPEG"
+    assert {stage: gpu[stage] == here[stage] for stage in here} == {stage: stage != "render" for stage in here}
+    assert slow["replay"] == 2 * here["replay"]
+
+
+def test_it_is_told_by_worker() -> None:
+    stages_s = {"replay": 600.0, "render": 36000.0, "rest": 60.0}
+    assert in_words(stages_s, 1) == "about 10.2 h with 1 worker: replay 10 min, render 10.0 h, rest 60 s"
+    assert in_words(stages_s, 10) == "about 62 min with 10 workers: replay 60 s, render 60 min, rest 60 s"
