@@ -20,7 +20,8 @@ from pipeline.run.machine import Speed
 from pipeline.types import Floats, Task
 from pipeline.validation.disk import lengths
 
-REFERENCE = Speed(step_s=0.007, frame_s=0.125)
+REFERENCE = Speed(step_s=0.0033, frame_s=0.093)
+"""Of the machine of the figures below, by ``machine.trial``: one step again and again, and a frame without savings."""
 
 FRAME_S: dict[Arena, tuple[float, float]] = {
     "tabletop": (0.040, 0.051),
@@ -34,8 +35,8 @@ SHADOWS_S, SHADOWS = 0.16, 0.4
 """What shadows add to a frame, and the share of the light episodes that have them."""
 ENCODE_S = 0.004
 """Of a frame: the JPEG, and the noise where there is some. A GPU does not make it quicker."""
-SCENE_S, TRIES = 3.0, 1.4
-"""A trajectory besides its control steps; how often its steps are run, as tracking follows a replay that missed."""
+SCENE_S, STEP_S, TRIES = 3.0, 0.007, 1.4
+"""A trajectory besides its control steps; a step; how often steps are run, as tracking follows a replay that missed."""
 RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.003, 0.0013
 """A step of an episode in the exports and in ``validate``."""
 FIXED_S = 120.0
@@ -69,7 +70,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     processor = speed.step_s / REFERENCE.step_s
     formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
     return {
-        "replay": trajectories * (SCENE_S * processor + TRIES * mean_steps * speed.step_s),
+        "replay": processor * trajectories * (SCENE_S + TRIES * mean_steps * STEP_S),
         "render": frames_s,
         "export": processor * steps * sum(formats[name] for name in config.export.formats),
         "validate": processor * steps * VALIDATE_S * len(config.export.formats),
