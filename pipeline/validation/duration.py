@@ -17,7 +17,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.run.machine import Speed
-from pipeline.types import Floats, Task
+from pipeline.types import Task
 from pipeline.validation.disk import lengths
 
 REFERENCE = Speed(step_s=0.0033, frame_s=0.093)
@@ -57,7 +57,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     frame_s = _frame_s(tasks, speed)
     twin_steps = sum(map(sum, tasks.values()))
     mean_steps = twin_steps / sum(map(len, tasks.values()))
-    trajectories, frames_s = float(sum(map(len, tasks.values()))), twin_steps * float(frame_s.sum())
+    trajectories, frames_s = sum(map(len, tasks.values())), twin_steps * sum(view_s + ENCODE_S for view_s in frame_s)
     for name, episodes in plan.episodes.items():
         kinds = [AXES[axis].draws[0] for axis in axes_of(name)]
         trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
@@ -102,8 +102,8 @@ def _time(seconds: float) -> str:
     )
 
 
-def _frame_s(tasks: Mapping[Task, list[int]], speed: Speed) -> Floats:
-    """Mean of the frames of all demonstrations, of each view (2,)."""
+def _frame_s(tasks: Mapping[Task, list[int]], speed: Speed) -> list[float]:
+    """To render a frame of each view: the mean over all demonstrations."""
     weights = [sum(steps) for steps in tasks.values()]
     drawn_s = np.average([FRAME_S[bddl.read(task.bddl_file).arena] for task in tasks], axis=0, weights=weights)
-    return np.asarray(drawn_s * speed.frame_s / REFERENCE.frame_s + ENCODE_S)
+    return [float(s) * speed.frame_s / REFERENCE.frame_s for s in drawn_s]
