@@ -85,8 +85,12 @@ class Episodes:
             validation: share of each task's demonstrations, by number, rounded; drawn by a hash of its name.
 
         Raises:
-            PipelineError: when the demonstrations are too few to hold any out.
+            PipelineError: when there is nothing to write, or the demonstrations are too few to hold any out.
         """
+        if not self.known:
+            raise PipelineError(
+                "no episodes to write", expected="1 or more", remedy="read in the manifest why all were dropped"
+            )
         if not validation:
             return {"train": list(self.ids)}
         by_task: dict[str, set[str]] = {}
@@ -143,16 +147,20 @@ def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
     """Contiguous slices whose sizes differ by at most one, so that their concatenation keeps the caller's order.
 
     There are ``pieces`` of them, or one per episode when there are fewer episodes than that.
-
-    Raises:
-        PipelineError: when there is nothing to write, or ``pieces`` is not positive.
     """
-    if not episode_ids:
-        raise PipelineError(
-            "no episodes to write", expected="1 or more", remedy="read in the manifest why all were dropped"
-        )
-    if pieces < 1:
-        raise PipelineError(f"{pieces} output files were asked for", expected="1 or more")
     count = min(pieces, len(episode_ids))
     bounds = [len(episode_ids) * k // count for k in range(count + 1)]
     return [list(episode_ids[start:stop]) for start, stop in pairwise(bounds)]
+
+
+def by_suite(suites: Mapping[str, str], name: str) -> dict[str, list[str]]:
+    """Set name to its episodes, in the caller's order: a set for each suite, so that clients train on one or on all.
+
+    Args:
+        suites: episode id to LIBERO suite.
+        name: what the sets' names begin with; ``libero_spatial`` comes into ``<name>_spatial``.
+    """
+    sets: dict[str, list[str]] = {}
+    for episode_id, suite in suites.items():
+        sets.setdefault(f"{name}_{suite.removeprefix('libero_')}", []).append(episode_id)
+    return sets
