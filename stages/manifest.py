@@ -2,7 +2,7 @@
 
 from pipeline.config import Config
 from pipeline.files import write_json
-from pipeline.formats import motion_statistics, registry
+from pipeline.formats import exact_statistics, registry
 from pipeline.formats.episodes import by_suite
 from pipeline.run import counts, manifest, outcome
 from pipeline.run.stage import main
@@ -24,7 +24,7 @@ def run(config: Config) -> None:
     suites = {episode: row_of[episode].suite for episode in episodes.kept}
     name = (config.export.rlds or config.export).name
     figures = {
-        name: motion_statistics.openvla([motions[row_of[episode].trajectory_id] for episode in members])
+        name: exact_statistics.openvla([motions[row_of[episode].trajectory_id] for episode in members])
         for name, members in by_suite(suites, name).items()
     }
     write_json(data / "dataset_statistics.json", figures)

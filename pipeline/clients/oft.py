@@ -19,7 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
-from pipeline.formats import motion_statistics
+from pipeline.formats.exact_statistics import open_is_one
 from pipeline.formats.tfrecord import METADATA, columns, records
 
 CHUNK = 8
@@ -104,7 +104,7 @@ def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Samples | No
     """What OFT trains on, or None where it passes the episode by: no instruction, or fewer than 8 steps."""
     if not any(episode.instructions) or len(episode.action) < CHUNK:
         return None
-    action = normalise(motion_statistics.open_is_one(episode.action), statistics["action"])
+    action = normalise(open_is_one(episode.action), statistics["action"])
     end_effector, fingers = episode.state[:, :6], episode.state[:, -2:]
     proprio = normalise(np.concatenate((end_effector, fingers), axis=1), statistics["proprio"])
     chunks = sliding_window_view(action, CHUNK, axis=0).swapaxes(1, 2)

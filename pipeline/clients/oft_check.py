@@ -14,7 +14,7 @@ from pipeline.clients import oft
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
-from pipeline.formats import motion_statistics
+from pipeline.formats import exact_statistics
 
 SAME = 1e-9
 """Largest difference between statistics read back and those stored; both are computed in double precision."""
@@ -36,7 +36,7 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
         (largest, between what was read and ``statistics``) and ``violations``, texts.
     """
     violations: list[str] = []
-    motions: list[motion_statistics.Motion] = []
+    motions: list[exact_statistics.Motion] = []
     samples: list[int] = []
     episodes = clipped = 0
     for episode in oft.read(folder):
@@ -53,7 +53,7 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
         return {"episodes": episodes, "violations": [*violations, "holds nothing to train on: OFT waits for ever"]}
     if _closes_on_open(motions):
         violations.append("fingers part where the gripper is told to close: the command's sign is wrong")
-    measured = motion_statistics.openvla(motions)
+    measured = exact_statistics.openvla(motions)
     difference = _difference(measured, statistics)
     if not difference <= SAME:
         violations.append(f"dataset_statistics.json is off by up to {difference:g}")
@@ -111,7 +111,7 @@ def _is_frame(data: bytes) -> bool:
         return False
 
 
-def _closes_on_open(motions: Sequence[motion_statistics.Motion]) -> bool:
+def _closes_on_open(motions: Sequence[exact_statistics.Motion]) -> bool:
     """Whether the fingers, on the whole, part after the command turns positive and close after it turns negative."""
     moved = 0.0
     for action, state in motions:

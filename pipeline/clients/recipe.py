@@ -17,7 +17,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotV21Config, known_to_oft
 from pipeline.files import checksum, replaced, schema_file
-from pipeline.formats import motion_statistics
+from pipeline.formats import exact_statistics
 from pipeline.formats.rlds_layout import dataset_of
 
 SCHEMA_FILE = schema_file("finetune.json")
@@ -147,7 +147,7 @@ def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
             table = pq.read_table(data / "lerobot_v21" / wanted.name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
             (unfinished / OPENPI_ASSETS).parent.mkdir(parents=True)
-            content = json.dumps(motion_statistics.openpi(actions, states), indent=1) + "\n"
+            content = json.dumps(exact_statistics.openpi(actions, states), indent=1) + "\n"
             (unfinished / OPENPI_ASSETS).write_text(content)
         if wanted is not None and wanted.convention == "ipec":
             roots = sorted(path.name for path in (data / "lerobot_v21").iterdir() if not path.name.endswith("_val"))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, check, named, provenance_of
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
-from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
+from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, of_levels, open_is_one
 from pipeline.formats.lerobot_columns import (
     EPISODE_ID,
     INSTANCES,
@@ -31,7 +31,6 @@ from pipeline.formats.lerobot_columns import (
     matrix_columns,
 )
 from pipeline.formats.lerobot_video import INFO, Video
-from pipeline.formats.motion_statistics import describe, open_is_one
 from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Extra
 
@@ -94,7 +93,7 @@ def finish(
     columns = convention.columns(extras)
     levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
     figures = {
-        convention.name(of.lerobot_key): statistics(np.sum([one[view] for one in levels], axis=0))
+        convention.name(of.lerobot_key): of_levels(np.sum([one[view] for one in levels], axis=0))
         for view, of in SCHEMA.views.items()
     }
     figures |= {
@@ -210,7 +209,7 @@ def figures(found: Numbers, shown: Mapping[str, Counts]) -> dict[str, dict[str, 
         name: describe(values.reshape(len(values), -1), QUANTILES) | {"count": np.array([len(values)])}
         for name, values in found.items()
     }
-    return of_numbers | {SCHEMA.views[view].lerobot_key: statistics(counts) for view, counts in shown.items()}
+    return of_numbers | {SCHEMA.views[view].lerobot_key: of_levels(counts) for view, counts in shown.items()}
 
 
 def _provenance_schema(extras: Sequence[Extra]) -> pa.Schema:

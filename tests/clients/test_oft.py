@@ -21,7 +21,7 @@ from pipeline.compute.pool import loop
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import RldsConfig
-from pipeline.formats import motion_statistics, rlds_write
+from pipeline.formats import exact_statistics, rlds_write
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.rlds import Rlds
 from pipeline.run.export import export
@@ -75,7 +75,7 @@ def write(data: Path, load: Callable[[str], Episode] = episode) -> Path:
     known = {name: Known("libero_tiny") for name in LENGTHS}
     export(Rlds(data, RldsConfig(name="libero", shards=2)), Episodes(known, load), loop)
     episodes = [load(name) for name in LENGTHS]
-    figures = motion_statistics.openvla([(made.action, made.state) for made in episodes])
+    figures = exact_statistics.openvla([(made.action, made.state) for made in episodes])
     (data / "dataset_statistics.json").write_text(json.dumps({NAME: figures}))
     return data
 
