@@ -12,7 +12,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.results import Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
 from pipeline.files import replaced
-from pipeline.report import clips, figures, pages
+from pipeline.report import figures, pages
 from pipeline.report.evaluation_findings import FAILURES, findings
 from pipeline.report.figures import Panel, Share
 from pipeline.report.yields import Cell, Table
@@ -98,7 +98,7 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
         few=FEW,
         sections=[_section(source, found, colours) for source in found["common"]],
         failures=[
-            {**failure, "video": clips.video_of(videos[failure["episode"]]) if failure["video"] else None}
+            {**failure, "video": pages.video_of(videos[failure["episode"]]) if failure["video"] else None}
             for failure in found["failures"]
         ],
         limit=FAILURES,

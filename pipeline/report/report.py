@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from PIL import Image
 
 from pipeline.axes import TextPerturbation, from_json
 from pipeline.config import Config
@@ -19,10 +20,10 @@ from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.libero.tasks import find_task
 from pipeline.planning.streams import streams_of
-from pipeline.report import clips, coverage, figures, pages, seen, yields
-from pipeline.report.clips import Clip
+from pipeline.report import coverage, figures, pages, seen, yields
 from pipeline.report.coverage import AxisPlots, Draw
 from pipeline.report.figures import Panel
+from pipeline.report.pages import Clip
 from pipeline.report.sheets import describe
 from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
@@ -232,7 +233,7 @@ def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
 
 def _video(row: Mapping[str, Any], load: EpisodeLoader, caption: str) -> Video:
     twin, episode = load(row["twin_id"]), load(row["episode_id"])
-    return Video(row["axis"], caption, row["instruction"], clips.beside(twin.frames["image"], episode.frames["image"]))
+    return Video(row["axis"], caption, row["instruction"], pages.beside(twin.frames["image"], episode.frames["image"]))
 
 
 def _looks_different(row: Mapping[str, Any], twin: Mapping[str, Any]) -> bool:
@@ -245,7 +246,7 @@ def _level(row: Mapping[str, Any]) -> int:
 
 
 def _pictures(folder: Path) -> dict[str, str]:
-    return {file.stem: clips.picture_of(file) for file in sorted(folder.glob("*.png"))}
+    return {file.stem: pages.picture(Image.open(file)) for file in sorted(folder.glob("*.png"))}
 
 
 def _versions(rows: Rows) -> dict[str, str]:

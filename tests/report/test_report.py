@@ -27,7 +27,7 @@ from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode
 from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
-from pipeline.report import clips, coverage, figures, pages, report, yields
+from pipeline.report import coverage, figures, pages, report, yields
 from pipeline.report.coverage import Draw
 from pipeline.run import manifest
 from pipeline.seeding import rng
@@ -126,7 +126,7 @@ def test_a_combination_counts_with_each_of_its_axes() -> None:
 
 def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
     light, dark = (_still(np.full((256, 256, 3), grey, np.uint8)) for grey in (200, 60))
-    clip = clips.beside([light] * 20, [dark] * 24 + [light] * 6)
+    clip = pages.beside([light] * 20, [dark] * 24 + [light] * 6)
     frames = _video(clip)
     assert frames.shape == (30, 256, 512, 3)
     assert np.abs(frames[:, :, :250] - 200.0).max() < 8
@@ -136,7 +136,7 @@ def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
 
 def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
     noise = [_still(rng(1, frame).integers(0, 256, (256, 256, 3)).astype(np.uint8)) for frame in range(60)]
-    assert len(_content(clips.beside(noise, noise).video)) <= VIDEO_BYTES
+    assert len(_content(pages.beside(noise, noise).video)) <= VIDEO_BYTES
 
 
 @pytest.mark.parametrize("name", sorted(AXES))
@@ -219,6 +219,6 @@ def _still(frame: NDArray[np.uint8]) -> bytes:
     return encode(frame, RenderConfig())
 
 
-def _video(clip: clips.Clip) -> NDArray[np.float64]:
+def _video(clip: pages.Clip) -> NDArray[np.float64]:
     with av.open(io.BytesIO(_content(clip.video))) as file:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]).astype(float)
