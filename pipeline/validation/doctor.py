@@ -28,7 +28,7 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.planning import plan
 from pipeline.run import machine
-from pipeline.run.remake import outdated
+from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
 from pipeline.validation.disk import RUN_MB, needed_mb
 

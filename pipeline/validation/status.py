@@ -15,7 +15,7 @@ from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.planning import plan
 from pipeline.run import cleaning, export, finished, inputs, outcome
-from pipeline.run.remake import outdated
+from pipeline.run.outcome import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
