@@ -101,10 +101,15 @@ def preview(arguments: argparse.Namespace) -> int:
 
 
 def sources(arguments: argparse.Namespace) -> int:
-    """fetch and convert the textures and objects that a configuration names, as its plan would, and count them"""
-    from pipeline.publish import attribution
+    """fetch and convert the textures and objects that a configuration names, as its plan would, and count them
 
-    print(json.dumps(attribution.counts(loaded(arguments).plan.axes)))
+    An axis that is not configured counts with its default sources.
+    """
+    from pipeline.axes import AXES
+
+    drawn = loaded(arguments).plan.axes.drawn()
+    offered = [(drawn.get(name) or axis()).offered() for name, axis in AXES.items()]
+    print(json.dumps({kind: number for of_axis in offered for kind, number in of_axis.items()}))
     return 0
 
 
