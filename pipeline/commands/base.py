@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from pipeline.config import Config
 
 PARAMS = Path("params.yaml")
@@ -72,6 +74,29 @@ def positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"{number} is less than 1")
     return number
+
+
+def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **options: str) -> None:
+    """Add an option for each of some fields of a model: with its type and its choices, and its docstring as help.
+
+    What is left out has no attribute, so that the model's default holds.
+
+    Args:
+        options: field to option.
+    """
+    for name, option in options.items():
+        field = model.model_fields[name]
+        kind, default = field.annotation, field.default
+        how: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
+        if get_origin(kind) is tuple:
+            how["nargs"] = "+"
+        if get_origin(kind) is Literal:
+            how["choices"] = get_args(kind)
+        else:
+            kind = next(iter(get_args(kind)), kind)
+            how |= {"type": positive if field.metadata else kind, "metavar": option.strip("-").upper()}
+        told = f" (default: {default})" if default not in (None, "", ()) else ""
+        command.add_argument(option, help=f"{field.description}{told}".replace("\n", " ").replace("``", ""), **how)
 
 
 def add_config(command: argparse.ArgumentParser) -> None:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.commands.base import add, add_config, add_group, owned, plan_of, positive
+from pipeline.commands.base import add, add_config, add_fields, add_group, owned, plan_of, positive
 from pipeline.files import write_json
 
 TITLE = "evaluate policies"
@@ -27,9 +27,12 @@ def add_commands(commands: Any) -> None:
 
 
 def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
-    command.argument_default = argparse.SUPPRESS  # of what is left out, the defaults are those of the models' fields
-    add = command.add_argument
-    add("out", type=Path, metavar="DIR", help="folder of the results")
+    from pipeline.evaluation.environment import EpisodeSettings
+    from pipeline.evaluation.rollout import PolicyConfig
+    from pipeline.evaluation.selection import Selection
+
+    command.argument_default = argparse.SUPPRESS
+    command.add_argument("out", type=Path, metavar="DIR", help="folder of the results")
     acting = command.add_mutually_exclusive_group(required=True)
     acting.add_argument("--server", metavar="URL", help="address of a model server, such as ws://localhost:8000")
     acting.add_argument("--checkpoint", type=Path, metavar="DIR", help="a policy that lerobot saved")
@@ -41,100 +44,24 @@ def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
         help="the demonstrations, as a check: their own actions (open_loop, as without a value), or their paths, "
         "followed by feedback (tracked)",
     )
-    _add_selection(command)
-    _add_settings(command)
-    add(
-        "--label",
-        metavar="NAME",
-        help="name of the policy in the results; a server must have one, another for each policy (default of a "
-        "checkpoint: its folder and a part of the hash of its content)",
-    )
-    add(
-        "--assets",
-        dest="archive",
-        type=Path,
-        metavar="DIR",
-        help="LIBERO-Plus's unpacked asset archive, which its light, layout and most of its background tasks need",
-    )
-    add(
-        "--timeout",
-        dest="timeout_s",
-        type=positive,
-        metavar="S",
-        help="seconds that a server's answer may take (default: 120)",
-    )
-    add("--workers", type=positive, default=0, metavar="N", help="processes (default: one for each core)")
-    add("--videos", choices=("none", "failures", "all"), help="of which episodes to keep a video (default: none)")
-
-
-def _add_selection(command: argparse.ArgumentParser) -> None:
-    """Fields of ``Selection``."""
-    add = command.add_argument
-    add(
-        "--source",
-        choices=("libero", "libero_plus", "own", "pairs", "goals"),
-        help="of the tasks (default: libero)",
-    )
-    add(
-        "--tasks-from",
-        dest="file",
-        type=Path,
-        metavar="FILE",
-        help="in place of a source, a list that `analyse construct` wrote",
-    )
-    add("--suite", dest="suites", nargs="+", metavar="SUITE", help="of these suites only")
-    add("--axis", dest="axes", nargs="+", metavar="AXIS", help="of these axes only")
-    add("--component", dest="components", nargs="+", metavar="NAME", help="of these components only")
-    add("--level", dest="levels", nargs="+", type=int, metavar="N", help="of these levels only")
-    add("--task", dest="tasks", nargs="+", metavar="PATTERN", help="named so, or perturbing one so named")
-    add("--subset", type=positive, metavar="N", help="so many, spread evenly over all of these")
-    add(
-        "--episodes",
-        type=positive,
-        metavar="N",
-        help="initial states, of which LIBERO has 50, or draws of each task (default: 1)",
-    )
-    add("--seed", type=int, help="of the subset and of every draw (default: 0)")
-
-
-def _add_settings(command: argparse.ArgumentParser) -> None:
-    """Fields of ``EpisodeSettings``, but the seed, which is the selection's."""
-    add = command.add_argument
-    add(
+    named = {"suites": "--suite", "axes": "--axis", "components": "--component", "levels": "--level", "tasks": "--task"}
+    add_fields(command, Selection, source="--source", file="--tasks-from", **named, subset="--subset")
+    add_fields(command, Selection, episodes="--episodes", seed="--seed")
+    command.add_argument(
         "--trained-on",
         dest="plan",
         type=plan_of,
         metavar="CONFIG",
         help="draw held-out draws anew that overlap with the plan of this run, whose data the policy was trained on",
     )
-    add(
-        "--prompt",
-        choices=("clean", "benchmark", "blank"),
-        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name; "
-        "or say nothing at all",
+    add_fields(command, EpisodeSettings, prompt="--prompt", step_limits="--step-limits", black="--black")
+    add_fields(command, EpisodeSettings, initial_states="--initial-states", look_every="--look-every")
+    add_fields(command, PolicyConfig, label="--label", timeout_s="--timeout")
+    command.add_argument(
+        "--assets", dest="archive", type=Path, metavar="DIR", help="folder of LIBERO-Plus's unpacked asset archive"
     )
-    add(
-        "--step-limits",
-        choices=("openvla", "lerobot"),
-        help="whose: they differ in libero_spatial, 220 (openvla, default) and 280 (lerobot)",
-    )
-    add(
-        "--black",
-        choices=("none", "agentview", "all"),
-        help="show the policy black frames in place of the agent view, or of all views (default: none)",
-    )
-    add(
-        "--initial-states",
-        choices=("libero", "demonstration"),
-        help="LIBERO's own (default), or the first state of the starter set's demonstration",
-    )
-    add(
-        "--look-every",
-        type=positive,
-        metavar="N",
-        help="a server that keeps its chunk of actions to itself takes N of each: it is shown the scene once in N "
-        "control steps (default: 1)",
-    )
+    command.add_argument("--videos", choices=("none", "failures", "all"), help="which episodes to film (default: none)")
+    command.add_argument("--workers", type=positive, default=0, metavar="N", help="processes (default: one a core)")
 
 
 def evaluate(arguments: argparse.Namespace) -> int:

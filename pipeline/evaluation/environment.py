@@ -36,35 +36,33 @@ LEROBOT_SPATIAL = 280
 """lerobot's limit of ``libero_spatial``; its others are those of OpenVLA (``lerobot/envs/libero.py``, 0.6.1)."""
 
 
-class EpisodeSettings(Frozen):
-    """What holds for all episodes of an evaluation.
-
-    Attributes:
-        prompt: the wording of test tasks; ``blank`` says nothing in any task.
-        black: which views are black, to see what a policy does without them.
-        seed: of held-out draws and of noise that is random.
-        fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
-        initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
-            starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
-            Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
-        plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
-            it by the SHA-256 of its file.
-        look_every: see ``NextLook``; of model servers alone.
-        step_limits: whose.
-        runner: what asks the policy. ``lerobot-eval`` has its own batches and random numbers, so what one policy does
-            there and in ``evaluate`` need not be the same.
-    """
+class EpisodeSettings(Frozen, use_attribute_docstrings=True):
+    """What holds for all episodes of an evaluation."""
 
     prompt: Prompt = "clean"
+    """wording of test tasks: LIBERO's instruction, or as the benchmark's code has it, the file's name; ``blank`` says
+    nothing in any task"""
     seed: int = 0
+    """of held-out draws and of noise that is random"""
     fixture_seed: int = 0
+    """of LIBERO's reset, to which the number of the initial state is added; 0 is what OpenVLA uses"""
     initial_states: Literal["libero", "demonstration"] = "libero"
+    """those that LIBERO evaluates from, or the one that the starter set's demonstration of the task begins in, without
+    settling, as when it is replayed for a dataset; test tasks have a state of their own, and goals begin in LIBERO's"""
     # What came later is left out where it is not used, so that results keep their names.
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
+    """which views are black, to see what a policy does without them"""
     plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
+    """which held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name it by the
+    SHA-256 of its file."""
     look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
+    """a server that keeps its chunk of actions to itself takes so many of each: it is shown the scene once in so many
+    control steps"""
     step_limits: Literal["openvla", "lerobot"] = Field(default="openvla", exclude_if=lambda whose: whose == "openvla")
+    """whose: they differ in libero_spatial, 220 (openvla) and 280 (lerobot)"""
     runner: Literal["pipeline", "lerobot-eval"] = Field(default="pipeline", exclude_if=lambda one: one == "pipeline")
+    """what asks the policy: lerobot-eval has its own batches and random numbers, so what one policy does there and in
+    ``evaluate`` need not be the same"""
 
     def step_limit(self, suite: str) -> int:
         """Of an episode in a suite."""

@@ -12,6 +12,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import Field
+
 from pipeline import identity
 from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
@@ -42,22 +44,19 @@ RECORDED = ("pipeline", "vla-eval", "OpenGL")
 """The versions of a result that do not decide whether it counts."""
 
 
-class PolicyConfig(Frozen):
-    """What acts.
-
-    Attributes:
-        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``open_loop`` for
-            the demonstrations' own actions, ``tracked`` for their paths, followed by feedback.
-        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations.
-        label: name in the results. A server must have one, another for each policy: nothing else tells what is behind
-            its address.
-        timeout_s: how long a server's answer may take.
-    """
+class PolicyConfig(Frozen, use_attribute_docstrings=True):
+    """What acts."""
 
     kind: Literal["server", "checkpoint", "open_loop", "tracked"]
+    """a model server, a folder that lerobot saved, the demonstrations' own actions, or their paths, followed by
+    feedback"""
     address: str = ""
+    """of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations"""
     label: str = ""
-    timeout_s: float = 120.0
+    """name of the policy in the results. A server must have one, another for each policy: nothing else tells what is
+    behind its address."""
+    timeout_s: float = Field(default=120.0, gt=0)
+    """seconds that a server's answer may take"""
 
     def identity(self) -> str:
         """What is the same for the same policy alone: ``sha256:`` and the content of a checkpoint, ``script:`` and the
