@@ -27,7 +27,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 FOLDER = ".finished"
 SEEN = Path(__file__).parents[1] / "testset" / "seen.json"
-"""What the report shows beside what the run shows."""
+"""What a policy sees in test tasks, which the report shows beside what it sees in the run."""
 
 
 @dataclass(frozen=True)
