@@ -109,7 +109,6 @@ class EpisodeEnvironment:
     def __init__(self, settings: EpisodeSettings = EpisodeSettings(), archive: Path | None = None):  # noqa: B008
         self.settings, self._archive = settings, archive
         self.progress = Progress()
-        self._simulator: Simulator | None = None
         self._key: tuple[str, ...] = ()
         self._picture = Picture()
 
@@ -153,12 +152,12 @@ class EpisodeEnvironment:
         steps = self.progress.steps + 1
         self._seen = {}
         try:
-            self._opened.step(given)
+            self._simulator.step(given)
         except RefusedError as error:
             self.progress = Progress(steps, error.reason)
             return self.progress
         limited = "step_limit" if steps >= self.step_limit else "running"
-        self.progress = Progress(steps, "success" if self._opened.succeeded() else limited)
+        self.progress = Progress(steps, "success" if self._simulator.succeeded() else limited)
         return self.progress
 
     @property
@@ -171,12 +170,12 @@ class EpisodeEnvironment:
     @property
     def observed(self) -> Observed:
         """What LIBERO observed of the last control step."""
-        return self._opened.observed
+        return self._simulator.observed
 
     @property
     def controller(self) -> Any:
         """robosuite's controller of the arm."""
-        return self._opened.controller
+        return self._simulator.controller
 
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
@@ -203,15 +202,9 @@ class EpisodeEnvironment:
 
     def close(self) -> None:
         self._picture.close()
-        if self._simulator is not None:
+        if self._key:
             self._simulator.close()
-        self._simulator, self._key = None, ()
-
-    @property
-    def _opened(self) -> Simulator:
-        if self._simulator is None:
-            raise PipelineError("no episode was started", remedy="reset first")
-        return self._simulator
+        self._key = ()
 
     def _start_test_task(self) -> None:
         test = self._test
@@ -238,11 +231,7 @@ class EpisodeEnvironment:
         self._start(*self._initial_state())
 
     def _start_libero(self) -> None:
-        """Start LIBERO's own task, or held-out draws on it.
-
-        Raises:
-            RefusedError: see ``drawn_scene``.
-        """
+        """Start LIBERO's own task, or held-out draws on it."""
         self._build(self._base)
         seed, demo, recorded = self.settings.fixture_seed, StarterSource().of(self._base), True
         if self.settings.initial_states == "libero":
@@ -250,7 +239,7 @@ class EpisodeEnvironment:
             demo, recorded = replace(demo, init_state=state), False
 
         def nominal() -> Scene:
-            scene = recorded_start(demo, self._opened.place_fixtures(seed))
+            scene = recorded_start(demo, self._simulator.place_fixtures(seed))
             # A recording had the gripper open; LIBERO's reset, after which its own states are put in, leaves it without
             # a command.
             return scene if recorded else replace(scene, gripper=0.0)
@@ -264,13 +253,13 @@ class EpisodeEnvironment:
             return
         scene = scene or nominal()
         self.resolved = scene.resolved
-        self._opened.start_scene(scene)
+        self._simulator.start_scene(scene)
         self._picture.show(scene.model_xml, self.perturbations)
 
     def _start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
         """Start from a state in the model of LIBERO's own reset."""
-        self._opened.start(seed, state, posture_rad)
-        self._picture.show(self._opened.model, self.perturbations)
+        self._simulator.start(seed, state, posture_rad)
+        self._picture.show(self._simulator.model, self.perturbations)
 
     def _initial_state(self) -> tuple[int, Floats]:
         """The seed of LIBERO's reset and its initial state for the task's number."""
@@ -306,4 +295,5 @@ class EpisodeEnvironment:
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()
-            self._simulator, self._key = Simulator(task, files), key
+            self._simulator: Simulator = Simulator(task, files)
+            self._key = key
