@@ -93,7 +93,13 @@ def read(folder: Path) -> Iterator[Recorded]:
         for index, record in enumerate(records(shard)):
             stored = columns(record, features)
             try:
-                yield _recorded(stored)
+                yield Recorded(
+                    name=stored[f"{METADATA}episode_id"][0].decode(),
+                    action=stored["action"],
+                    state=stored["observation/state"],
+                    frames={view: stored[f"observation/{view}"].tolist() for view in VIEWS.values()},
+                    instructions=[text.decode() for text in stored["language_instruction"]],
+                )
             except KeyError as error:
                 raise PipelineError(
                     f"record {index} has no feature {error}", where=shard, expected="the feature tree of OpenVLA's sets"
@@ -126,13 +132,3 @@ def normalise(values: NDArray[np.float32], figures: Mapping[str, Any]) -> NDArra
     mask = np.asarray(figures.get("mask", [True] * values.shape[1]))
     scaled = np.clip(2 * (values - low) / (high - low + 1e-8) - 1, -1, 1)
     return np.where(smallest == largest, 0.0, np.where(mask, scaled, values)).astype(np.float32)
-
-
-def _recorded(stored: Mapping[str, NDArray[Any]]) -> Recorded:
-    return Recorded(
-        name=stored[f"{METADATA}episode_id"][0].decode(),
-        action=stored["action"],
-        state=stored["observation/state"],
-        frames={view: stored[f"observation/{view}"].tolist() for view in VIEWS.values()},
-        instructions=[text.decode() for text in stored["language_instruction"]],
-    )

@@ -16,12 +16,11 @@ import yaml
 from huggingface_hub import DatasetCardData
 
 from pipeline.axes import from_json
-from pipeline.axes.base import Credit, Layer, Perturbation
+from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.base import Format
-from pipeline.report.yields import LEVELS
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, named, tally, tried
 

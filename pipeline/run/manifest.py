@@ -158,8 +158,4 @@ def settings(path: Path) -> Settings:
 
 def made_with(row: Mapping[str, Any]) -> dict[str, str]:
     """Package to the version that a row was made with."""
-    return {
-        column.removesuffix("_version").replace("_", "-"): version
-        for column, version in row.items()
-        if column.endswith("_version")
-    }
+    return {name: row[version_column(name)] for name in VERSIONS}
