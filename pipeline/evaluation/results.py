@@ -19,9 +19,6 @@ from pipeline.seeding import digest
 REFUSED = "refused"
 """The reason of an episode that could not begin, as its scene does not take what was drawn."""
 
-OUTCOME = ("success", "reason", "steps")
-"""What two results of one episode must have in common."""
-
 ALIKE = ("prompt", "step_limit")
 """What results on one suite of one source must have in common to be compared."""
 
@@ -253,11 +250,14 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     found = stored(folders)
     refuse_shared_names((row.policy, row.identity, files.folder) for row, files in found)
     refuse_different(found, across)
-    outcomes = [{name: getattr(row, name) for name in OUTCOME} for row, _ in found]
     _agree(
         (
-            (f"{row} by {row.policy}, episode {row.episode}", outcome, files.path(row.episode))
-            for (row, files), outcome in zip(found, outcomes, strict=True)
+            (
+                f"{row} by {row.policy}, episode {row.episode}",
+                {name: getattr(row, name) for name in ("success", "reason", "steps")},
+                files.path(row.episode),
+            )
+            for row, files in found
         ),
         "two results of ",
         expected="one result of each episode, the same wherever it was run",

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, named
 from pipeline.errors import PipelineError
+from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, camera_column
 from pipeline.formats.read_back import Copy, Fault, sampled
@@ -160,35 +161,32 @@ def forget_sessions() -> None:
 
 def _rows(root: Path) -> dict[str, dict[str, Any]]:
     """Episode id to its rows of ``meta/episodes`` and of ``meta/provenance.parquet``."""
-    return _opened(root, (root / "meta" / "info.json").stat().st_mtime_ns)
+    return _opened(edition(root / "meta" / "info.json"))[1]
 
 
 @lru_cache(maxsize=1)
-def _opened(root: Path, modified_ns: int) -> dict[str, dict[str, Any]]:
-    files = sorted((root / "meta" / "episodes").rglob("*.parquet"))
+def _opened(info_file: Edition) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """``meta/info.json`` with the tasks by number, and the rows of ``_rows``."""
+    meta = info_file.path.parent
+    info: dict[str, Any] = json.loads(info_file.path.read_text())
+    info["tasks"] = {row["task_index"]: row["task"] for row in pq.read_table(meta / "tasks.parquet").to_pylist()}
+    files = sorted((meta / "episodes").rglob("*.parquet"))
     names = [name for name in pq.read_schema(files[0]).names if not name.startswith("stats/")]
     episodes = [row for file in files for row in pq.read_table(file, columns=names).to_pylist()]
-    provenance = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
+    provenance = pq.read_table(meta / "provenance.parquet").to_pylist()
     firsts: dict[tuple[int, int], int] = {}
     for row in episodes:
         row["first_row"] = row["dataset_from_index"] - firsts.setdefault(_file(row), row["dataset_from_index"])
-    return {also[EPISODE_ID]: row | also for row, also in zip(episodes, provenance, strict=True)}
+    return info, {also[EPISODE_ID]: row | also for row, also in zip(episodes, provenance, strict=True)}
 
 
 def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
     return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
 
 
-@lru_cache(maxsize=1)
-def _info(root: Path, modified_ns: int) -> dict[str, Any]:
-    info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text())
-    tasks = pq.read_table(root / "meta" / "tasks.parquet").to_pylist()
-    return info | {"tasks": {row["task_index"]: row["task"] for row in tasks}}
-
-
 def _copy(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy:
     index, steps = row["episode_index"], row["length"]
-    info = _info(root, (root / "meta" / "info.json").stat().st_mtime_ns)
+    info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)
     table = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
     if table["episode_index"].to_pylist() != [index] * steps:
