@@ -27,7 +27,6 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
     """Read a dataset as OFT would and say what it finds, JSON-serialisable.
 
     Args:
-        folder: the version folder.
         statistics: the dataset's entry of ``dataset_statistics.json``.
 
     Returns:

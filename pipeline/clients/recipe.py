@@ -87,7 +87,6 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
     Args:
         manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
             episode, its place in each format, and the versions and the device that made it.
-        rows: its rows.
         export: the datasets that the run asks for; OpenVLA-OFT calls all of RLDS by the name there.
 
     Raises:
@@ -131,9 +130,7 @@ def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
     """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``finetune``.
 
     Args:
-        recipe: what ``build`` returned.
         data: the run's folder; the scripts look for ``rlds`` beside theirs.
-        export: the datasets that the run asks for.
     """
     wanted = export.lerobot_v21
     with replaced(data / "finetune") as unfinished:

@@ -20,12 +20,7 @@ Fill = Callable[[argparse.ArgumentParser], None]
 
 
 class LazyParser(argparse.ArgumentParser):
-    """Gets its arguments when it is first asked to parse, as what they may be can take long to import.
-
-    Attributes:
-        summary: what the command does, in a line.
-        fill: adds the arguments.
-    """
+    """Gets its arguments when it is first asked to parse, as what they may be can take long to import."""
 
     summary: str = ""
     fill: Fill | None = None
@@ -41,9 +36,7 @@ def add(commands: Any, run: Callable[[argparse.Namespace], int], fill: Fill, nam
     """Add a command.
 
     Args:
-        commands: what ``add_subparsers`` returned.
         run: does it; the first line of its docstring says what, and the rest more.
-        fill: adds its arguments.
         name: as it is called; the function's when left out.
     """
     described, _, details = (run.__doc__ or "").partition("\n\n")

@@ -138,7 +138,6 @@ class EvaluationJob:
     """Some episodes of one scene, as they are sent to a worker.
 
     Attributes:
-        tasks: what to run, in order.
         device: what renders the evaluation, as OpenGL names it.
     """
 

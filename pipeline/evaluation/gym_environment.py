@@ -46,11 +46,8 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
 
     Args:
         tasks: all episodes, in order.
-        first: which of them is the first here.
-        stride: how many environments share them.
         size_px: height and width of the views; they are rendered in 256 x 256 and resized.
         evaluation: where the rows of episodes go, if anywhere.
-        archive: see ``EpisodeEnvironment``.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012

@@ -103,7 +103,6 @@ class Evaluation:
 
     Attributes:
         identity: of the policy, as it was when the evaluation began.
-        folder: of the results.
         videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
         archive: folder of LIBERO-Plus's asset archive, where there is one.
     """
@@ -131,9 +130,6 @@ class Evaluation:
     def check(self, tasks: Iterable[EvaluationTask]) -> None:
         """Refuse a folder that has another policy of this name, or results of other versions that nobody allowed to
         make anew.
-
-        Args:
-            tasks: that are to be run.
 
         Raises:
             PipelineError: when it has. Nothing was changed.

@@ -74,9 +74,6 @@ class Selection(Frozen, use_attribute_docstrings=True):
 def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
     """The tasks that a selection names, in a fixed order.
 
-    Args:
-        archive: folder of LIBERO-Plus's asset archive, where there is one.
-
     Raises:
         PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.
     """

@@ -92,7 +92,6 @@ class Simulator(Environment):
     those of LIBERO's evaluation. A reset takes 1.3 s; episodes with the same seed and posture share one.
 
     Args:
-        task: the task to build.
         files: of the arena, by absolute paths; the task's own by default.
     """
 

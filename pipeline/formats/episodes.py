@@ -22,11 +22,8 @@ class Piece:
 
     Attributes:
         path: of its file or folder, below the work folder.
-        ids: of its episodes.
-        split: of its episodes.
         number: how many pieces come before.
         first_episode, first_step: how many episodes and steps of the dataset come before.
-        steps: of its episodes.
         tasks: each of its instructions to the number of it among the dataset's.
     """
 
@@ -44,11 +41,9 @@ class Known(NamedTuple):
     """What is known of an episode before it is loaded.
 
     Attributes:
-        suite: LIBERO suite.
         content: changes with anything that ``load`` would return.
         demo: its demonstration, ``<suite>/<task>/<key>``.
         instruction: the text that the policy is prompted with.
-        steps: its length.
     """
 
     suite: str
@@ -65,7 +60,6 @@ class Episodes:
     Attributes:
         known: episode id to what is known of it, in the order in which they are written: shuffled, because readers walk
             a dataset in order.
-        load: reads one episode.
     """
 
     known: Mapping[str, Known]
@@ -119,7 +113,6 @@ def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str
 
     Args:
         slices: path of each piece, in order, to its split and its episodes.
-        known: what is known of them.
     """
     pieces: list[Piece] = []
     tasks: dict[str, int] = {}

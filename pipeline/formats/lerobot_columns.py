@@ -53,7 +53,6 @@ class Convention:
     """What clients expect of a set.
 
     Attributes:
-        frames: how the frames are stored.
         robot_type: in ``meta/info.json``.
         names: columns that have another name than in v3.0.
         open_is_one: whether the gripper's command is 1 open, 0 closed, and not as LIBERO has it. GR00T and starVLA,

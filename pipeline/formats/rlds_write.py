@@ -54,7 +54,6 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
     Args:
         folder: ``<name>/1.0.0``.
         lengths: each shard of it, in order, to its number of episodes.
-        extras: what the episodes have beside the frames.
     """
     infos = []
     for split_name in sorted({split_of(shard) for shard in lengths}):

@@ -88,13 +88,10 @@ def render(
     """The card of one format, with the hub's metadata in front.
 
     Args:
-        shown: the format.
         others: titles of the other formats.
-        rows: the manifest.
         reports: what the files of ``REPORTS`` hold.
         clients: the section of that name in ``finetune.yaml``: where and how each policy's code is called.
         sheets: the axes that have a picture.
-        name: what the run's datasets together are called.
     """
     leakage, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]

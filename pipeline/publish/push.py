@@ -61,9 +61,6 @@ class Upload:
 def prepare(target: Format[Any]) -> Upload:
     """Gather what belongs to a dataset; nothing is sent.
 
-    Args:
-        target: the dataset.
-
     Raises:
         PipelineError: when files are missing, foreign, not validated, or failed validation.
     """
@@ -88,7 +85,6 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
     Files of an earlier upload that the dataset no longer has are deleted by the same commit.
 
     Args:
-        upload: what ``prepare`` gathered.
         repository: ``owner/name``, or ``name`` for one of your own.
         private: whether a new repository is private; one that exists stays as it is.
         endpoint: address of the hub, when not the usual one.

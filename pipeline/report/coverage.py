@@ -34,8 +34,6 @@ class Draw(NamedTuple):
     """One perturbation of a kept episode.
 
     Attributes:
-        task: the episode's.
-        made: what was drawn.
         resolved: what it did in the scene, None where nothing was recorded.
     """
 

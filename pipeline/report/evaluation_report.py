@@ -65,7 +65,6 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
     """The page.
 
     Args:
-        found: from ``findings``.
         videos: by the name of the episode.
     """
     colours = dict(zip(found["policies"], cycle(figures.COLOURS.values()), strict=False))

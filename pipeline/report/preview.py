@@ -55,9 +55,6 @@ class Stage:
     """A task set up to be looked at.
 
     Attributes:
-        demo: one of its demonstrations.
-        scene: the demonstration's first state.
-        opened: where scenes are rendered.
         replay: how a run settles, and treats the demonstration's no-ops.
     """
 
@@ -174,9 +171,6 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     What a scene refuses is a grey tile with the reason.
 
     Args:
-        stage: the demonstration to show.
-        name: the axis.
-        config: its ranges, and the seed.
         test: the benchmark's test tasks, which the plan's draws keep clear of.
     """
     demo, seed = stage.demo, config.plan.seed
@@ -220,8 +214,6 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     Of an axis it shows the strongest of the plan's first draws that the scene does not refuse.
 
     Args:
-        stage: the demonstration to show.
-        config: the ranges, and the seed.
         test: the benchmark's test tasks, which the plan's draws keep clear of.
 
     Raises:

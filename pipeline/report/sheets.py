@@ -47,8 +47,6 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
     """Write one sheet for each perturbed axis of a run.
 
     Args:
-        manifest: rows of the manifest.
-        load: reads an episode by its id.
         folder: where the pictures go, one ``<axis>.png`` each.
 
     Returns:

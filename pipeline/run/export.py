@@ -192,8 +192,6 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     not on how often the work was interrupted.
 
     Args:
-        target: the format.
-        episodes: what to write.
         workers: do the work; one call for each piece.
 
     Raises:

@@ -35,8 +35,6 @@ class Memory:
     """What a stage's outputs were made from.
 
     Attributes:
-        data: the run's folder.
-        stage: which stage.
         made_by: the fingerprint of its inputs and recipe; None where an input has changed since it was recorded.
         outputs: files or folders of ``data``.
     """

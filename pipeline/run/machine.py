@@ -56,10 +56,6 @@ def trial() -> dict[str, str]:
 def record(folder: Path, trial: Mapping[str, str]) -> None:
     """Write what is here, unless the run was begun where the trial came to something else.
 
-    Args:
-        folder: of the run.
-        trial: see ``trial``.
-
     Raises:
         PipelineError: as ``refuse_another``.
     """

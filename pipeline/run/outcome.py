@@ -33,7 +33,6 @@ class Outcome:
     """The plan, and what replay and rendering made of it.
 
     Attributes:
-        rows: the plan.
         trajectories: trajectory id to its row in the table of replays.
         frames: trajectory id to what is stored of its frames.
         verdicts: episode id to verdict.
@@ -77,10 +76,7 @@ def replayed(
     """Trajectory id to its row in the table of replays.
 
     Args:
-        rows: the plan.
-        folder: of the trajectory store.
         rejected: episode id to the reason why its frames were rejected.
-        limits: of quality.
 
     Raises:
         PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
@@ -97,7 +93,6 @@ def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[st
     """Episode id to the reason why one of its streams was not rendered, where that is so.
 
     Args:
-        rows: the plan.
         frames: trajectory id to what is stored of its frames.
     """
     reasons: dict[str, str] = {}
@@ -162,8 +157,6 @@ def outdated(rows: Sequence[plan.Row], config: Config, device: str | None = None
     files, and nobody is asked.
 
     Args:
-        rows: the plan.
-        config: of the run.
         device: what renders here, as OpenGL names it; without it, frames of any device count as finished.
     """
     planned = dict.fromkeys(row.trajectory_id for row in rows)

@@ -40,7 +40,6 @@ class Found:
 
     Attributes:
         episode_id: this project's name of it, or what the dataset calls it.
-        instruction: the text that a policy is prompted with.
         extrinsics: (4, 4) from the agent view to the world (z forward, y down); None where the dataset has none.
         suite, task: of LIBERO; None where nothing tells.
         perturbations: the labels, as the manifest writes them; None where there are none.
@@ -70,7 +69,6 @@ class Audit:
     """What an audit found.
 
     Attributes:
-        episodes: of the dataset.
         axes: axis to how close its episodes come to the test tasks.
         unlabelled: episodes without labels, of which nothing is known but the instruction and the camera.
         without_camera: unlabelled episodes without the camera's matrices.
@@ -97,7 +95,6 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
 
     Args:
         dataset: a folder with an RLDS set (as TFDS writes it) or a LeRobot set (v3.0 or v2.1), or several below it.
-        test: the benchmark's tasks.
         manifest: gives the labels of episodes that have an ``episode_id`` and lost theirs.
 
     Raises:

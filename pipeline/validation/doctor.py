@@ -82,7 +82,6 @@ def run(config: Config, *, tried: bool = False) -> int:
     """Print what ``check`` and a trial find for a configuration; the exit status: 1 when something fails.
 
     Args:
-        config: of the run.
         tried: whether the trial was made before, on this machine as it is.
     """
     table = Table(box=None)

@@ -39,7 +39,6 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     """Replay, render and serialise one kept episode again, and compare it with the dataset that lies by the manifest.
 
     Args:
-        episode_id: which.
         manifest_file: of the run; its ``rlds`` folder is looked for beside it.
         out: a new folder, which gets the replay, the frames, and the episode as an RLDS set of its own.
         root: folder of LIBERO's HDF5 demonstrations, where the run started from those.
@@ -90,7 +89,6 @@ class _Record:
     """An episode as it lies in a shard.
 
     Attributes:
-        data: the serialised example.
         features: the feature tree of its dataset.
     """
 

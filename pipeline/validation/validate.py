@@ -177,8 +177,6 @@ class EpisodesJob:
     """The checks of some episodes, wherever they lie.
 
     Attributes:
-        config: of the run.
-        data: its folder.
         formats: the datasets that can be opened.
         cache: folder for files that reading them needs.
         witnesses: ids of the episodes to render anew.
