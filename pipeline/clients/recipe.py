@@ -13,7 +13,6 @@ import pyarrow.parquet as pq
 import yaml
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotV21Config
 from pipeline.files import checksum, replaced
 from pipeline.formats import exact_statistics
@@ -86,14 +85,9 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
         manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
             episode, its place in each format, and the versions and the device that made it.
         export: the datasets that the run asks for; OpenVLA-OFT calls all of RLDS by the name there.
-
-    Raises:
-        PipelineError: when nothing was kept.
     """
     name = export.rlds.name if export.rlds else None
     kept = [row for row in rows if row["kept"]]
-    if not kept:
-        raise PipelineError("no episode was kept", where=manifest_file, remedy="read its column reason")
     counts: dict[str, dict[str, int]] = {}
     for row in kept:
         by_axis = counts.setdefault(row["suite"], {})

@@ -18,7 +18,6 @@ from huggingface_hub import DatasetCardData
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.base import Format
 from pipeline.run import manifest
@@ -49,14 +48,9 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
         name: what all of them together are called.
 
     Raises:
-        PipelineError: when something that it describes is missing, or nothing was kept.
+        PipelineError: when something that it describes cannot be read.
     """
-    missing = [name for name in (*REPORTS, "manifest.parquet", "finetune/finetune.yaml") if not (data / name).is_file()]
-    if missing:
-        raise PipelineError(f"{', '.join(missing)} not there", where=data, remedy="dvc repro")
     rows = manifest.read(data / "manifest.parquet")
-    if not any(row["kept"] for row in rows):
-        raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
     reports = {name: read_json(data / name) for name in REPORTS}
     clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)

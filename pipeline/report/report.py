@@ -16,7 +16,6 @@ from PIL import Image
 from pipeline.axes import TextPerturbation, from_json
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.libero.tasks import find_task
 from pipeline.planning.streams import streams_of
@@ -54,7 +53,7 @@ def page(config: Config, test: TestSet) -> str:
     """The report of a finished run.
 
     Raises:
-        PipelineError: when the run's folder lacks what an earlier stage makes, or nothing was kept.
+        PipelineError: when the run's folder lacks what an earlier stage makes.
     """
     data = config.data
     rows: Rows = manifest.read(data / "manifest.parquet")
@@ -62,8 +61,6 @@ def page(config: Config, test: TestSet) -> str:
     load = EpisodeLoader(data, config.render)
     tried = counts.tried(rows)
     kept = [row for row in tried if row["kept"]]
-    if not kept:
-        raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
     actions = _actions(kept, FrameStore(data / "frames", config.render))
     axes = list(dict.fromkeys(row["axis"] for row in kept))
     sheets = _pictures(data / "sheets")

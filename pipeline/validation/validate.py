@@ -146,10 +146,7 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
 
 def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> list[Fault]:
     """What would mislead OpenVLA-OFT."""
-    name = folder.parent.name
-    if name not in statistics:
-        return [Fault("rlds", None, f"dataset_statistics.json has nothing on {name}", "its statistics")]
-    found = oft_check.check(folder, statistics[name])
+    found, name = oft_check.check(folder, statistics), folder.parent.name
     return [Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in found["violations"]]
 
 

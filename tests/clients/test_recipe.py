@@ -25,7 +25,6 @@ from synthetic import IDS, SET, episode, write_lerobot_v21
 
 from pipeline.clients.recipe import build, write
 from pipeline.clients.templates.run_openvla_oft import read_schedule, set_optimiser
-from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
 from pipeline.files import schema_file
 from pipeline.formats.registry import formats_of
@@ -92,11 +91,6 @@ def test_recipe_changes_with_the_dataset(tmp_path: Path) -> None:
     (tmp_path / "other.parquet").write_bytes(b"other rows")
     other = build(tmp_path / "other.parquet", ROWS, export_config())
     assert other["dataset"]["sha256"] != tiny_recipe(tmp_path)["dataset"]["sha256"]
-
-
-def test_nothing_kept_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(PipelineError, match="no episode was kept"):
-        tiny_recipe(tmp_path, rows=[row("libero_10", "camera", kept=False)])
 
 
 @pytest.mark.parametrize(

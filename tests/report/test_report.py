@@ -6,15 +6,12 @@ import base64
 import io
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
 import av
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from conftest import REPOSITORY, tiny_config
 from html_page import Page, needs_nothing_beside_itself, screenshot
@@ -31,7 +28,6 @@ from pipeline.report import coverage, figures, pages, report, yields
 from pipeline.report.coverage import Draw
 from pipeline.run import manifest
 from pipeline.seeding import rng
-from pipeline.tables import write_table
 from pipeline.testset import benchmark
 from pipeline.types import Quality
 
@@ -180,20 +176,6 @@ def test_the_same_data_give_the_same_figure() -> None:
 def test_an_unfinished_run_says_what_to_run(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(PipelineError, match="dvc repro"):
-        report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
-
-
-def test_a_run_that_kept_nothing_is_refused(
-    config: Config, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / config.data).mkdir(parents=True)
-    table = pq.read_table(finished / "manifest.parquet")
-    lost = pa.array([False] * len(table))
-    column = table.schema.get_field_index("kept")
-    write_table(table.set_column(column, "kept", lost), tmp_path / config.data / "manifest.parquet")
-    shutil.copy(finished / "leakage.json", tmp_path / config.data)
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(PipelineError, match="no episode was kept"):
         report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
