@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
@@ -32,22 +33,18 @@ class LazyParser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
 
-def add(commands: Any, run: Callable[[argparse.Namespace], int], fill: Fill, name: str | None = None) -> LazyParser:
-    """Add a command.
+def add(commands: Any, run: Callable[[argparse.Namespace], int | None], fill: Fill) -> None:
+    """Add a command of a function's name, whose docstring says what it does, in its first line and in more.
 
     Args:
-        run: does it; the first line of its docstring says what, and the rest more.
-        name: as it is called; the function's when left out.
+        run: does it; returns the exit status, or nothing for 0.
     """
-    described, _, details = (run.__doc__ or "").partition("\n\n")
-    description = f"{described[:1].upper()}{described[1:]}.\n\n{_unindented(details)}".strip()
+    described, _, details = (inspect.getdoc(run) or "").partition("\n\n")
+    description = f"{described[:1].upper()}{described[1:]}.\n\n{details}".strip()
     formatter = argparse.RawDescriptionHelpFormatter
-    command: LazyParser = commands.add_parser(
-        name or run.__name__, help=described, description=description, formatter_class=formatter
-    )
+    command = commands.add_parser(run.__name__, help=described, description=description, formatter_class=formatter)
     command.set_defaults(run=run)
     command.summary, command.fill = described, fill
-    return command
 
 
 def add_group(commands: Any, name: str, summary: str) -> Any:
@@ -55,10 +52,6 @@ def add_group(commands: Any, name: str, summary: str) -> Any:
     group = commands.add_parser(name, help=summary, description=f"{summary[:1].upper()}{summary[1:]}.")
     group.summary = summary
     return group.add_subparsers(required=True, metavar="VERB")
-
-
-def _unindented(text: str) -> str:
-    return "\n".join(line.strip() for line in text.splitlines())
 
 
 def positive(text: str) -> int:

@@ -31,7 +31,7 @@ def config_schema() -> dict[str, Any]:
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
 
 
-def schema(arguments: argparse.Namespace) -> int:
+def schema(arguments: argparse.Namespace) -> None:
     """write the files of schemas/ that follow from the code"""
     from pipeline.files import replaced
 
@@ -39,4 +39,3 @@ def schema(arguments: argparse.Namespace) -> int:
         with replaced(SCHEMAS / name) as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n")
         print(f"wrote {SCHEMAS / name}")
-    return 0

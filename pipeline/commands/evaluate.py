@@ -64,7 +64,7 @@ def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--workers", type=positive, default=0, metavar="N", help="processes (default: one a core)")
 
 
-def evaluate(arguments: argparse.Namespace) -> int:
+def evaluate(arguments: argparse.Namespace) -> None:
     """run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes
 
     Writes one file for each episode, and summary.json with success rates and their 95 % intervals. Run again after a
@@ -93,7 +93,6 @@ def evaluate(arguments: argparse.Namespace) -> int:
     with runner(compute, arguments.out, gl.WorkerSetup) as run:
         found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
-    return 0
 
 
 def _report_arguments(command: argparse.ArgumentParser) -> None:
@@ -114,7 +113,7 @@ def _report_arguments(command: argparse.ArgumentParser) -> None:
     )
 
 
-def report(arguments: argparse.Namespace) -> int:
+def report(arguments: argparse.Namespace) -> None:
     """write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures
 
     Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
@@ -125,10 +124,9 @@ def report(arguments: argparse.Namespace) -> int:
     from pipeline.report import evaluation_report
 
     print(json.dumps(evaluation_report.write(read(arguments.folders, arguments.across), arguments.out)))
-    return 0
 
 
-def coverage(arguments: argparse.Namespace) -> int:
+def coverage(arguments: argparse.Namespace) -> None:
     """set what a policy sees in a finished run beside what it sees in the benchmark's test tasks
 
     First looks, how far the hand and the targets are moved, where objects are added, how much of a view changes, grey
@@ -147,14 +145,13 @@ def coverage(arguments: argparse.Namespace) -> int:
         table.add_row(one.axis, one.what, *("-" if of is None else str(of) for of in (one.tested, one.ours)))
     Console().print(table)
     print(json.dumps({f"{one.axis}: {one.what}": {"tests": one.tested, "run": one.ours} for one in measures}))
-    return 0
 
 
 def _gap_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
 
 
-def gap(arguments: argparse.Namespace) -> int:
+def gap(arguments: argparse.Namespace) -> None:
     """compositional gap of the pairs that were run with --source pairs: gap.json and gap.png in their folder"""
     from pipeline.evaluation import composition
     from pipeline.evaluation.results import stored
@@ -164,7 +161,6 @@ def gap(arguments: argparse.Namespace) -> int:
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
     write_json(arguments.results / "gap.json", figures)
     print(json.dumps(figures))
-    return 0
 
 
 def _construct_arguments(command: argparse.ArgumentParser) -> None:
@@ -181,7 +177,7 @@ def _construct_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--seed", type=int, default=0, help="of all draws (default: 0)")
 
 
-def construct(arguments: argparse.Namespace) -> int:
+def construct(arguments: argparse.Namespace) -> None:
     """draw 14,000 candidates of held-out draws, filter and balance them to a benchmark
 
     The file is for `evaluate --tasks-from`. Which scenes refuse their draw is known once candidates were run: give
@@ -200,7 +196,6 @@ def construct(arguments: argparse.Namespace) -> int:
     )
     write_tasks(chosen, arguments.seed, arguments.out)
     print(json.dumps(counts))
-    return 0
 
 
 def _grade_arguments(command: argparse.ArgumentParser) -> None:
@@ -208,7 +203,7 @@ def _grade_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks with their difficulty")
 
 
-def grade(arguments: argparse.Namespace) -> int:
+def grade(arguments: argparse.Namespace) -> None:
     """levels of difficulty, 1 to 5, by how many of several models solve a task"""
     from pipeline.errors import PipelineError
     from pipeline.evaluation.results import stored
@@ -223,7 +218,6 @@ def grade(arguments: argparse.Namespace) -> int:
     write_tasks(graded, seed, arguments.out)
     by_level = {level: sum(task["difficulty"] == level for task in graded) for level in range(1, 6)}
     print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
-    return 0
 
 
 def _leakage_arguments(command: argparse.ArgumentParser) -> None:

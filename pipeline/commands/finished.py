@@ -119,7 +119,7 @@ def _push_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--endpoint", metavar="URL", help="address of the hub, when not the usual one")
 
 
-def push(arguments: argparse.Namespace) -> int:
+def push(arguments: argparse.Namespace) -> None:
     """upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go
 
     Sends one of the datasets of a finished and validated run: its files, the card, the manifest and the recipe, in
@@ -142,6 +142,5 @@ def push(arguments: argparse.Namespace) -> int:
     print(upload.summary())
     if not arguments.really:
         print(f"nothing was sent: with --really this goes to {arguments.repository}")
-        return 0
+        return
     print(push.send(upload, arguments.repository, private=arguments.private, endpoint=arguments.endpoint))
-    return 0
