@@ -192,11 +192,17 @@ def _copy(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy
     if table["episode_index"].to_pylist() != [index] * steps:
         raise ValueError(f"rows {row['first_row']} of data file {number} are not the {steps} steps of episode {index}")
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
+    videos = {}
+    for view, key in ((view, spec.lerobot_key) for view, spec in SCHEMA.views.items()):
+        if info["features"][key]["dtype"] == "video":
+            chunk, number = _file(row, f"videos/{key}")
+            path = root / info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
+            videos[view] = path, row[f"videos/{key}/from_timestamp"]
     return Copy(
         dataset="lerobot",
         episode=episode(table, row, instructions[0], extras),
         instructions=instructions,
-        decoded={key: frame for view in SCHEMA.views for key, frame in _decoded(root, info, row, table, view)},
+        decoded=decoded(table, videos),
         marks={name: table[name].to_numpy() for name in MARKS},
         place={"lerobot_episode_index": index},
     )
@@ -246,21 +252,22 @@ def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[
     return Geometry(**matrices, maps={name: list(map(base64.b64decode, files)) for name, files in texts.items()})
 
 
-def _decoded(
-    root: Path, info: Mapping[str, Any], row: Mapping[str, Any], table: pa.Table, view: str
-) -> Iterator[tuple[tuple[str, int], Frame]]:
-    """The frames of a view at the sampled steps."""
-    key = SCHEMA.views[view].lerobot_key
-    if info["features"][key]["dtype"] == "image":
-        for step in sampled(row["length"]):
-            yield (view, step), decode(table[key][step]["bytes"].as_py())
-        return
-    chunk, number = _file(row, f"videos/{key}")
-    path = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
-    for step in sampled(row["length"]):
-        # By the time that stands at the step, as lerobot does.
-        at_s = row[f"videos/{key}/from_timestamp"] + table["timestamp"][step].as_py()
-        yield (view, step), frame_at(root / path, at_s)
+def decoded(table: pa.Table, videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:
+    """The frames at the sampled steps.
+
+    Args:
+        videos: view to its video, and the time (s) at which the episode begins there; views without one are images.
+    """
+    frames = {}
+    for view, spec in SCHEMA.views.items():
+        for step in sampled(len(table)):
+            if view in videos:
+                # By the time that stands at the step, as lerobot does.
+                path, begins_s = videos[view]
+                frames[view, step] = frame_at(path, begins_s + table["timestamp"][step].as_py())
+            else:
+                frames[view, step] = decode(table[spec.lerobot_key][step]["bytes"].as_py())
+    return frames
 
 
 def frame_at(path: Path, at_s: float) -> Frame:
