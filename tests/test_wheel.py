@@ -19,7 +19,7 @@ READ = """
 import json
 from pathlib import Path
 import pipeline
-from pipeline.commands.develop import config_schema
+from pipeline.commands.develop import schemas
 from pipeline.axes.language import load_bank
 from pipeline.catalogue.objects import models
 from pipeline.episode_schema import SCHEMA, SCHEMA_FILE
@@ -29,7 +29,7 @@ from pipeline.publish import card
 from pipeline.run import manifest
 
 assert SCHEMA.fps_hz == 20 and manifest.schema().names and load_bank() and models(("libero",))
-assert json.loads(schema_file("config.schema.json").read_text()) == config_schema()
+assert json.loads(schema_file("config.schema.json").read_text()) == schemas()["config.schema.json"]
 for file in (pipeline.__file__, SCHEMA_FILE, recipe.SCHEMA_FILE):
     print(Path(file).is_file(), file)
 """

@@ -19,16 +19,11 @@ def add_commands(commands: Any) -> None:
 
 def schemas() -> dict[str, dict[str, Any]]:
     """The files of ``schemas/`` that are written from the code."""
+    from pipeline.config import Config
     from pipeline.run import manifest
 
-    return {"config.schema.json": config_schema(), "manifest.json": manifest.described()}
-
-
-def config_schema() -> dict[str, Any]:
-    """JSON Schema of the files in ``configs/``."""
-    from pipeline.config import Config
-
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
+    config = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
+    return {"config.schema.json": config, "manifest.json": manifest.described()}
 
 
 def schema(arguments: argparse.Namespace) -> None:

@@ -103,10 +103,6 @@ class Episodes:
             splits["val" if self.known[episode_id].demo in chosen else "train"].append(episode_id)
         return splits
 
-    def slices(self, members: Sequence[str], pieces: int) -> list[list[str]]:
-        """Some of the episodes in slices (see ``split``): as many of ``pieces`` as they are of all, at least one."""
-        return split(members, max(1, round(pieces * len(members) / len(self.known))))
-
 
 def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:
     """The pieces of one dataset whose files say how many episodes and steps come before theirs.

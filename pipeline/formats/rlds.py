@@ -12,7 +12,7 @@ import pyarrow as pa
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Format, Row
-from pipeline.formats.episodes import Episodes, Load, Piece, by_suite
+from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.rlds_layout import VERSION, dataset_of, shard_path
 from pipeline.identity import Step
@@ -42,7 +42,7 @@ class Rlds(Format[RldsConfig]):
         for split_name, members in episodes.by_split(self.options.validation).items():
             suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
             for name, ids in by_suite(suites, self.options.name).items():
-                slices = episodes.slices(ids, shards)
+                slices = split(ids, max(1, round(shards * len(ids) / len(episodes.known))))
                 for shard, slice_ids in enumerate(slices):
                     path = shard_path(name, split_name, shard, len(slices))
                     pieces.append(Piece(f"dataset/{path}", slice_ids, split_name))
