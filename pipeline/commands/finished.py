@@ -116,14 +116,14 @@ def _push_arguments(command: argparse.ArgumentParser) -> None:
     add_config(command)
     command.add_argument("--really", action="store_true", help="send it")
     command.add_argument("--private", action="store_true", help="make a new repository private")
-    command.add_argument("--endpoint", metavar="URL", help="address of the hub, when not the usual one")
 
 
 def push(arguments: argparse.Namespace) -> None:
     """upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go
 
     Sends one of the datasets of a finished and validated run: its files, the card, the manifest and the recipe, in
-    one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`.
+    one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`, the address of
+    another hub from HF_ENDPOINT.
     """
     from pipeline.errors import PipelineError
     from pipeline.formats.registry import formats_of
@@ -143,4 +143,4 @@ def push(arguments: argparse.Namespace) -> None:
     if not arguments.really:
         print(f"nothing was sent: with --really this goes to {arguments.repository}")
         return
-    print(push.send(upload, arguments.repository, private=arguments.private, endpoint=arguments.endpoint))
+    print(push.send(upload, arguments.repository, private=arguments.private))

@@ -8,15 +8,15 @@ leaves notes among the files, shows half a dataset meanwhile, and tries for ever
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Set
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import httpx
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, errors, get_token
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, errors, get_token
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 
 from pipeline.errors import PipelineError
@@ -79,15 +79,14 @@ def prepare(target: Format[Any]) -> Upload:
     return Upload(dict(sorted(files.items())), folders, target.tag())
 
 
-def send(upload: Upload, repository: str, *, private: bool = False, endpoint: str | None = None) -> str:
-    """Create the repository if need be, send what it does not have, and tag it.
+def send(upload: Upload, repository: str, *, private: bool = False) -> str:
+    """Create the repository on the hub (of HF_ENDPOINT) if need be, send what it does not have, and tag it.
 
     Files of an earlier upload that the dataset no longer has are deleted by the same commit.
 
     Args:
         repository: ``owner/name``, or ``name`` for one of your own.
         private: whether a new repository is private; one that exists stays as it is.
-        endpoint: address of the hub, when not the usual one.
 
     Returns:
         The address of the commit.
@@ -95,7 +94,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
     Raises:
         PipelineError: without a token, without the right to write, or when the network or the hub fails.
     """
-    api = HfApi(endpoint=endpoint)
+    api = HfApi()
     try:
         if get_token() is None:
             raise PipelineError(
@@ -109,10 +108,9 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
             *(CommitOperationAdd(path, _content(path, file, repository)) for path, file in upload.files.items()),
             *(CommitOperationDelete(path, is_folder=False) for path in stale),
         ]
-        with _addresses_of(api.endpoint):
-            commit = api.create_commit(
-                repository, operations, repo_type="dataset", commit_message=f"Upload {len(upload.files)} files"
-            )
+        commit = api.create_commit(
+            repository, operations, repo_type="dataset", commit_message=f"Upload {len(upload.files)} files"
+        )
         if upload.tag is not None:  # moved, where it stands on an earlier upload
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
@@ -120,17 +118,6 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
     except FAILURES as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url
-
-
-@contextmanager
-def _addresses_of(endpoint: str) -> Iterator[None]:
-    """Have huggingface_hub understand the address of its own commit: it knows no hub but the one of ``HF_ENDPOINT``."""
-    saved = constants.ENDPOINT
-    constants.ENDPOINT = endpoint
-    try:
-        yield
-    finally:
-        constants.ENDPOINT = saved
 
 
 def _content(path: str, file: Path, repository: str) -> Path | bytes:
