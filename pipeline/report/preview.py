@@ -242,11 +242,10 @@ def _strongest(stage: Stage, drawn: Sequence[Perturbation], view: str) -> Tile:
     raise refused
 
 
-def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:
+def for_run(config: Config, folder: Path, workers: Workers) -> None:
     """Show every configured axis that applies on the first task of each suite that the run is about.
 
-    Returns:
-        Suite to the folder of its sheets, ``<folder>/<suite>/<axis>.png``.
+    A sheet is ``<folder>/<suite>/<axis>.png``.
     """
     by_suite: dict[str, list[Task]] = {}
     for task in select_tasks(config.demos.tasks):
@@ -258,7 +257,6 @@ def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:
             workers(_draw_all, jobs, "previews")
         finally:
             scene_of_process().close()
-    return {suite: folder / suite for suite in by_suite}
 
 
 def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:

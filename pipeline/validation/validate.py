@@ -118,9 +118,8 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
             total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
             continue
         opened.append(one)
-        total.note("format", [fault for check, fault in found if check == "format"])
-        total.note("ids", [fault for check, fault in found if check == "ids"], len(episodes))
-        total.note("readable", [fault for check, fault in found if check == "readable"], 0)
+        for check, checked in (("format", 1), ("ids", len(episodes)), ("readable", 0)):
+            total.note(check, [fault for named, fault in found if named == check], checked)
     for results in workers(replace(job, formats=opened), _slices(episodes, job.witnesses, opened), "validate"):
         total.add(results)
     return total
@@ -195,17 +194,18 @@ class EpisodesJob:
 
     def _check(self, row: Row, results: Results) -> None:
         episode_id = row["episode_id"]
-        copies, missing, unreadable = [], [], []
+        copies = []
+        results.note("readable", [])
         for one in self.formats:
             try:
                 if (copy := one.read(row, self.cache)) is not None:
                     copies.append(copy)
                 else:
-                    missing.append(Fault(one.name, episode_id, "is not in the dataset", "every kept episode"))
+                    missing = Fault(one.name, episode_id, "is not in the dataset", "every kept episode")
+                    results.note("ids", [missing], 0)
             except PipelineError as error:
-                unreadable.append(Fault(one.name, episode_id, str(error), "an episode that can be read"))
-        results.note("ids", missing, 0)
-        results.note("readable", unreadable)
+                unreadable = Fault(one.name, episode_id, str(error), "an episode that can be read")
+                results.note("readable", [unreadable], 0)
         language = self.config.plan.axes.language
         try:
             made = EpisodeLoader(self.data, self.config.render, self.extras)(episode_id)
@@ -217,13 +217,7 @@ class EpisodesJob:
         if "outcome" in self.extras:  # The manifest has figures of kept episodes alone.
             quality = measure(trajectory, find_task(row["suite"], row["task"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
-        case = Case(
-            row=row,
-            made=made,
-            trajectory=trajectory,
-            copies=copies,
-            bank=language.bank if language else None,
-        )
+        case = Case(row, made, trajectory, copies, language.bank if language else None)
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:
