@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.commands.base import add, add_config, add_fields, add_group, owned, plan_of, positive
+from pipeline.errors import PipelineError
 from pipeline.files import write_json
 
 TITLE = "evaluate policies"
@@ -205,7 +206,6 @@ def _grade_arguments(command: argparse.ArgumentParser) -> None:
 
 def grade(arguments: argparse.Namespace) -> None:
     """levels of difficulty, 1 to 5, by how many of several models solve a task"""
-    from pipeline.errors import PipelineError
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.statistics import grade
     from pipeline.evaluation.tasks import write_tasks
@@ -228,7 +228,6 @@ def _leakage_arguments(command: argparse.ArgumentParser) -> None:
 def leakage(arguments: argparse.Namespace) -> int:
     """how close the held-out draws of results come to the plan of a run; ends with 1 where they overlap"""
     from pipeline.axes import from_json
-    from pipeline.errors import PipelineError
     from pipeline.evaluation import own_draws
     from pipeline.evaluation.results import stored
     from pipeline.libero.tasks import find_task

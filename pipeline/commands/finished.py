@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.commands.base import add, add_config, owned
+from pipeline.errors import PipelineError
 
 TITLE = "a finished run"
 
@@ -125,7 +126,6 @@ def push(arguments: argparse.Namespace) -> None:
     one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`, the address of
     another hub from HF_ENDPOINT.
     """
-    from pipeline.errors import PipelineError
     from pipeline.formats.registry import formats_of
 
     config = owned(arguments)

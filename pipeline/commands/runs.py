@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from pipeline.commands.base import add, add_config, config_file, owned
+from pipeline.errors import PipelineError
 
 TITLE = "make datasets"
 
@@ -55,7 +56,6 @@ def clean(arguments: argparse.Namespace) -> None:
 
     Other files in the run's folder stay. Demonstrations, configurations and downloads are not touched.
     """
-    from pipeline.errors import PipelineError
     from pipeline.run import cleaning
 
     config = owned(arguments)
