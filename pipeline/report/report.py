@@ -26,7 +26,7 @@ from pipeline.report.pages import Clip
 from pipeline.report.sheets import describe
 from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
-from pipeline.run.counts import Counts, Rows
+from pipeline.run.counts import Counts, Rows, by_axis
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
@@ -124,14 +124,14 @@ def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id")
 
 
 def _overall(kept: Rows, actions: Mapping[str, Floats]) -> list[Panel]:
-    return _histograms({axis: _stacked(rows, actions) for axis, rows in _by_axis(kept).items()})
+    return _histograms({axis: _stacked(rows, actions) for axis, rows in by_axis(kept).items()})
 
 
 def _own_motion(kept: Rows, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:
     """Axis to its actions beside those of its episodes' twins, for axes with replays of their own."""
     by_id = {row["episode_id"]: row for row in kept}
     shown = {}
-    for axis, rows in _by_axis(kept).items():
+    for axis, rows in by_axis(kept).items():
         paired = [row for row in rows if row["twin_id"] in by_id]
         if any(row["trajectory_id"] != by_id[row["twin_id"]]["trajectory_id"] for row in paired):
             twins = _stacked(paired, actions, "twin_id")
@@ -143,13 +143,13 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
     """Episode lengths by suite, and against the twins', whether these were kept or not."""
     panels = []
     for suite in dict.fromkeys(row["suite"] for row in kept):
-        of_axis = _by_axis([row for row in kept if row["suite"] == suite]).items()
+        of_axis = by_axis([row for row in kept if row["suite"] == suite]).items()
         lengths = {axis: {axis: np.array([float(row["steps"]) for row in group])} for axis, group in of_axis}
         panels.append(figures.strips(suite, lengths, "steps"))
     steps = {row["episode_id"]: row["steps"] for row in rows}
     longer = {
         axis: {axis: np.array([row["steps"] - steps[row["twin_id"]] for row in group if steps[row["twin_id"]]])}
-        for axis, group in _by_axis(kept).items()
+        for axis, group in by_axis(kept).items()
         if axis != "clean"
     }
     return [*panels, figures.strips("longer than the twin by", longer, "steps")] if longer else panels
@@ -157,7 +157,7 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
 
 def _quality(kept: Rows) -> list[Panel]:
     """A panel for each figure of quality, by axis."""
-    groups = _by_axis(kept).items()
+    groups = by_axis(kept).items()
     return [
         figures.strips(
             each.name,
@@ -177,13 +177,6 @@ def _worst(kept: Rows, load: EpisodeLoader) -> list[Video]:
     moving = [row for row in of_trajectory.values() if row["non_target_moved_m"]]
     shown = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
     return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in shown]
-
-
-def _by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(row["axis"], []).append(row)
-    return groups
 
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
@@ -220,7 +213,7 @@ def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
     """The strongest episode of each axis that shows it in the agent view, the shortest of several, beside its twin."""
     by_id = {row["episode_id"]: row for row in kept}
     videos = []
-    for rows in _by_axis(kept).values():
+    for rows in by_axis(kept).values():
         seen = [row for row in rows if row["twin_id"] in by_id and _looks_different(row, by_id[row["twin_id"]])]
         if seen:
             row = min(seen, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
