@@ -100,7 +100,7 @@ class Progress:
 class EpisodeEnvironment:
     """Runs episodes one after the other; keep one for many, ordered by task: what is built for a scene is reused.
 
-    Frames are rendered when they are asked for, and only then.
+    Frames are rendered when they are asked for, and only then; ``looks`` counts observations.
 
     Args:
         archive: folder of LIBERO-Plus's asset archive, for test tasks of light, background and layout.
@@ -125,6 +125,7 @@ class EpisodeEnvironment:
         self.resolved: Mapping[str, Any] = {}
         self.perturbations: tuple[Perturbation, ...] = ()
         self._seen: dict[str, Frame] = {}
+        self.looks = 0
         starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
         try:
             starts.get(task.source, self._start_libero)()
@@ -189,10 +190,9 @@ class EpisodeEnvironment:
     def observation(self, wanted: Wanted) -> dict[str, Any]:
         """What a policy sees, as vla-eval names it: ``images``, ``states`` (8,) and ``task_description``."""
         views = () if not wanted.images else VIEWS if wanted.wrist else ("agentview",)
-        seen: dict[str, Any] = {
-            "images": {view: self.image(view) for view in views},
-            "task_description": self.instruction,
-        }
+        self.looks += 1
+        images = {view: self.image(view) for view in views}
+        seen: dict[str, Any] = {"images": images, "task_description": self.instruction}
         if wanted.state:
             seen["states"] = self.observed.state.copy()
             angle_rad = float(np.linalg.norm(seen["states"][3:6]))

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from pipeline import identity
+from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
@@ -150,14 +150,8 @@ class Evaluation:
             found |= {"files of the benchmark": digest(contents)[:16]} if contents else {}
         return found
 
-    def save(self, environment: EpisodeEnvironment, wanted: Wanted, looks: int, device: str) -> None:
-        """Write the result of the episode that ended in an environment.
-
-        Args:
-            wanted: what the policy asked to see.
-            looks: how often it was shown that.
-            device: what rendered, as OpenGL names it.
-        """
+    def save(self, environment: EpisodeEnvironment, wanted: Wanted) -> None:
+        """Write the result of the episode that ended in an environment, of a policy that asked to see ``wanted``."""
         task, progress, changes = environment.task, environment.progress, environment.perturbations
         own = changes if task.source == "own" else ()
         facts = asdict(task)
@@ -174,12 +168,12 @@ class Evaluation:
                 success=progress.success,
                 reason=progress.reason,
                 steps=progress.steps,
-                looks=looks,
+                looks=environment.looks,
                 perturbations=json.loads(to_json(own)),
                 policy=self.policy.name(self.identity),
                 identity=self.identity,
                 settings={**self.settings.model_dump(), **wanted._asdict()},
-                versions={**self.versions(task), **_installed(("pipeline", "vla-eval")), "OpenGL": device},
+                versions={**self.versions(task), **_installed(("pipeline", "vla-eval")), "OpenGL": gl.choose().device},
             )
         )
 
@@ -200,8 +194,8 @@ def _installed(packages: tuple[str, ...]) -> dict[str, str]:
 
 def roll_out_policy(
     environment: EpisodeEnvironment, policy: Policy, task: EvaluationTask, film: dict[int, Frame] | None = None
-) -> int:
-    """Run one episode to its end, which the environment knows; returns how often the policy looked.
+) -> None:
+    """Run one episode to its end, which the environment knows.
 
     Args:
         film: where agent views go, by the number of steps before each: of every look, and one whenever
@@ -213,11 +207,8 @@ def roll_out_policy(
     """
     progress = environment.reset(task)
     policy.begin(task)
-    looks = 0
 
     def look(wanted: Wanted) -> dict[str, Any]:
-        nonlocal looks
-        looks += 1
         observation = environment.observation(wanted)
         if film is not None and wanted.images:
             film[environment.progress.steps] = observation["images"]["agentview"]
@@ -232,4 +223,3 @@ def roll_out_policy(
             if progress.over:
                 break
     policy.end(progress.success)
-    return looks
