@@ -53,28 +53,24 @@ class Diagnosis:
     remedy: str = ""
 
 
-def check(
-    data: Path, *, need_gb: float, workers: int | None = None, demos: DemosConfig | None = None
-) -> list[Diagnosis]:
+def check(config: Config, need_gb: float) -> list[Diagnosis]:
     """Look at everything that takes no simulation; nothing is changed but the GL variables of the environment.
 
     Args:
-        data: folder that the run writes to; it need not exist.
-        need_gb: free space that the run needs there.
-        workers: worker processes of the run on this machine; one for each core when left out.
-        demos: the demonstrations of the run; the starter set when left out.
+        need_gb: free space that the run needs in its folder, which need not exist.
     """
+    demos = config.demos
     return [
         *_packages(),
         _tensorflow(),
         _opengl(),
         _ffmpeg(),
         _assets(),
-        _starter_demos() if demos is None or demos.root is None else _hdf5_demos(demos, demos.root),
+        _starter_demos() if demos.root is None else _hdf5_demos(demos, demos.root),
         _test_set(),
         *_further_sources(),
-        _disk(data, need_gb),
-        _machine(workers),
+        _disk(config.data, need_gb),
+        _machine(config.compute),
     ]
 
 
@@ -89,13 +85,8 @@ def run(config: Config, *, tried: bool = False) -> int:
         table.add_column(column, overflow="fold")
     styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
     made_gb = sum(file.stat().st_size for file in config.data.rglob("*") if file.is_file()) / 1e9
-    findings = check(
-        config.data,
-        # What is made already needs no more room, but for LeRobot's second copy while it is merged.
-        need_gb=max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3),
-        workers=_workers_here(config.compute),
-        demos=config.demos,
-    )
+    # What is made already needs no more room, but for LeRobot's second copy while it is merged.
+    findings = check(config, max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3))
     if all(finding.status != "fail" for finding in findings):
         findings += [*([] if tried else [_same(config.data)]), _finished(config)]
     for finding in findings:
@@ -123,11 +114,6 @@ def _finished(config: Config) -> Diagnosis:
         return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
     told = "; ".join(f"{number} {what}" for what, number in found.items())
     return Diagnosis("finished work", "warn", f"outdated: {told}", "go on where it was made, or `REMAKE=1 dvc repro`")
-
-
-def _workers_here(compute: ComputeConfig) -> int | None:
-    """Worker processes on this machine: none of its own where a loop or a cluster elsewhere does the work."""
-    return compute.workers if compute.cluster == "local" else 1
 
 
 def _packages() -> Iterator[Diagnosis]:
@@ -261,12 +247,14 @@ def _disk(data: Path, need_gb: float) -> Diagnosis:
     return Diagnosis("disk", "ok", detail)
 
 
-def _machine(workers: int | None) -> Diagnosis:
+def _machine(compute: ComputeConfig) -> Diagnosis:
     """Cores and memory as Dask counts them, with the limits of a container."""
     from dask.system import CPU_COUNT
     from distributed.system import MEMORY_LIMIT
 
-    processes, memory_gb = workers or CPU_COUNT, MEMORY_LIMIT / 1e9
+    # None of its own where a loop or a cluster elsewhere does the work.
+    processes = (compute.workers or CPU_COUNT) if compute.cluster == "local" else 1
+    memory_gb = MEMORY_LIMIT / 1e9
     detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB for {processes} workers"
     if memory_gb < processes * WORKER_GB:
         remedy = f"set compute.workers to {max(1, int(memory_gb / WORKER_GB))}"
