@@ -73,7 +73,6 @@ class Policy(Protocol):
 
     def begin(self, task: EvaluationTask) -> None:
         """An episode begins."""
-        ...
 
     def act(self, look: Look) -> Any:
         """The actions to take next, (n, 7) or (7,) for one, as ``checked_actions`` takes them; looks only when it has
@@ -82,11 +81,9 @@ class Policy(Protocol):
         Raises:
             PolicyError: when there is no answer.
         """
-        ...
 
     def end(self, success: bool) -> None:
         """It is over."""
-        ...
 
 
 class NextLook:
