@@ -45,7 +45,9 @@ def write_shard(path: Path, episode_ids: Sequence[str], load: Load, extras: tupl
         for episode_id in episode_ids:
             episode = load(episode_id)
             check(episode, extras)
-            file.write(framed(_serialize(episode, extras)))
+            example = _serializer(extras).get_tf_example(features(extras).encode_example(_tree(episode)))
+            # Left to itself, protobuf orders its map anew in every process.
+            file.write(framed(example.SerializeToString(deterministic=True)))
 
 
 def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extra, ...] = ()) -> None:
@@ -136,12 +138,6 @@ def _map(spec: MapSpec) -> Any:
     return tfds.features.Image(
         shape=(height, width, 1), dtype=np.dtype(spec.dtype), encoding_format=spec.encoding, doc=spec.meaning
     )
-
-
-def _serialize(episode: Episode, extras: tuple[Extra, ...]) -> bytes:
-    """``tf.train.Example`` of an episode; left to itself, protobuf orders its map anew in every process."""
-    example = _serializer(extras).get_tf_example(features(extras).encode_example(_tree(episode)))
-    return bytes(example.SerializeToString(deterministic=True))
 
 
 @cache

@@ -68,7 +68,8 @@ def prepare(target: Format[Any]) -> Upload:
     dataset = _exactly(target.folder, set(target.record().files))
     files = {target.repository_path(path): file for path, file in dataset.items()}
     _refuse_unvalidated(data, files, target.name)
-    _refuse_changed(target)
+    for fault in (fault for file in target.written() for fault in file.faults()):
+        raise PipelineError(fault.what, expected=fault.expected)
     card = data / "card" / target.name
     files |= {file.relative_to(card).as_posix(): file for file in card.rglob("*") if file.is_file()}
     files |= {name: data / name for name in ("manifest.parquet", *REPORTS)}
@@ -171,13 +172,6 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
                 # Forced: where a file was written anew with the same content, DVC sees nothing to do.
                 remedy="dvc repro --force --single-item validate card",
             )
-
-
-def _refuse_changed(target: Format[Any]) -> None:
-    """Stop where a file is not what was written, although its time says so."""
-    for file in target.written():
-        for fault in file.faults():
-            raise PipelineError(fault.what, expected=fault.expected)
 
 
 def _written(file: Path) -> int:

@@ -70,7 +70,7 @@ def page(config: Config, test: TestSet) -> str:
         headline=_headline(tried, kept),
         yields=yields.tables(tried),
         axes=axes,
-        overall=_overall(kept, actions),
+        overall=_histograms({axis: _stacked(rows, actions) for axis, rows in by_axis(kept).items()}),
         by_axis=_own_motion(kept, actions),
         lengths=_lengths(rows, kept),
         quality=_quality(kept),
@@ -121,10 +121,6 @@ def _histograms(groups: Mapping[str, Floats]) -> list[Panel]:
 
 def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id") -> Floats:
     return np.concatenate([actions[row[key]] for row in rows])
-
-
-def _overall(kept: Rows, actions: Mapping[str, Floats]) -> list[Panel]:
-    return _histograms({axis: _stacked(rows, actions) for axis, rows in by_axis(kept).items()})
 
 
 def _own_motion(kept: Rows, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:

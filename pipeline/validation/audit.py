@@ -223,13 +223,9 @@ def _row(one: Found, task: Task | None, test: TestSet) -> Labelled:
             anywhere = tasks(TESTED_SUITES[0])[0]
             seen.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
     own = task is not None and normalise(one.instruction) == normalise(task.instruction)
-    rewrites = [] if own else [_rewrite(one.instruction)]
+    rewrites = [] if own else [LanguagePerturbation(component="paraphrase", level=1, text=one.instruction)]
     task = task or _nearest_task(rewrites[0], test)
     return Labelled(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
-
-
-def _rewrite(text: str) -> LanguagePerturbation:
-    return LanguagePerturbation(component="paraphrase", level=1, text=text)
 
 
 def _task_of(one: Found) -> Task | None:

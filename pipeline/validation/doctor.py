@@ -67,7 +67,7 @@ def check(config: Config, need_gb: float) -> list[Diagnosis]:
         _ffmpeg(),
         _assets(),
         _starter_demos() if demos.root is None else _hdf5_demos(demos, demos.root),
-        _test_set(),
+        _download("test set", benchmark.FOLDER / benchmark.WHEEL, _has_pip(), "pip", "fail"),
         *_further_sources(),
         _disk(config.data, need_gb),
         _machine(config.compute),
@@ -211,10 +211,6 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
         short = f"{detail}; {len(few)} tasks have fewer than {wanted}, such as {few[0]} with {counts[few[0]]}"
         return Diagnosis("demos", "warn", short, "the run makes fewer episodes of these: add their files")
     return Diagnosis("demos", "ok", detail)
-
-
-def _test_set() -> Diagnosis:
-    return _download("test set", benchmark.FOLDER / benchmark.WHEEL, _has_pip(), "pip", "fail")
 
 
 def _further_sources() -> Iterator[Diagnosis]:
