@@ -111,8 +111,8 @@ def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Samples | No
     if not any(episode.instructions) or len(episode.action) < CHUNK:
         return None
     action = normalise(open_is_one(episode.action), statistics["action"])
-    end_effector, fingers = episode.state[:, :6], episode.state[:, -2:]
-    proprio = normalise(np.concatenate((end_effector, fingers), axis=1), statistics["proprio"])
+    # OFT splits the state into end effector and fingers, and joins them again.
+    proprio = normalise(episode.state, statistics["proprio"])
     chunks = sliding_window_view(action, CHUNK, axis=0).swapaxes(1, 2)
     samples = len(chunks)
     return Samples(
