@@ -74,8 +74,8 @@ def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **optio
         field = model.model_fields[name]
         kind, default = field.annotation, field.default
         how: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
-        if get_origin(kind) is tuple:
-            how["nargs"] = "+"
+        if isinstance(default, tuple):
+            how["nargs"], default = "+", " ".join(default)
         if get_origin(kind) is Literal:
             how["choices"] = get_args(kind)
         else:
