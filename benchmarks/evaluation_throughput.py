@@ -6,7 +6,7 @@ A model server replays demonstrations for all of them. The same episodes, each t
 it starts, which is in one process, and by one of its shards on each core; by ours in one process, by one on each
 core, which is how it starts, and so with answers in chunks of eight, where it looks once in eight steps. Imports,
 environments and results are counted. The last line is the result as JSON: wall and CPU seconds, without those of the
-server. `benchmarks/evaluation_speed.py` says where one process spends them.
+server.
 """
 
 from __future__ import annotations

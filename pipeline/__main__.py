@@ -51,7 +51,7 @@ def main() -> int:
     def run() -> int:
         arguments = parser().parse_args()
         try:
-            return int(arguments.run(arguments))
+            return int(arguments.run(arguments) or 0)
         except BrokenPipeError:
             # Who reads the output, such as `head`, has enough. Nothing must be written to it when Python ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

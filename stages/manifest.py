@@ -2,8 +2,8 @@
 
 from pipeline.config import Config
 from pipeline.files import write_json
-from pipeline.formats import motion_statistics, registry
-from pipeline.formats.rlds_layout import by_suite
+from pipeline.formats import exact_statistics, registry
+from pipeline.formats.episodes import by_suite
 from pipeline.run import counts, manifest, outcome
 from pipeline.run.stage import main
 from pipeline.stores.frame_store import FrameStore
@@ -21,11 +21,11 @@ def run(config: Config) -> None:
 
     frames, row_of = FrameStore(data / "frames", config.render), episodes.row_of
     motions = {name: frames.motion(name) for name in {row_of[episode].trajectory_id for episode in episodes.kept}}
-    suites = {episode: row.suite for episode, row in row_of.items()}
+    suites = {episode: row_of[episode].suite for episode in episodes.kept}
     name = (config.export.rlds or config.export).name
     figures = {
-        name: motion_statistics.openvla([motions[row_of[episode].trajectory_id] for episode in members])
-        for name, members in by_suite(episodes.kept, suites, name).items()
+        name: exact_statistics.openvla([motions[row_of[episode].trajectory_id] for episode in members])
+        for name, members in by_suite(suites, name).items()
     }
     write_json(data / "dataset_statistics.json", figures)
     write_json(data / "counts.json", counts.by_axis_and_suite(table.to_pylist()))

@@ -9,8 +9,7 @@ from pipeline.config import Config
 from pipeline.files import read_json
 from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
-from pipeline.run.outcome import rejections
-from pipeline.run.remake import outdated
+from pipeline.run.outcome import outdated, rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
 from pipeline.run.stage import main

@@ -5,7 +5,7 @@ from pipeline.config import Config
 from pipeline.files import write_json
 from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
-from pipeline.run.remake import outdated
+from pipeline.run.outcome import outdated
 from pipeline.run.replay_stage import Replays
 from pipeline.run.stage import main
 from pipeline.stores.trajectory_store import TrajectoryStore

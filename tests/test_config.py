@@ -13,7 +13,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
-from pipeline.commands.develop import config_schema, schemas
+from pipeline.commands.develop import schemas
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.export_config import Where
@@ -36,7 +36,7 @@ def changed(path: Path, value: Any, *keys: str) -> Path:
 @pytest.mark.parametrize("file", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda file: file.stem)
 def test_every_config_is_valid_and_named_after_its_file(file: Path) -> None:
     assert load(file).name == file.stem
-    jsonschema.validate(yaml.safe_load(file.read_text()), config_schema())
+    jsonschema.validate(yaml.safe_load(file.read_text()), schemas()["config.schema.json"])
 
 
 @pytest.mark.parametrize("name", ["config.schema.json", "manifest.json"])
@@ -131,7 +131,7 @@ THREE_LINES = "name: mine\nplan:\n  episodes: {camera: 40, camera+language: 8}\n
 def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text(THREE_LINES)
-    jsonschema.validate(yaml.safe_load(THREE_LINES), config_schema())
+    jsonschema.validate(yaml.safe_load(THREE_LINES), schemas()["config.schema.json"])
     config = load(file)
     assert config.data == Path("data/mine")
     assert {name for name, axis in config.plan.axes if axis} == {"camera", "language"}

@@ -19,18 +19,18 @@ READ = """
 import json
 from pathlib import Path
 import pipeline
-from pipeline.commands.develop import config_schema
+from pipeline.commands.develop import schemas
 from pipeline.axes.language import load_bank
 from pipeline.catalogue.objects import models
 from pipeline.episode_schema import SCHEMA, SCHEMA_FILE
 from pipeline.files import schema_file
-from pipeline.clients import recipe
+from pipeline.clients.recipe import TEMPLATES
 from pipeline.publish import card
 from pipeline.run import manifest
 
 assert SCHEMA.fps_hz == 20 and manifest.schema().names and load_bank() and models(("libero",))
-assert json.loads(schema_file("config.schema.json").read_text()) == config_schema()
-for file in (pipeline.__file__, SCHEMA_FILE, recipe.SCHEMA_FILE):
+assert json.loads(schema_file("config.schema.json").read_text()) == schemas()["config.schema.json"]
+for file in (pipeline.__file__, SCHEMA_FILE, TEMPLATES / "run_openvla_oft.py"):
     print(Path(file).is_file(), file)
 """
 

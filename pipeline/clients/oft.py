@@ -19,7 +19,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
-from pipeline.formats import motion_statistics
+from pipeline.formats.exact_statistics import open_is_one
 from pipeline.formats.tfrecord import METADATA, columns, records
 
 CHUNK = 8
@@ -93,7 +93,13 @@ def read(folder: Path) -> Iterator[Recorded]:
         for index, record in enumerate(records(shard)):
             stored = columns(record, features)
             try:
-                yield _recorded(stored)
+                yield Recorded(
+                    name=stored[f"{METADATA}episode_id"][0].decode(),
+                    action=stored["action"],
+                    state=stored["observation/state"],
+                    frames={view: stored[f"observation/{view}"].tolist() for view in VIEWS.values()},
+                    instructions=[text.decode() for text in stored["language_instruction"]],
+                )
             except KeyError as error:
                 raise PipelineError(
                     f"record {index} has no feature {error}", where=shard, expected="the feature tree of OpenVLA's sets"
@@ -104,9 +110,9 @@ def trajectory(episode: Recorded, statistics: Mapping[str, Any]) -> Samples | No
     """What OFT trains on, or None where it passes the episode by: no instruction, or fewer than 8 steps."""
     if not any(episode.instructions) or len(episode.action) < CHUNK:
         return None
-    action = normalise(motion_statistics.open_is_one(episode.action), statistics["action"])
-    end_effector, fingers = episode.state[:, :6], episode.state[:, -2:]
-    proprio = normalise(np.concatenate((end_effector, fingers), axis=1), statistics["proprio"])
+    action = normalise(open_is_one(episode.action), statistics["action"])
+    # OFT splits the state into end effector and fingers, and joins them again.
+    proprio = normalise(episode.state, statistics["proprio"])
     chunks = sliding_window_view(action, CHUNK, axis=0).swapaxes(1, 2)
     samples = len(chunks)
     return Samples(
@@ -126,13 +132,3 @@ def normalise(values: NDArray[np.float32], figures: Mapping[str, Any]) -> NDArra
     mask = np.asarray(figures.get("mask", [True] * values.shape[1]))
     scaled = np.clip(2 * (values - low) / (high - low + 1e-8) - 1, -1, 1)
     return np.where(smallest == largest, 0.0, np.where(mask, scaled, values)).astype(np.float32)
-
-
-def _recorded(stored: Mapping[str, NDArray[Any]]) -> Recorded:
-    return Recorded(
-        name=stored[f"{METADATA}episode_id"][0].decode(),
-        action=stored["action"],
-        state=stored["observation/state"],
-        frames={view: stored[f"observation/{view}"].tolist() for view in VIEWS.values()},
-        instructions=[text.decode() for text in stored["language_instruction"]],
-    )

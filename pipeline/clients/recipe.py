@@ -8,19 +8,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import numpy as np
 import pyarrow.parquet as pq
 import yaml
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
-from pipeline.export_config import ExportConfig, LeRobotV21Config, known_to_oft
-from pipeline.files import checksum, replaced, schema_file
-from pipeline.formats import motion_statistics
+from pipeline.export_config import ExportConfig, LeRobotV21Config
+from pipeline.files import checksum, replaced
+from pipeline.formats import exact_statistics
 from pipeline.formats.rlds_layout import dataset_of
 
-SCHEMA_FILE = schema_file("finetune.json")
 TEMPLATES = Path(__file__).parent / "templates"
 COPIED = ("run_openvla_oft.py",)
 
@@ -87,22 +84,10 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
     Args:
         manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
             episode, its place in each format, and the versions and the device that made it.
-        rows: its rows.
         export: the datasets that the run asks for; OpenVLA-OFT calls all of RLDS by the name there.
-
-    Raises:
-        PipelineError: when nothing was kept, or OFT would take the name for another robot's.
     """
     name = export.rlds.name if export.rlds else None
-    if name is not None and not known_to_oft(name):
-        raise PipelineError(
-            f"{name} would be read with another robot's constants and cameras by OpenVLA-OFT, which goes by the name",
-            where="export.rlds.name",
-            expected="a name with libero and without aloha in it",
-        )
     kept = [row for row in rows if row["kept"]]
-    if not kept:
-        raise PipelineError("no episode was kept", where=manifest_file, remedy="read its column reason")
     counts: dict[str, dict[str, int]] = {}
     for row in kept:
         by_axis = counts.setdefault(row["suite"], {})
@@ -122,18 +107,14 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
         )
     if export.lerobot is not None:
         dataset["lerobot"] = sourced(export.lerobot.name, "the run's configuration, export.lerobot.name")
-    recipe = {"name": export.name, "dataset": dataset, "training": TRAINING, "clients": _clients(export)}
-    check(recipe, manifest_file)
-    return recipe
+    return {"name": export.name, "dataset": dataset, "training": TRAINING, "clients": _clients(export)}
 
 
 def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
     """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``finetune``.
 
     Args:
-        recipe: what ``build`` returned.
         data: the run's folder; the scripts look for ``rlds`` beside theirs.
-        export: the datasets that the run asks for.
     """
     wanted = export.lerobot_v21
     with replaced(data / "finetune") as unfinished:
@@ -147,27 +128,12 @@ def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
             table = pq.read_table(data / "lerobot_v21" / wanted.name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
             (unfinished / OPENPI_ASSETS).parent.mkdir(parents=True)
-            content = json.dumps(motion_statistics.openpi(actions, states), indent=1) + "\n"
+            content = json.dumps(exact_statistics.openpi(actions, states), indent=1) + "\n"
             (unfinished / OPENPI_ASSETS).write_text(content)
         if wanted is not None and wanted.convention == "ipec":
             roots = sorted(path.name for path in (data / "lerobot_v21").iterdir() if not path.name.endswith("_val"))
             mixture = "".join(f'        ("{root}", 1.0, "libero_franka"),\n' for root in roots)
             (unfinished / "starvla_data_config.py").write_text(STARVLA.format(name=wanted.name, mixture=mixture))
-
-
-def check(recipe: Mapping[str, Any], where: object) -> None:
-    """Validate a recipe.
-
-    Raises:
-        PipelineError: naming the first field that breaks ``schemas/finetune.json``.
-    """
-    validator = jsonschema.Draft202012Validator(json.loads(SCHEMA_FILE.read_text()))
-    if error := jsonschema.exceptions.best_match(validator.iter_errors(recipe)):
-        raise PipelineError(
-            f"{'.'.join(map(str, error.path)) or 'top level'}: {error.message}",
-            where=where,
-            expected="what schemas/finetune.json says",
-        )
 
 
 class _Dumper(yaml.SafeDumper):

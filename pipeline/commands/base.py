@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from pipeline.errors import PipelineError
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
     from pipeline.config import Config
 
 PARAMS = Path("params.yaml")
@@ -18,12 +21,7 @@ Fill = Callable[[argparse.ArgumentParser], None]
 
 
 class LazyParser(argparse.ArgumentParser):
-    """Gets its arguments when it is first asked to parse, as what they may be can take long to import.
-
-    Attributes:
-        summary: what the command does, in a line.
-        fill: adds the arguments.
-    """
+    """Gets its arguments when it is first asked to parse, as what they may be can take long to import."""
 
     summary: str = ""
     fill: Fill | None = None
@@ -35,24 +33,18 @@ class LazyParser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
 
-def add(commands: Any, run: Callable[[argparse.Namespace], int], fill: Fill, name: str | None = None) -> LazyParser:
-    """Add a command.
+def add(commands: Any, run: Callable[[argparse.Namespace], int | None], fill: Fill) -> None:
+    """Add a command of a function's name, whose docstring says what it does, in its first line and in more.
 
     Args:
-        commands: what ``add_subparsers`` returned.
-        run: does it; the first line of its docstring says what, and the rest more.
-        fill: adds its arguments.
-        name: as it is called; the function's when left out.
+        run: does it; returns the exit status, or nothing for 0.
     """
-    described, _, details = (run.__doc__ or "").partition("\n\n")
-    description = f"{described[:1].upper()}{described[1:]}.\n\n{_unindented(details)}".strip()
+    described, _, details = (inspect.getdoc(run) or "").partition("\n\n")
+    description = f"{described[:1].upper()}{described[1:]}.\n\n{details}".strip()
     formatter = argparse.RawDescriptionHelpFormatter
-    command: LazyParser = commands.add_parser(
-        name or run.__name__, help=described, description=description, formatter_class=formatter
-    )
+    command = commands.add_parser(run.__name__, help=described, description=description, formatter_class=formatter)
     command.set_defaults(run=run)
     command.summary, command.fill = described, fill
-    return command
 
 
 def add_group(commands: Any, name: str, summary: str) -> Any:
@@ -62,16 +54,35 @@ def add_group(commands: Any, name: str, summary: str) -> Any:
     return group.add_subparsers(required=True, metavar="VERB")
 
 
-def _unindented(text: str) -> str:
-    return "\n".join(line.strip() for line in text.splitlines())
-
-
 def positive(text: str) -> int:
     """Type of an argument that is a number from 1 on."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"{number} is less than 1")
     return number
+
+
+def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **options: str) -> None:
+    """Add an option for each of some fields of a model: with its type and its choices, and its docstring as help.
+
+    What is left out has no attribute, so that the model's default holds.
+
+    Args:
+        options: field to option.
+    """
+    for name, option in options.items():
+        field = model.model_fields[name]
+        kind, default = field.annotation, field.default
+        how: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS}
+        if isinstance(default, tuple):
+            how["nargs"], default = "+", " ".join(default)
+        if get_origin(kind) is Literal:
+            how["choices"] = get_args(kind)
+        else:
+            kind = next(iter(get_args(kind)), kind)
+            how |= {"type": positive if field.metadata else kind, "metavar": option.strip("-").upper()}
+        told = f" (default: {default})" if default not in (None, "", ()) else ""
+        command.add_argument(option, help=f"{field.description}{told}".replace("\n", " ").replace("``", ""), **how)
 
 
 def add_config(command: argparse.ArgumentParser) -> None:

@@ -31,7 +31,7 @@ def doctor(arguments: argparse.Namespace) -> int:
     return doctor.run(loaded(arguments))
 
 
-def axes(arguments: argparse.Namespace) -> int:
+def axes(arguments: argparse.Namespace) -> None:
     """list the axes of perturbation, their components and what of an episode each makes anew"""
     from rich.console import Console
     from rich.table import Table
@@ -45,7 +45,6 @@ def axes(arguments: argparse.Namespace) -> int:
         table.add_row(axis, ", ".join(components_of(axis)), kind.layer.name.lower(), views)
     Console(highlight=False).print(table)
     print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` shows what an axis does.")
-    return 0
 
 
 def _tasks_arguments(command: argparse.ArgumentParser) -> None:
@@ -54,13 +53,12 @@ def _tasks_arguments(command: argparse.ArgumentParser) -> None:
     )
 
 
-def tasks(arguments: argparse.Namespace) -> int:
+def tasks(arguments: argparse.Namespace) -> None:
     """list LIBERO's tasks, as demos.tasks names them, with their instructions"""
     from pipeline.libero.tasks import select_tasks
 
     for task in select_tasks(arguments.patterns):
         print(f"{task.suite}/{task.name}\t{task.instruction}")
-    return 0
 
 
 def _preview_arguments(command: argparse.ArgumentParser) -> None:
@@ -73,7 +71,7 @@ def _preview_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", type=Path, default=Path("sheet.png"), help="picture to write (default: sheet.png)")
 
 
-def preview(arguments: argparse.Namespace) -> int:
+def preview(arguments: argparse.Namespace) -> None:
     """render what an axis does to a task: its first frame, and eleven draws over the components and levels
 
     With `all`, one strong draw of each axis beside the clean twin. A name that ends in .jpg gives JPEG, else PNG.
@@ -97,15 +95,18 @@ def preview(arguments: argparse.Namespace) -> int:
         picture.save(temporary, format="JPEG" if arguments.out.suffix == ".jpg" else "PNG", quality=90)
         of = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
         print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")
-    return 0
 
 
-def sources(arguments: argparse.Namespace) -> int:
-    """fetch and convert the textures and objects that a configuration names, as its plan would, and count them"""
-    from pipeline.publish import attribution
+def sources(arguments: argparse.Namespace) -> None:
+    """fetch and convert the textures and objects that a configuration names, as its plan would, and count them
 
-    print(json.dumps(attribution.counts(loaded(arguments).plan.axes)))
-    return 0
+    An axis that is not configured counts with its default sources.
+    """
+    from pipeline.axes import AXES
+
+    drawn = loaded(arguments).plan.axes.drawn()
+    offered = [(drawn.get(name) or axis()).offered() for name, axis in AXES.items()]
+    print(json.dumps({kind: number for of_axis in offered for kind, number in of_axis.items()}))
 
 
 def _rewrite_arguments(command: argparse.ArgumentParser) -> None:
@@ -123,7 +124,7 @@ def _rewrite_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--model", required=True, metavar="NAME", help="name of the model at the endpoint")
 
 
-def rewrite(arguments: argparse.Namespace) -> int:
+def rewrite(arguments: argparse.Namespace) -> None:
     """have a language model reword a task's instruction, lint what it says, and add it to a bank of rewrites
 
     Asks an OpenAI-compatible endpoint for rewrites of each class (distraction, common sense, reasoning chain,
@@ -135,4 +136,3 @@ def rewrite(arguments: argparse.Namespace) -> int:
 
     extend(arguments.bddl_file, arguments.out, arguments.per_class, LanguageModel(arguments.endpoint, arguments.model))
     print(f"{arguments.out} holds {arguments.per_class} rewrites of each class for {arguments.bddl_file.stem}")
-    return 0

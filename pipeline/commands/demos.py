@@ -30,13 +30,12 @@ def _fetch_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--endpoint", metavar="URL", help="address of a mirror of the hub")
 
 
-def fetch(arguments: argparse.Namespace) -> int:
+def fetch(arguments: argparse.Namespace) -> None:
     """download LIBERO's demonstrations (HDF5) from the hub, or go on with a download that was cut short"""
     from pipeline.libero.fetch import fetch
 
     files = fetch(arguments.out, arguments.suites, arguments.endpoint)
     print(f"{len(files)} files are in {arguments.out}: write `demos: {{root: {arguments.out}}}` into a configuration")
-    return 0
 
 
 def _expand_arguments(command: argparse.ArgumentParser) -> None:
@@ -63,7 +62,7 @@ def _expand_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
 
 
-def expand(arguments: argparse.Namespace) -> int:
+def expand(arguments: argparse.Namespace) -> None:
     """make many demonstrations of each task from the starter set's one, where the hub cannot be reached
 
     Replays each human demonstration from other starts and writes those that reach the goal in LIBERO's own HDF5 layout
@@ -87,7 +86,6 @@ def expand(arguments: argparse.Namespace) -> int:
         "configuration"
     )
     print(json.dumps({"written": made.written, "dropped": dict(made.dropped.most_common()), "short": made.short}))
-    return 0
 
 
 def _check_arguments(command: argparse.ArgumentParser) -> None:

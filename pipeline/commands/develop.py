@@ -19,19 +19,14 @@ def add_commands(commands: Any) -> None:
 
 def schemas() -> dict[str, dict[str, Any]]:
     """The files of ``schemas/`` that are written from the code."""
+    from pipeline.config import Config
     from pipeline.run import manifest
 
-    return {"config.schema.json": config_schema(), "manifest.json": manifest.described()}
+    config = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
+    return {"config.schema.json": config, "manifest.json": manifest.described()}
 
 
-def config_schema() -> dict[str, Any]:
-    """JSON Schema of the files in ``configs/``."""
-    from pipeline.config import Config
-
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
-
-
-def schema(arguments: argparse.Namespace) -> int:
+def schema(arguments: argparse.Namespace) -> None:
     """write the files of schemas/ that follow from the code"""
     from pipeline.files import replaced
 
@@ -39,4 +34,3 @@ def schema(arguments: argparse.Namespace) -> int:
         with replaced(SCHEMAS / name) as temporary:
             temporary.write_text(json.dumps(content, indent=2) + "\n")
         print(f"wrote {SCHEMAS / name}")
-    return 0

@@ -7,7 +7,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.commands.base import add, add_config, add_group, owned, plan_of, positive
+from pipeline.commands.base import add, add_config, add_fields, add_group, owned, plan_of, positive
+from pipeline.errors import PipelineError
 from pipeline.files import write_json
 
 TITLE = "evaluate policies"
@@ -27,9 +28,12 @@ def add_commands(commands: Any) -> None:
 
 
 def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
-    command.argument_default = argparse.SUPPRESS  # of what is left out, the defaults are those of the models' fields
-    add = command.add_argument
-    add("out", type=Path, metavar="DIR", help="folder of the results")
+    from pipeline.evaluation.environment import EpisodeSettings
+    from pipeline.evaluation.rollout import PolicyConfig
+    from pipeline.evaluation.selection import Selection
+
+    command.argument_default = argparse.SUPPRESS
+    command.add_argument("out", type=Path, metavar="DIR", help="folder of the results")
     acting = command.add_mutually_exclusive_group(required=True)
     acting.add_argument("--server", metavar="URL", help="address of a model server, such as ws://localhost:8000")
     acting.add_argument("--checkpoint", type=Path, metavar="DIR", help="a policy that lerobot saved")
@@ -41,103 +45,27 @@ def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
         help="the demonstrations, as a check: their own actions (open_loop, as without a value), or their paths, "
         "followed by feedback (tracked)",
     )
-    _add_selection(command)
-    _add_settings(command)
-    add(
-        "--label",
-        metavar="NAME",
-        help="name of the policy in the results; a server must have one, another for each policy (default of a "
-        "checkpoint: its folder and a part of the hash of its content)",
-    )
-    add(
-        "--assets",
-        dest="archive",
-        type=Path,
-        metavar="DIR",
-        help="LIBERO-Plus's unpacked asset archive, which its light, layout and most of its background tasks need",
-    )
-    add(
-        "--timeout",
-        dest="timeout_s",
-        type=positive,
-        metavar="S",
-        help="seconds that a server's answer may take (default: 120)",
-    )
-    add("--workers", type=positive, default=0, metavar="N", help="processes (default: one for each core)")
-    add("--videos", choices=("none", "failures", "all"), help="of which episodes to keep a video (default: none)")
-
-
-def _add_selection(command: argparse.ArgumentParser) -> None:
-    """Fields of ``Selection``."""
-    add = command.add_argument
-    add(
-        "--source",
-        choices=("libero", "libero_plus", "own", "pairs", "goals"),
-        help="of the tasks (default: libero)",
-    )
-    add(
-        "--tasks-from",
-        dest="file",
-        type=Path,
-        metavar="FILE",
-        help="in place of a source, a list that `analyse construct` wrote",
-    )
-    add("--suite", dest="suites", nargs="+", metavar="SUITE", help="of these suites only")
-    add("--axis", dest="axes", nargs="+", metavar="AXIS", help="of these axes only")
-    add("--component", dest="components", nargs="+", metavar="NAME", help="of these components only")
-    add("--level", dest="levels", nargs="+", type=int, metavar="N", help="of these levels only")
-    add("--task", dest="tasks", nargs="+", metavar="PATTERN", help="named so, or perturbing one so named")
-    add("--subset", type=positive, metavar="N", help="so many, spread evenly over all of these")
-    add(
-        "--episodes",
-        type=positive,
-        metavar="N",
-        help="initial states, of which LIBERO has 50, or draws of each task (default: 1)",
-    )
-    add("--seed", type=int, help="of the subset and of every draw (default: 0)")
-
-
-def _add_settings(command: argparse.ArgumentParser) -> None:
-    """Fields of ``EpisodeSettings``, but the seed, which is the selection's."""
-    add = command.add_argument
-    add(
+    named = {"suites": "--suite", "axes": "--axis", "components": "--component", "levels": "--level", "tasks": "--task"}
+    add_fields(command, Selection, source="--source", file="--tasks-from", **named, subset="--subset")
+    add_fields(command, Selection, episodes="--episodes", seed="--seed")
+    command.add_argument(
         "--trained-on",
         dest="plan",
         type=plan_of,
         metavar="CONFIG",
         help="draw held-out draws anew that overlap with the plan of this run, whose data the policy was trained on",
     )
-    add(
-        "--prompt",
-        choices=("clean", "benchmark", "blank"),
-        help="word test tasks by LIBERO's instruction (default), or as the benchmark's code does, by the file's name; "
-        "or say nothing at all",
+    add_fields(command, EpisodeSettings, prompt="--prompt", step_limits="--step-limits", black="--black")
+    add_fields(command, EpisodeSettings, initial_states="--initial-states", look_every="--look-every")
+    add_fields(command, PolicyConfig, label="--label", timeout_s="--timeout")
+    command.add_argument(
+        "--assets", dest="archive", type=Path, metavar="DIR", help="folder of LIBERO-Plus's unpacked asset archive"
     )
-    add(
-        "--step-limits",
-        choices=("openvla", "lerobot"),
-        help="whose: they differ in libero_spatial, 220 (openvla, default) and 280 (lerobot)",
-    )
-    add(
-        "--black",
-        choices=("none", "agentview", "all"),
-        help="show the policy black frames in place of the agent view, or of all views (default: none)",
-    )
-    add(
-        "--initial-states",
-        choices=("libero", "demonstration"),
-        help="LIBERO's own (default), or the first state of the starter set's demonstration",
-    )
-    add(
-        "--look-every",
-        type=positive,
-        metavar="N",
-        help="a server that keeps its chunk of actions to itself takes N of each: it is shown the scene once in N "
-        "control steps (default: 1)",
-    )
+    command.add_argument("--videos", choices=("none", "failures", "all"), help="which episodes to film (default: none)")
+    command.add_argument("--workers", type=positive, default=0, metavar="N", help="processes (default: one a core)")
 
 
-def evaluate(arguments: argparse.Namespace) -> int:
+def evaluate(arguments: argparse.Namespace) -> None:
     """run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes
 
     Writes one file for each episode, and summary.json with success rates and their 95 % intervals. Run again after a
@@ -166,7 +94,6 @@ def evaluate(arguments: argparse.Namespace) -> int:
     with runner(compute, arguments.out, gl.WorkerSetup) as run:
         found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
-    return 0
 
 
 def _report_arguments(command: argparse.ArgumentParser) -> None:
@@ -187,7 +114,7 @@ def _report_arguments(command: argparse.ArgumentParser) -> None:
     )
 
 
-def report(arguments: argparse.Namespace) -> int:
+def report(arguments: argparse.Namespace) -> None:
     """write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures
 
     Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
@@ -198,31 +125,34 @@ def report(arguments: argparse.Namespace) -> int:
     from pipeline.report import evaluation_report
 
     print(json.dumps(evaluation_report.write(read(arguments.folders, arguments.across), arguments.out)))
-    return 0
 
 
-def coverage(arguments: argparse.Namespace) -> int:
+def coverage(arguments: argparse.Namespace) -> None:
     """set what a policy sees in a finished run beside what it sees in the benchmark's test tasks
 
     First looks, how far the hand and the targets are moved, where objects are added, how much of a view changes, grey
     levels and words, axis by axis. The last line is JSON: number, tenth, fiftieth and ninetieth percentile of each.
     """
     from rich.console import Console
+    from rich.table import Table
 
     from pipeline.report import seen
     from pipeline.testset import benchmark
 
     measures = seen.measure(owned(arguments), benchmark.load())
-    Console().print(seen.table(measures))
+    table = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
+    table.caption = "A run adds each number of objects equally often, unless it is configured otherwise."
+    for one in measures:
+        table.add_row(one.axis, one.what, *("-" if of is None else str(of) for of in (one.tested, one.ours)))
+    Console().print(table)
     print(json.dumps({f"{one.axis}: {one.what}": {"tests": one.tested, "run": one.ours} for one in measures}))
-    return 0
 
 
 def _gap_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
 
 
-def gap(arguments: argparse.Namespace) -> int:
+def gap(arguments: argparse.Namespace) -> None:
     """compositional gap of the pairs that were run with --source pairs: gap.json and gap.png in their folder"""
     from pipeline.evaluation import composition
     from pipeline.evaluation.results import stored
@@ -232,7 +162,6 @@ def gap(arguments: argparse.Namespace) -> int:
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
     write_json(arguments.results / "gap.json", figures)
     print(json.dumps(figures))
-    return 0
 
 
 def _construct_arguments(command: argparse.ArgumentParser) -> None:
@@ -249,7 +178,7 @@ def _construct_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--seed", type=int, default=0, help="of all draws (default: 0)")
 
 
-def construct(arguments: argparse.Namespace) -> int:
+def construct(arguments: argparse.Namespace) -> None:
     """draw 14,000 candidates of held-out draws, filter and balance them to a benchmark
 
     The file is for `evaluate --tasks-from`. Which scenes refuse their draw is known once candidates were run: give
@@ -268,7 +197,6 @@ def construct(arguments: argparse.Namespace) -> int:
     )
     write_tasks(chosen, arguments.seed, arguments.out)
     print(json.dumps(counts))
-    return 0
 
 
 def _grade_arguments(command: argparse.ArgumentParser) -> None:
@@ -276,9 +204,8 @@ def _grade_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks with their difficulty")
 
 
-def grade(arguments: argparse.Namespace) -> int:
+def grade(arguments: argparse.Namespace) -> None:
     """levels of difficulty, 1 to 5, by how many of several models solve a task"""
-    from pipeline.errors import PipelineError
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.statistics import grade
     from pipeline.evaluation.tasks import write_tasks
@@ -291,7 +218,6 @@ def grade(arguments: argparse.Namespace) -> int:
     write_tasks(graded, seed, arguments.out)
     by_level = {level: sum(task["difficulty"] == level for task in graded) for level in range(1, 6)}
     print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
-    return 0
 
 
 def _leakage_arguments(command: argparse.ArgumentParser) -> None:
@@ -302,7 +228,6 @@ def _leakage_arguments(command: argparse.ArgumentParser) -> None:
 def leakage(arguments: argparse.Namespace) -> int:
     """how close the held-out draws of results come to the plan of a run; ends with 1 where they overlap"""
     from pipeline.axes import from_json
-    from pipeline.errors import PipelineError
     from pipeline.evaluation import own_draws
     from pipeline.evaluation.results import stored
     from pipeline.libero.tasks import find_task

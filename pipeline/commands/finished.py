@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.commands.base import add, add_config, owned
+from pipeline.errors import PipelineError
 
 TITLE = "a finished run"
 
@@ -116,16 +117,15 @@ def _push_arguments(command: argparse.ArgumentParser) -> None:
     add_config(command)
     command.add_argument("--really", action="store_true", help="send it")
     command.add_argument("--private", action="store_true", help="make a new repository private")
-    command.add_argument("--endpoint", metavar="URL", help="address of the hub, when not the usual one")
 
 
-def push(arguments: argparse.Namespace) -> int:
+def push(arguments: argparse.Namespace) -> None:
     """upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go
 
     Sends one of the datasets of a finished and validated run: its files, the card, the manifest and the recipe, in
-    one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`.
+    one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`, the address of
+    another hub from HF_ENDPOINT.
     """
-    from pipeline.errors import PipelineError
     from pipeline.formats.registry import formats_of
 
     config = owned(arguments)
@@ -142,6 +142,5 @@ def push(arguments: argparse.Namespace) -> int:
     print(upload.summary())
     if not arguments.really:
         print(f"nothing was sent: with --really this goes to {arguments.repository}")
-        return 0
-    print(push.send(upload, arguments.repository, private=arguments.private, endpoint=arguments.endpoint))
-    return 0
+        return
+    print(push.send(upload, arguments.repository, private=arguments.private))

@@ -7,6 +7,7 @@ import sys
 from typing import Any
 
 from pipeline.commands.base import add, add_config, config_file, owned
+from pipeline.errors import PipelineError
 
 TITLE = "make datasets"
 
@@ -28,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     return repro.run(config_file(arguments))
 
 
-def status(arguments: argparse.Namespace) -> int:
+def status(arguments: argparse.Namespace) -> None:
     """say how many episodes are wanted and kept, what would run and why, and what disk it takes; changes nothing"""
     from rich.console import Console
 
@@ -38,7 +39,6 @@ def status(arguments: argparse.Namespace) -> int:
     console = Console(soft_wrap=True, highlight=False)
     for part in status.told(config):
         console.print(part)
-    return 0
 
 
 def _clean_arguments(command: argparse.ArgumentParser) -> None:
@@ -51,19 +51,18 @@ def _clean_arguments(command: argparse.ArgumentParser) -> None:
     command.add_argument("--yes", action="store_true", help="do not ask")
 
 
-def clean(arguments: argparse.Namespace) -> int:
+def clean(arguments: argparse.Namespace) -> None:
     """delete what can be made again of a run, after it was listed with its sizes and you said yes
 
     Other files in the run's folder stay. Demonstrations, configurations and downloads are not touched.
     """
-    from pipeline.errors import PipelineError
     from pipeline.run import cleaning
 
     config = owned(arguments)
     found = cleaning.found(config.data, arguments.only or tuple(cleaning.PARTS))
     if not found:
         print(f"{config.data} has nothing of this")
-        return 0
+        return
     for part, size_mb in found.items():
         print(f"{size_mb:10.1f} MB  {part:<13} made again by {cleaning.PARTS[part].made_by}")
     print(f"{sum(found.values()):10.1f} MB  in all, of {config.data}")
@@ -72,7 +71,6 @@ def clean(arguments: argparse.Namespace) -> int:
             raise PipelineError("nothing was deleted, as nobody can be asked here", remedy="add --yes")
         if input("Delete all of this? [y/N] ").strip().lower() not in ("y", "yes"):
             print("nothing was deleted")
-            return 0
+            return
     cleaning.delete(config.data, list(found))
     print("deleted")
-    return 0

@@ -41,9 +41,7 @@ class Pair:
     """Two axes, and the successes of their four combinations.
 
     Attributes:
-        one, other: the axes.
         trials: episodes of each combination, on the same tasks, initial states and draws.
-        neither, only_one, only_other, both: successes.
         interval: of the gap, by bootstrap over trials; None where only the counts are known.
     """
 

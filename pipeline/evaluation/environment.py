@@ -36,35 +36,33 @@ LEROBOT_SPATIAL = 280
 """lerobot's limit of ``libero_spatial``; its others are those of OpenVLA (``lerobot/envs/libero.py``, 0.6.1)."""
 
 
-class EpisodeSettings(Frozen):
-    """What holds for all episodes of an evaluation.
-
-    Attributes:
-        prompt: the wording of test tasks; ``blank`` says nothing in any task.
-        black: which views are black, to see what a policy does without them.
-        seed: of held-out draws and of noise that is random.
-        fixture_seed: of LIBERO's reset, to which the number of the initial state is added. 0 is what OpenVLA uses.
-        initial_states: ``libero`` for the states that LIBERO evaluates from, ``demonstration`` for the one that the
-            starter set's demonstration of the task begins in, without settling, as when it is replayed for a dataset.
-            Test tasks have a state of their own in both, and ``goals`` begin in LIBERO's.
-        plan: a plan that held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name
-            it by the SHA-256 of its file.
-        look_every: see ``NextLook``; of model servers alone.
-        step_limits: whose.
-        runner: what asks the policy. ``lerobot-eval`` has its own batches and random numbers, so what one policy does
-            there and in ``evaluate`` need not be the same.
-    """
+class EpisodeSettings(Frozen, use_attribute_docstrings=True):
+    """What holds for all episodes of an evaluation."""
 
     prompt: Prompt = "clean"
+    """wording of test tasks: LIBERO's instruction, or as the benchmark's code has it, the file's name; ``blank`` says
+    nothing in any task"""
     seed: int = 0
+    """of held-out draws and of noise that is random"""
     fixture_seed: int = 0
+    """of LIBERO's reset, to which the number of the initial state is added; 0 is what OpenVLA uses"""
     initial_states: Literal["libero", "demonstration"] = "libero"
+    """those that LIBERO evaluates from, or the one that the starter set's demonstration of the task begins in, without
+    settling, as when it is replayed for a dataset; test tasks have a state of their own, and goals begin in LIBERO's"""
     # What came later is left out where it is not used, so that results keep their names.
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
+    """which views are black, to see what a policy does without them"""
     plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
+    """which held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name it by the
+    SHA-256 of its file."""
     look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
+    """a server that keeps its chunk of actions to itself takes so many of each: it is shown the scene once in so many
+    control steps"""
     step_limits: Literal["openvla", "lerobot"] = Field(default="openvla", exclude_if=lambda whose: whose == "openvla")
+    """whose: they differ in libero_spatial, 220 (openvla) and 280 (lerobot)"""
     runner: Literal["pipeline", "lerobot-eval"] = Field(default="pipeline", exclude_if=lambda one: one == "pipeline")
+    """what asks the policy: lerobot-eval has its own batches and random numbers, so what one policy does there and in
+    ``evaluate`` need not be the same"""
 
     def step_limit(self, suite: str) -> int:
         """Of an episode in a suite."""
@@ -102,7 +100,7 @@ class Progress:
 class EpisodeEnvironment:
     """Runs episodes one after the other; keep one for many, ordered by task: what is built for a scene is reused.
 
-    Frames are rendered when they are asked for, and only then.
+    Frames are rendered when they are asked for, and only then; ``looks`` counts observations.
 
     Args:
         archive: folder of LIBERO-Plus's asset archive, for test tasks of light, background and layout.
@@ -111,7 +109,6 @@ class EpisodeEnvironment:
     def __init__(self, settings: EpisodeSettings = EpisodeSettings(), archive: Path | None = None):  # noqa: B008
         self.settings, self._archive = settings, archive
         self.progress = Progress()
-        self._simulator: Simulator | None = None
         self._key: tuple[str, ...] = ()
         self._picture = Picture()
 
@@ -128,6 +125,7 @@ class EpisodeEnvironment:
         self.resolved: Mapping[str, Any] = {}
         self.perturbations: tuple[Perturbation, ...] = ()
         self._seen: dict[str, Frame] = {}
+        self.looks = 0
         starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
         try:
             starts.get(task.source, self._start_libero)()
@@ -155,12 +153,12 @@ class EpisodeEnvironment:
         steps = self.progress.steps + 1
         self._seen = {}
         try:
-            self._opened.step(given)
+            self._simulator.step(given)
         except RefusedError as error:
             self.progress = Progress(steps, error.reason)
             return self.progress
         limited = "step_limit" if steps >= self.step_limit else "running"
-        self.progress = Progress(steps, "success" if self._opened.succeeded() else limited)
+        self.progress = Progress(steps, "success" if self._simulator.succeeded() else limited)
         return self.progress
 
     @property
@@ -173,12 +171,12 @@ class EpisodeEnvironment:
     @property
     def observed(self) -> Observed:
         """What LIBERO observed of the last control step."""
-        return self._opened.observed
+        return self._simulator.observed
 
     @property
     def controller(self) -> Any:
         """robosuite's controller of the arm."""
-        return self._opened.controller
+        return self._simulator.controller
 
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
@@ -192,10 +190,9 @@ class EpisodeEnvironment:
     def observation(self, wanted: Wanted) -> dict[str, Any]:
         """What a policy sees, as vla-eval names it: ``images``, ``states`` (8,) and ``task_description``."""
         views = () if not wanted.images else VIEWS if wanted.wrist else ("agentview",)
-        seen: dict[str, Any] = {
-            "images": {view: self.image(view) for view in views},
-            "task_description": self.instruction,
-        }
+        self.looks += 1
+        images = {view: self.image(view) for view in views}
+        seen: dict[str, Any] = {"images": images, "task_description": self.instruction}
         if wanted.state:
             seen["states"] = self.observed.state.copy()
             angle_rad = float(np.linalg.norm(seen["states"][3:6]))
@@ -205,15 +202,9 @@ class EpisodeEnvironment:
 
     def close(self) -> None:
         self._picture.close()
-        if self._simulator is not None:
+        if self._key:
             self._simulator.close()
-        self._simulator, self._key = None, ()
-
-    @property
-    def _opened(self) -> Simulator:
-        if self._simulator is None:
-            raise PipelineError("no episode was started", remedy="reset first")
-        return self._simulator
+        self._key = ()
 
     def _start_test_task(self) -> None:
         test = self._test
@@ -240,11 +231,7 @@ class EpisodeEnvironment:
         self._start(*self._initial_state())
 
     def _start_libero(self) -> None:
-        """Start LIBERO's own task, or held-out draws on it.
-
-        Raises:
-            RefusedError: see ``drawn_scene``.
-        """
+        """Start LIBERO's own task, or held-out draws on it."""
         self._build(self._base)
         seed, demo, recorded = self.settings.fixture_seed, StarterSource().of(self._base), True
         if self.settings.initial_states == "libero":
@@ -252,7 +239,7 @@ class EpisodeEnvironment:
             demo, recorded = replace(demo, init_state=state), False
 
         def nominal() -> Scene:
-            scene = recorded_start(demo, self._opened.place_fixtures(seed))
+            scene = recorded_start(demo, self._simulator.place_fixtures(seed))
             # A recording had the gripper open; LIBERO's reset, after which its own states are put in, leaves it without
             # a command.
             return scene if recorded else replace(scene, gripper=0.0)
@@ -266,13 +253,13 @@ class EpisodeEnvironment:
             return
         scene = scene or nominal()
         self.resolved = scene.resolved
-        self._opened.start_scene(scene)
+        self._simulator.start_scene(scene)
         self._picture.show(scene.model_xml, self.perturbations)
 
     def _start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
         """Start from a state in the model of LIBERO's own reset."""
-        self._opened.start(seed, state, posture_rad)
-        self._picture.show(self._opened.model, self.perturbations)
+        self._simulator.start(seed, state, posture_rad)
+        self._picture.show(self._simulator.model, self.perturbations)
 
     def _initial_state(self) -> tuple[int, Floats]:
         """The seed of LIBERO's reset and its initial state for the task's number."""
@@ -308,4 +295,5 @@ class EpisodeEnvironment:
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()
-            self._simulator, self._key = Simulator(task, files), key
+            self._simulator: Simulator = Simulator(task, files)
+            self._key = key

@@ -138,7 +138,6 @@ class EvaluationJob:
     """Some episodes of one scene, as they are sent to a worker.
 
     Attributes:
-        tasks: what to run, in order.
         device: what renders the evaluation, as OpenGL names it.
     """
 
@@ -198,14 +197,14 @@ class EvaluationJob:
     def _run(self, task: EvaluationTask, environment: EpisodeEnvironment, policy: Policy) -> None:
         evaluation = self.evaluation
         film: dict[int, Frame] | None = None if evaluation.videos == "none" else {}
-        looks = roll_out_policy(environment, policy, task, film)
+        roll_out_policy(environment, policy, task, film)
         progress = environment.progress
         if film is not None and progress.steps and (evaluation.videos == "all" or not progress.success):
             # The policy did not look at how it ended, which is what one wants to see of a failure.
             film[progress.steps] = environment.image("agentview")
             # Before the episode's own file: where that exists, nothing is missing.
             evaluation.files.save_video(evaluation.episode(task), mp4(list(film.values()), list(film)))
-        evaluation.save(environment, policy.wanted, looks, self.device)
+        evaluation.save(environment, policy.wanted)
 
 
 @lru_cache(maxsize=1)

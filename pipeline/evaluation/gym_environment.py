@@ -46,11 +46,8 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
 
     Args:
         tasks: all episodes, in order.
-        first: which of them is the first here.
-        stride: how many environments share them.
         size_px: height and width of the views; they are rendered in 256 x 256 and resized.
         evaluation: where the rows of episodes go, if anywhere.
-        archive: see ``EpisodeEnvironment``.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
@@ -103,8 +100,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         self._again = self._next >= len(self._tasks)
         task = self._tasks[self._next % len(self._tasks)]
         self._next += self._stride
-        self._device = gl.prepare().device
-        self._looks = 0
+        gl.prepare()
         if self._environment.reset(task).over:
             raise PipelineError(
                 "the scene refuses what was sampled", where=str(task), remedy="name others by --env.tasks"
@@ -117,7 +113,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
         seen = self._look()
         limited = progress.reason == "step_limit"
         if progress.over and self._evaluation is not None and not self._again:
-            self._evaluation.save(self._environment, Wanted(), self._looks, self._device)
+            self._evaluation.save(self._environment, Wanted())
         done = {"done": progress.over, "is_success": progress.success, "task": self.task}
         return seen, float(progress.success), progress.over and not limited, limited, done
 
@@ -130,7 +126,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
 
     def _look(self) -> Observation:
         """LIBERO's views as they are rendered, upside down, which lerobot's processor turns."""
-        self._looks += 1
+        self._environment.looks += 1
         observed, controller = self._environment.observed, self._environment.controller
         turned = {name: resized(self._environment.image(view), *self._size_px) for name, view in CAMERAS.items()}
         w, *xyz = observed.hand_wxyz

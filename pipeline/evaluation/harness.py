@@ -90,7 +90,6 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         if out is not None:
             policy = PolicyConfig(kind="server", address="of the harness", label=label)
             self._evaluation = Evaluation(episodes, policy, policy.identity(), Path(out), archive=self._archive)
-            self._device = gl.choose().device
         elif label:
             raise PipelineError(f"no folder for the rows of {label!r}", where="label", remedy="out: DIR beside it")
         self._next_look = NextLook(self._environment.settings.look_every)
@@ -105,7 +104,6 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
 
     def reset(self, task: dict[str, Any]) -> Any:
         progress = self._environment.reset(EvaluationTask.of_harness(task))
-        self._looks = 0
         if progress.over:
             self._save()
             raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
@@ -163,13 +161,12 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         self._environment.close()
 
     def _look(self) -> dict[str, Any]:
-        self._looks += 1
         self._last = self._environment.observation(self._wanted)
         return self._last
 
     def _save(self) -> None:
         if self._evaluation is not None:
-            self._evaluation.save(self._environment, self._wanted, self._looks, self._device)
+            self._evaluation.save(self._environment, self._wanted)
 
 
 class ReplayServer(ModelServer):  # type: ignore[misc]

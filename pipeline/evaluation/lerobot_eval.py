@@ -44,7 +44,6 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
 
     Attributes:
         task: suites, separated by commas; ``subset`` and ``episodes`` hold for each.
-        observation_height, observation_width: of the policy's images.
         out, label: folder for the rows of the policy, as ``evaluate`` writes them, and its name there; none by default.
         assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
     """

@@ -75,7 +75,6 @@ def drawn_scene(
     pair has the draws of its singles. They apply one after the other, as those of a plan do.
 
     Args:
-        seed: of all draws.
         demo: of the task, in the initial state that the episode begins in.
         nominal: gives the scene without any change.
         planned: what draws must keep clear of.

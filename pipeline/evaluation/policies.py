@@ -26,7 +26,6 @@ class Wanted(NamedTuple):
     """What a policy asks to see.
 
     Attributes:
-        wrist: the wrist's view beside the agent view.
         state: position, axis-angle and fingers.
         shortest_rotation: the axis-angle with an angle in [0, pi], as vla-eval has it by default; else in [0, 2 pi], as
             robosuite and OpenVLA's data have it.
@@ -74,7 +73,6 @@ class Policy(Protocol):
 
     def begin(self, task: EvaluationTask) -> None:
         """An episode begins."""
-        ...
 
     def act(self, look: Look) -> Any:
         """The actions to take next, (n, 7) or (7,) for one, as ``checked_actions`` takes them; looks only when it has
@@ -83,11 +81,9 @@ class Policy(Protocol):
         Raises:
             PolicyError: when there is no answer.
         """
-        ...
 
     def end(self, success: bool) -> None:
         """It is over."""
-        ...
 
 
 class NextLook:
@@ -123,8 +119,6 @@ class Server:
 
     Args:
         address: such as ``ws://localhost:8000``.
-        timeout_s: how long an answer may take.
-        look_every: see ``NextLook``.
 
     Raises:
         PipelineError: when no server answers there.

@@ -24,11 +24,7 @@ from pipeline.types import Floats
 
 
 class Replay:
-    """The demonstration's actions, open-loop and without no-ops, then nothing.
-
-    Args:
-        chunk: how many actions at a time.
-    """
+    """The demonstration's actions, open-loop and without no-ops, then nothing."""
 
     name = "replay"
     wanted = Wanted(wrist=False, state=False, images=False)

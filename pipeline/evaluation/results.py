@@ -19,9 +19,6 @@ from pipeline.seeding import digest
 REFUSED = "refused"
 """The reason of an episode that could not begin, as its scene does not take what was drawn."""
 
-OUTCOME = ("success", "reason", "steps")
-"""What two results of one episode must have in common."""
-
 ALIKE = ("prompt", "step_limit")
 """What results on one suite of one source must have in common to be compared."""
 
@@ -36,11 +33,8 @@ class EpisodeResult(EvaluationTask):
     Attributes:
         component: as drawn, where the scene refused the first draw.
         episode: names it by what it is made from.
-        prompt, instruction: how tasks are worded, and what the policy was told.
-        step_limit: control steps after settling before an episode has failed.
         seed: of what is drawn for the task: its perturbations, and noise that is random.
         reason: why it ended, see ``Progress``; ``success`` says whether the goal was reached.
-        steps, looks: actions taken, and observations made.
         perturbations: held-out draws as they were used.
         policy, identity: the policy's name, and what is the same for the same policy alone.
         settings: what held for all episodes, and what the policy looks at.
@@ -223,7 +217,6 @@ class Evaluated:
 
     Attributes:
         name: the policy's, with the settings in which it differs from another of the same name.
-        settings: what held for all its episodes.
         rows: its episodes, without those that no policy acted in.
         videos: those that there are, by the name of the episode.
         refused: how many episodes could not begin, as their scene did not take what was drawn.
@@ -243,9 +236,6 @@ class Evaluated:
 def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluated]:
     """Read the folders that ``evaluate`` wrote; what several of them hold counts once.
 
-    Args:
-        across: see ``refuse_different``.
-
     Raises:
         PipelineError: when a folder has no results, results cannot be compared, two results of an episode differ, or
             two policies have one name.
@@ -253,11 +243,14 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     found = stored(folders)
     refuse_shared_names((row.policy, row.identity, files.folder) for row, files in found)
     refuse_different(found, across)
-    outcomes = [{name: getattr(row, name) for name in OUTCOME} for row, _ in found]
     _agree(
         (
-            (f"{row} by {row.policy}, episode {row.episode}", outcome, files.path(row.episode))
-            for (row, files), outcome in zip(found, outcomes, strict=True)
+            (
+                f"{row} by {row.policy}, episode {row.episode}",
+                {name: getattr(row, name) for name in ("success", "reason", "steps")},
+                files.path(row.episode),
+            )
+            for row, files in found
         ),
         "two results of ",
         expected="one result of each episode, the same wherever it was run",

@@ -12,7 +12,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-from pipeline import identity
+from pydantic import Field
+
+from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
@@ -42,22 +44,19 @@ RECORDED = ("pipeline", "vla-eval", "OpenGL")
 """The versions of a result that do not decide whether it counts."""
 
 
-class PolicyConfig(Frozen):
-    """What acts.
-
-    Attributes:
-        kind: ``server`` for a model server's address, ``checkpoint`` for a folder that lerobot saved, ``open_loop`` for
-            the demonstrations' own actions, ``tracked`` for their paths, followed by feedback.
-        address: of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations.
-        label: name in the results. A server must have one, another for each policy: nothing else tells what is behind
-            its address.
-        timeout_s: how long a server's answer may take.
-    """
+class PolicyConfig(Frozen, use_attribute_docstrings=True):
+    """What acts."""
 
     kind: Literal["server", "checkpoint", "open_loop", "tracked"]
+    """a model server, a folder that lerobot saved, the demonstrations' own actions, or their paths, followed by
+    feedback"""
     address: str = ""
+    """of the server, such as ``ws://localhost:8000``, or the folder; empty for the demonstrations"""
     label: str = ""
-    timeout_s: float = 120.0
+    """name of the policy in the results. A server must have one, another for each policy: nothing else tells what is
+    behind its address."""
+    timeout_s: float = Field(default=120.0, gt=0)
+    """seconds that a server's answer may take"""
 
     def identity(self) -> str:
         """What is the same for the same policy alone: ``sha256:`` and the content of a checkpoint, ``script:`` and the
@@ -104,7 +103,6 @@ class Evaluation:
 
     Attributes:
         identity: of the policy, as it was when the evaluation began.
-        folder: of the results.
         videos: of which episodes that are run now a video is kept: what the policy looked at, and the end.
         archive: folder of LIBERO-Plus's asset archive, where there is one.
     """
@@ -133,9 +131,6 @@ class Evaluation:
         """Refuse a folder that has another policy of this name, or results of other versions that nobody allowed to
         make anew.
 
-        Args:
-            tasks: that are to be run.
-
         Raises:
             PipelineError: when it has. Nothing was changed.
         """
@@ -155,14 +150,8 @@ class Evaluation:
             found |= {"files of the benchmark": digest(contents)[:16]} if contents else {}
         return found
 
-    def save(self, environment: EpisodeEnvironment, wanted: Wanted, looks: int, device: str) -> None:
-        """Write the result of the episode that ended in an environment.
-
-        Args:
-            wanted: what the policy asked to see.
-            looks: how often it was shown that.
-            device: what rendered, as OpenGL names it.
-        """
+    def save(self, environment: EpisodeEnvironment, wanted: Wanted) -> None:
+        """Write the result of the episode that ended in an environment, of a policy that asked to see ``wanted``."""
         task, progress, changes = environment.task, environment.progress, environment.perturbations
         own = changes if task.source == "own" else ()
         facts = asdict(task)
@@ -179,12 +168,12 @@ class Evaluation:
                 success=progress.success,
                 reason=progress.reason,
                 steps=progress.steps,
-                looks=looks,
+                looks=environment.looks,
                 perturbations=json.loads(to_json(own)),
                 policy=self.policy.name(self.identity),
                 identity=self.identity,
                 settings={**self.settings.model_dump(), **wanted._asdict()},
-                versions={**self.versions(task), **_installed(("pipeline", "vla-eval")), "OpenGL": device},
+                versions={**self.versions(task), **_installed(("pipeline", "vla-eval")), "OpenGL": gl.choose().device},
             )
         )
 
@@ -205,8 +194,8 @@ def _installed(packages: tuple[str, ...]) -> dict[str, str]:
 
 def roll_out_policy(
     environment: EpisodeEnvironment, policy: Policy, task: EvaluationTask, film: dict[int, Frame] | None = None
-) -> int:
-    """Run one episode to its end, which the environment knows; returns how often the policy looked.
+) -> None:
+    """Run one episode to its end, which the environment knows.
 
     Args:
         film: where agent views go, by the number of steps before each: of every look, and one whenever
@@ -218,11 +207,8 @@ def roll_out_policy(
     """
     progress = environment.reset(task)
     policy.begin(task)
-    looks = 0
 
     def look(wanted: Wanted) -> dict[str, Any]:
-        nonlocal looks
-        looks += 1
         observation = environment.observation(wanted)
         if film is not None and wanted.images:
             film[environment.progress.steps] = observation["images"]["agentview"]
@@ -237,4 +223,3 @@ def roll_out_policy(
             if progress.over:
                 break
     policy.end(progress.success)
-    return looks

@@ -23,7 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_task
 from pipeline.evaluation.results import REFUSED, EpisodeResult
-from pipeline.evaluation.tasks import EvaluationTask, Source, balanced, libero_task, read_tasks, replacements
+from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task, read_tasks, replacements
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Task
@@ -44,38 +44,35 @@ SIZE = 10_000
 """How many tasks the benchmark has; LIBERO-Plus has 10,030."""
 
 
-class Selection(Frozen):
-    """Which tasks to evaluate on; what is left out does not restrict.
+class Selection(Frozen, use_attribute_docstrings=True):
+    """Which tasks to evaluate on; what is left out does not restrict."""
 
-    Attributes:
-        source: where they come from. ``pairs`` are, for every two axes, LIBERO's task, the held-out draw of either
-            axis, and both draws together, on the same initial states.
-        file: a list of tasks that ``analyse construct`` wrote, in place of a source.
-        suites, axes, components, levels: those of the tasks wanted.
-        tasks: shell-style patterns, one of which must match the task's name or its LIBERO task's.
-        episodes: how many of LIBERO's 50 initial states of each task (``libero``, ``goals``, ``pairs``), or draws of
-            each task, axis and level (``own``); from the 51st on draws are on the same initial states again.
-        subset: at most so many, spread evenly over suites, axes, components and levels.
-        seed: of the subset and of all draws.
-    """
-
-    source: Source | Literal["pairs"] = "libero"
+    source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
+    """of the tasks: as in ``EvaluationTask``; ``pairs`` are, for every two axes, LIBERO's task, the held-out draw of
+    either axis, and both draws together, on the same initial states"""
     file: Path | None = None
+    """in place of a source, a list of tasks that ``analyse construct`` wrote"""
     suites: tuple[str, ...] = TESTED_SUITES
+    """of these suites only"""
     axes: tuple[str, ...] = ()
+    """of these axes only"""
     components: tuple[str, ...] = ()
+    """of these components only"""
     levels: tuple[int, ...] = ()
+    """of these levels only"""
     tasks: tuple[str, ...] = ()
+    """shell-style patterns, one of which must match the task's name or its LIBERO task's"""
     episodes: int = Field(default=1, ge=1)
+    """how many of LIBERO's 50 initial states of each task, or, of ``own``, draws of each task, axis and level; from the
+    51st on draws are on the same initial states again"""
     subset: int | None = Field(default=None, ge=1)
+    """at most so many, spread evenly over suites, axes, components and levels"""
     seed: int = 0
+    """of the subset and of every draw"""
 
 
 def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
     """The tasks that a selection names, in a fixed order.
-
-    Args:
-        archive: folder of LIBERO-Plus's asset archive, where there is one.
 
     Raises:
         PipelineError: when it names something unknown, nothing, or what needs the benchmark's asset archive.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import Perturbation
-from pipeline.errors import PipelineError, RefusedError
+from pipeline.errors import RefusedError
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
 from pipeline.physics.quality import ARM, FINGERS
@@ -92,7 +92,6 @@ class Simulator(Environment):
     those of LIBERO's evaluation. A reset takes 1.3 s; episodes with the same seed and posture share one.
 
     Args:
-        task: the task to build.
         files: of the arena, by absolute paths; the task's own by default.
     """
 
@@ -160,13 +159,8 @@ class Simulator(Environment):
         self._reset_under(seed, initial_qpos=None if posture_rad is None else np.array(posture_rad))
         physics = np.empty(mujoco.mj_stateSize(self.model, _PHYSICS))
         mujoco.mj_getState(self.model, env.sim.data._data, physics, _PHYSICS)
-        self._rewind = _Rewind(
-            seed,
-            posture_rad,
-            physics,
-            env.sim.model.site_rgba.copy(),
-            _copied(vars(env.robots[0].controller)),
-        )
+        controller = _copied(vars(env.robots[0].controller))
+        self._rewind = _Rewind(seed, posture_rad, physics, env.sim.model.site_rgba.copy(), controller)
 
     def _observe_from_here(self) -> None:
         env = self._env.env
@@ -221,7 +215,7 @@ class Picture:
 
     def __init__(self) -> None:
         self._opened = LastScene()
-        self._scene: mujoco.MjModel | str | None = None
+        self._scene: mujoco.MjModel | str = ""
         self._perturbations: Sequence[Perturbation] = ()
         self._changes: ExitStack | None = None
 
@@ -237,8 +231,6 @@ class Picture:
             view: its name in ``schemas/episode.json``.
             step: how many steps were taken, for noise that is random.
         """
-        if self._scene is None:
-            raise PipelineError("no episode was started", remedy="reset first")
         renderer, stream = self._opened.renderer(self._scene), Stream(view, tuple(self._perturbations))
         if self._changes is None:
             self._changes = ExitStack()
@@ -253,6 +245,5 @@ class Picture:
         self._changes = None
 
     def close(self) -> None:
-        self.restore()
-        self._scene = None
+        self.show("", ())
         self._opened.close()

@@ -228,9 +228,6 @@ def difficulty(solved: int, models: int) -> int:
 def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
     """Every task that all models ran, as JSON, with its ``difficulty`` and how many models solve it.
 
-    Args:
-        results: those of each model.
-
     Raises:
         PipelineError: when results of a model have several settings, models cannot be compared, or no task was run by
             all.

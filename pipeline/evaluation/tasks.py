@@ -151,7 +151,6 @@ class Replacement:
 
     Attributes:
         old, new: names in the BDDL file.
-        category: of the new object.
         instruction: LIBERO's, with the new object's words.
     """
 

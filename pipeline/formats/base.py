@@ -52,8 +52,6 @@ class Format(ABC, Generic[Options]):
     """A format's dataset of one run.
 
     Args:
-        data: the run's folder.
-        options: the format's section of the configuration.
         extras: what the episodes have beside the frames.
     """
 
@@ -198,6 +196,5 @@ class Format(ABC, Generic[Options]):
 
         Args:
             name: of the run's datasets.
-            repository: of the dataset on the hub.
             kept: the manifest's rows of its episodes.
         """

@@ -22,11 +22,8 @@ class Piece:
 
     Attributes:
         path: of its file or folder, below the work folder.
-        ids: of its episodes.
-        split: of its episodes.
         number: how many pieces come before.
         first_episode, first_step: how many episodes and steps of the dataset come before.
-        steps: of its episodes.
         tasks: each of its instructions to the number of it among the dataset's.
     """
 
@@ -44,11 +41,9 @@ class Known(NamedTuple):
     """What is known of an episode before it is loaded.
 
     Attributes:
-        suite: LIBERO suite.
         content: changes with anything that ``load`` would return.
         demo: its demonstration, ``<suite>/<task>/<key>``.
         instruction: the text that the policy is prompted with.
-        steps: its length.
     """
 
     suite: str
@@ -65,7 +60,6 @@ class Episodes:
     Attributes:
         known: episode id to what is known of it, in the order in which they are written: shuffled, because readers walk
             a dataset in order.
-        load: reads one episode.
     """
 
     known: Mapping[str, Known]
@@ -85,8 +79,12 @@ class Episodes:
             validation: share of each task's demonstrations, by number, rounded; drawn by a hash of its name.
 
         Raises:
-            PipelineError: when the demonstrations are too few to hold any out.
+            PipelineError: when there is nothing to write, or the demonstrations are too few to hold any out.
         """
+        if not self.known:
+            raise PipelineError(
+                "no episodes to write", expected="1 or more", remedy="read in the manifest why all were dropped"
+            )
         if not validation:
             return {"train": list(self.ids)}
         by_task: dict[str, set[str]] = {}
@@ -105,17 +103,12 @@ class Episodes:
             splits["val" if self.known[episode_id].demo in chosen else "train"].append(episode_id)
         return splits
 
-    def slices(self, members: Sequence[str], pieces: int) -> list[list[str]]:
-        """Some of the episodes in slices (see ``split``): as many of ``pieces`` as they are of all, at least one."""
-        return split(members, max(1, round(pieces * len(members) / len(self.known))))
-
 
 def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:
     """The pieces of one dataset whose files say how many episodes and steps come before theirs.
 
     Args:
         slices: path of each piece, in order, to its split and its episodes.
-        known: what is known of them.
     """
     pieces: list[Piece] = []
     tasks: dict[str, int] = {}
@@ -143,16 +136,20 @@ def split(episode_ids: Sequence[str], pieces: int) -> list[list[str]]:
     """Contiguous slices whose sizes differ by at most one, so that their concatenation keeps the caller's order.
 
     There are ``pieces`` of them, or one per episode when there are fewer episodes than that.
-
-    Raises:
-        PipelineError: when there is nothing to write, or ``pieces`` is not positive.
     """
-    if not episode_ids:
-        raise PipelineError(
-            "no episodes to write", expected="1 or more", remedy="read in the manifest why all were dropped"
-        )
-    if pieces < 1:
-        raise PipelineError(f"{pieces} output files were asked for", expected="1 or more")
     count = min(pieces, len(episode_ids))
     bounds = [len(episode_ids) * k // count for k in range(count + 1)]
     return [list(episode_ids[start:stop]) for start, stop in pairwise(bounds)]
+
+
+def by_suite(suites: Mapping[str, str], name: str) -> dict[str, list[str]]:
+    """Set name to its episodes, in the caller's order: a set for each suite, so that clients train on one or on all.
+
+    Args:
+        suites: episode id to LIBERO suite.
+        name: what the sets' names begin with; ``libero_spatial`` comes into ``<name>_spatial``.
+    """
+    sets: dict[str, list[str]] = {}
+    for episode_id, suite in suites.items():
+        sets.setdefault(f"{name}_{suite.removeprefix('libero_')}", []).append(episode_id)
+    return sets

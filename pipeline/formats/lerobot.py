@@ -14,7 +14,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig
 from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
-from pipeline.formats.lerobot_columns import FILE_MB
+from pipeline.formats.lerobot_columns import FILE_MB, Convention
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.identity import Step
 from pipeline.tables import column
@@ -36,6 +36,10 @@ class LeRobot(Format[LeRobotConfig]):
     @property
     def language(self) -> bool:
         return self.options.language
+
+    @property
+    def _convention(self) -> Convention:
+        return Convention(self.options.frames, language=self.language)
 
     @property
     def root(self) -> Path:
@@ -62,21 +66,19 @@ class LeRobot(Format[LeRobotConfig]):
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         from pipeline.formats import lerobot_write
 
-        lerobot_write.write_piece(path, piece, load, self.options.frames, self.extras, self.language)
+        lerobot_write.write_piece(path, piece, load, self._convention, self.extras)
 
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, int]]:
         from pipeline.formats import lerobot_write
 
-        root, options = work / "dataset" / self.options.name, self.options
-        lerobot_write.finish(work, root, pieces, options.frames, self.extras, self.language)
+        lerobot_write.finish(work, work / "dataset" / self.options.name, pieces, self._convention, self.extras)
         ids = [episode_id for piece in pieces for episode_id in piece.ids]
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
-        from pipeline.formats import lerobot_columns, lerobot_read
+        from pipeline.formats import lerobot_read
 
-        columns = lerobot_columns.features(self.options.frames, self.extras, self.language)
-        return lerobot_read.check(self.root, cache, kept, columns)
+        return lerobot_read.check(self.root, cache, kept, self._convention.columns(self.extras))
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_read

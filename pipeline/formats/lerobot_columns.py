@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, MatrixSpec, PosesSpec
@@ -42,25 +42,6 @@ def matrix_columns() -> dict[str, MatrixSpec]:
     return {camera_column(view, name): getattr(SCHEMA, name) for view in SCHEMA.views for name in MATRICES}
 
 
-def features(frames: Frames, extras: Collection[Extra] = (), language: bool = False) -> dict[str, dict[str, Any]]:
-    """The columns of every frame, as ``meta/info.json`` describes them."""
-    dtype = {"video": "video", "images": "image"}[frames]
-    frame = {"dtype": dtype, "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
-    text: dict[str, Any] = {"dtype": "string", "shape": (1,), "names": None}
-    columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
-    for name in MOTION:
-        spec = getattr(SCHEMA, name)
-        columns[spec.lerobot_key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
-    columns[EPISODE_ID] = dict(text)
-    columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in MAPS if name in extras}
-    if "object_poses" in extras:
-        columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
-    if language:
-        columns[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
-    columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}
-    return columns | {name: {"dtype": "int64", "shape": (1,), "names": None} for name in COUNTERS}
-
-
 def _flat(spec: PosesSpec) -> dict[str, Any]:
     rows, columns = spec.shape
     names = [f"{row}_{name}" for row in range(rows) for name in spec.names]
@@ -69,20 +50,21 @@ def _flat(spec: PosesSpec) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Convention:
-    """What clients expect of a set of v2.1.
+    """What clients expect of a set.
 
     Attributes:
-        frames: how the frames are stored.
         robot_type: in ``meta/info.json``.
         names: columns that have another name than in v3.0.
         open_is_one: whether the gripper's command is 1 open, 0 closed, and not as LIBERO has it. GR00T and starVLA,
             which look for ``meta/modality.json``, take it so.
+        language: whether there is lerobot's language column.
     """
 
     frames: Frames
-    robot_type: str
-    names: Mapping[str, str]
-    open_is_one: bool
+    robot_type: str = SCHEMA.robot_type
+    names: Mapping[str, str] = field(default_factory=dict)
+    open_is_one: bool = False
+    language: bool = False
 
     def name(self, column: str) -> str:
         """Of a column of v3.0."""
@@ -90,7 +72,23 @@ class Convention:
 
     def columns(self, extras: Collection[Extra]) -> dict[str, dict[str, Any]]:
         """The columns of every frame, as ``meta/info.json`` describes them."""
-        return {self.name(column): of for column, of in features(self.frames, extras).items()}
+        frame = {"dtype": "video", "shape": SCHEMA.frame.shape, "names": list(SCHEMA.frame.names)}
+        if self.frames == "images":
+            frame["dtype"] = "image"
+        text, number = ({"dtype": dtype, "shape": (1,), "names": None} for dtype in ("string", "int64"))
+        columns: dict[str, dict[str, Any]] = {view.lerobot_key: dict(frame) for view in SCHEMA.views.values()}
+        for name in MOTION:
+            spec = getattr(SCHEMA, name)
+            columns[spec.lerobot_key] = {"dtype": spec.dtype, "shape": spec.shape, "names": list(spec.names)}
+        columns[EPISODE_ID] = dict(text)
+        columns |= {camera_column(view, name): dict(text) for view in SCHEMA.views for name in MAPS if name in extras}
+        if "object_poses" in extras:
+            columns[OBJECT_POSES] = _flat(SCHEMA.object_poses)
+        if self.language:
+            columns[LANGUAGE] = {"dtype": "language", "shape": (1,), "names": None}
+        columns["timestamp"] = {"dtype": "float32", "shape": (1,), "names": None}
+        columns |= {name: dict(number) for name in COUNTERS}
+        return {self.name(column): of for column, of in columns.items()}
 
 
 CONVENTIONS = {
@@ -110,7 +108,6 @@ CONVENTIONS = {
             "observation.joint_state": "joint_state",
             "action": "actions",
         },
-        open_is_one=False,
     ),
 }
 """Each as its public code has it. Joint angles are in neither; under ``observation`` they would be a policy's input.

@@ -1,4 +1,4 @@
-"""What an episode, and all of a dataset's episodes together, are in LeRobot's files, whichever version they are of."""
+"""What LeRobot's files have of an episode, and of all of a dataset's episodes, whichever version they are of."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import base64
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +17,25 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, named, provenance_of
+from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, check, named, provenance_of
 from pipeline.errors import PipelineError
-from pipeline.formats.image_statistics import QUANTILES, Counts, count, statistics
+from pipeline.formats.episodes import Load, Piece
+from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, of_levels, open_is_one
 from pipeline.formats.lerobot_columns import (
     EPISODE_ID,
     INSTANCES,
     LANGUAGE,
     OBJECT_POSES,
+    Convention,
     camera_column,
     matrix_columns,
 )
-from pipeline.formats.lerobot_video import Video
-from pipeline.formats.motion_statistics import describe
+from pipeline.formats.lerobot_video import INFO, Video
 from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Extra
+
+PROVENANCE, LEVELS = "provenance.parquet", "levels.json"
+"""In a piece's folder, beside the files of its version: a row for each episode, and how often each level occurs."""
 
 ENTRIES = 16
 """Of a column so many entries are in memory at a time: 300 MB for 28,000 episodes."""
@@ -51,6 +56,69 @@ _LANGUAGE = datasets.List(
     }
 )
 """``language_persistent_column_feature`` in ``datasets/language.py`` of lerobot 0.6.1, which older ones do not have."""
+
+
+def each(
+    piece: Piece, load: Load, convention: Convention, extras: Sequence[Extra]
+) -> Iterator[tuple[int, int, Episode, Numbers]]:
+    """The number of each episode of a piece, how many steps come before it, the episode, and what it has in numbers.
+
+    Raises:
+        PipelineError: when an episode breaks the schema.
+    """
+    first_step = piece.first_step
+    for index, episode_id in enumerate(piece.ids, piece.first_episode):
+        episode = load(episode_id)
+        check(episode, extras)
+        if convention.open_is_one:
+            episode = replace(episode, action=open_is_one(episode.action))
+        yield index, first_step, episode, _numbers(episode, index, first_step, piece.tasks[episode.instruction])
+        first_step += len(episode)
+
+
+def summarise(path: Path, made: Sequence[tuple[dict[str, Any], Mapping[str, Counts]]], extras: Sequence[Extra]) -> None:
+    """Write ``PROVENANCE`` and ``LEVELS`` of a piece, from the ``provenance`` and the levels of each episode."""
+    rows, shown = zip(*made, strict=True)
+    pq.write_table(pa.Table.from_pylist(list(rows), schema=_provenance_schema(extras)), path / PROVENANCE)
+    levels = {view: sum(one[view] for one in shown).tolist() for view in SCHEMA.views}
+    (path / LEVELS).write_text(json.dumps(levels))
+
+
+def finish(
+    work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, extras: Sequence[Extra]
+) -> dict[str, int]:
+    """Write provenance and exact statistics of a dataset whose data files are there; returns its tasks, numbered."""
+    tables = [pq.read_table(work / piece.path / PROVENANCE) for piece in pieces]
+    pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
+    columns = convention.columns(extras)
+    levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
+    figures = {
+        convention.name(of.lerobot_key): of_levels(np.sum([one[view] for one in levels], axis=0))
+        for view, of in SCHEMA.views.items()
+    }
+    figures |= {
+        name: _exact(root, name, of["shape"][0]) for name, of in columns.items() if of["dtype"] in ("float32", "int64")
+    }
+    write_json(root / "meta" / "stats.json", {name: listed(figures[name]) for name in columns if name in figures})
+    # In order, as numbers were given when a text first came.
+    return {task: number for piece in pieces for task, number in piece.tasks.items()}
+
+
+def totals(version: str, last: Piece, tasks: int, convention: Convention) -> dict[str, Any]:
+    """What ``meta/info.json`` of a dataset that ends with a piece begins with."""
+    return {
+        "codebase_version": version,
+        "robot_type": convention.robot_type,
+        "total_episodes": last.first_episode + len(last.ids),
+        "total_frames": last.first_step + last.steps,
+        "total_tasks": tasks,
+    }
+
+
+def described(convention: Convention, extras: Sequence[Extra]) -> dict[str, Any]:
+    """The columns as ``meta/info.json`` has them."""
+    columns = convention.columns(extras)
+    return {name: {**of, **({"info": INFO} if of["dtype"] == "video" else {})} for name, of in columns.items()}
 
 
 def schema(columns: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
@@ -85,15 +153,7 @@ def show(episode: Episode, view: str, video: Video | None) -> Counts:
     return counts
 
 
-def numbers(episode: Episode, index: int, first_step: int, task: int) -> Numbers:
-    """What each step has in numbers.
-
-    Args:
-        episode: of which they are.
-        index: how many episodes of the dataset come before.
-        first_step: how many steps of the dataset come before.
-        task: of its instruction.
-    """
+def _numbers(episode: Episode, index: int, first_step: int, task: int) -> Numbers:
     steps = np.arange(len(episode))
     found: dict[str, NDArray[Any]] = {getattr(SCHEMA, name).lerobot_key: getattr(episode, name) for name in MOTION}
     if episode.object_poses is not None:
@@ -149,10 +209,10 @@ def figures(found: Numbers, shown: Mapping[str, Counts]) -> dict[str, dict[str, 
         name: describe(values.reshape(len(values), -1), QUANTILES) | {"count": np.array([len(values)])}
         for name, values in found.items()
     }
-    return of_numbers | {SCHEMA.views[view].lerobot_key: statistics(counts) for view, counts in shown.items()}
+    return of_numbers | {SCHEMA.views[view].lerobot_key: of_levels(counts) for view, counts in shown.items()}
 
 
-def provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
+def _provenance_schema(extras: Sequence[Extra]) -> pa.Schema:
     """Of ``meta/provenance.parquet``, which has a row for each episode, and which lerobot passes by."""
     stored = {"episode_index": pa.int64()}
     stored |= {name: pa.type_for_alias(dtype) for name, dtype in provenance_of(extras).items()}
@@ -168,7 +228,7 @@ def provenance(episode: Episode, index: int) -> dict[str, Any]:
     return row | ({INSTANCES: json.dumps(list(episode.instances))} if episode.instances else {})
 
 
-def exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
+def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
     """lerobot's statistics of a column over all steps of the dataset, ``ENTRIES`` of its entries at a time."""
     found = []
     files = sorted((root / "data").rglob("*.parquet"))
@@ -187,34 +247,28 @@ def _entries(file: Path, column: str) -> NDArray[Any]:
     return np.asarray(flat.to_numpy(zero_copy_only=False).reshape(len(values), -1))
 
 
-def modality(views: Mapping[str, str], state: str, action: str) -> dict[str, Any]:
+def write_modality(root: Path, convention: Convention) -> None:
     """``meta/modality.json``, by which GR00T and starVLA find their inputs.
 
     Entries and names are those of ``examples/simBenchmarks/LIBERO/train_files/modality.json`` in starVLA/starVLA at
     0ed0aad. The agent view is there a second time as ``image``, its name in NVIDIA/Isaac-GR00T at 2a7748b
     (``gr00t/configs/data/embodiment_configs.py``). What both call roll, pitch and yaw is an axis-angle.
-
-    Args:
-        views: ``image`` and ``wrist_image`` to their columns.
-        state, action: their columns.
     """
 
     def entries(column: str, *names: str) -> dict[str, Any]:
         return {name: {"start": k, "end": k + 1, "original_key": column} for k, name in enumerate(names)}
 
     pose = ("x", "y", "z", "roll", "pitch", "yaw")
-    return {
-        "state": entries(state, *pose, "pad", "gripper"),
-        "action": entries(action, *pose, "gripper"),
+    views = {view: convention.name(of.lerobot_key) for view, of in SCHEMA.views.items()}
+    content = {
+        "state": entries(convention.name(SCHEMA.state.lerobot_key), *pose, "pad", "gripper"),
+        "action": entries(convention.name(SCHEMA.action.lerobot_key), *pose, "gripper"),
         "video": {
             name: {"original_key": column} for name, column in {"primary_image": views["image"], **views}.items()
         },
         "annotation": {"human.action.task_description": {"original_key": "task_index"}},
     }
-
-
-def is_number(column: Mapping[str, Any]) -> bool:
-    return column["dtype"] in ("float32", "int64")
+    write_json(root / "meta" / "modality.json", content)
 
 
 def listed(found: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

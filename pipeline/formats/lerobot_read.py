@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, named
 from pipeline.errors import PipelineError
+from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, camera_column
 from pipeline.formats.read_back import Copy, Fault, sampled
@@ -160,45 +161,48 @@ def forget_sessions() -> None:
 
 def _rows(root: Path) -> dict[str, dict[str, Any]]:
     """Episode id to its rows of ``meta/episodes`` and of ``meta/provenance.parquet``."""
-    return _opened(root, (root / "meta" / "info.json").stat().st_mtime_ns)
+    return _opened(edition(root / "meta" / "info.json"))[1]
 
 
 @lru_cache(maxsize=1)
-def _opened(root: Path, modified_ns: int) -> dict[str, dict[str, Any]]:
-    files = sorted((root / "meta" / "episodes").rglob("*.parquet"))
+def _opened(info_file: Edition) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """``meta/info.json`` with the tasks by number, and the rows of ``_rows``."""
+    meta = info_file.path.parent
+    info: dict[str, Any] = json.loads(info_file.path.read_text())
+    info["tasks"] = {row["task_index"]: row["task"] for row in pq.read_table(meta / "tasks.parquet").to_pylist()}
+    files = sorted((meta / "episodes").rglob("*.parquet"))
     names = [name for name in pq.read_schema(files[0]).names if not name.startswith("stats/")]
     episodes = [row for file in files for row in pq.read_table(file, columns=names).to_pylist()]
-    provenance = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
+    provenance = pq.read_table(meta / "provenance.parquet").to_pylist()
     firsts: dict[tuple[int, int], int] = {}
     for row in episodes:
         row["first_row"] = row["dataset_from_index"] - firsts.setdefault(_file(row), row["dataset_from_index"])
-    return {also[EPISODE_ID]: row | also for row, also in zip(episodes, provenance, strict=True)}
+    return info, {also[EPISODE_ID]: row | also for row, also in zip(episodes, provenance, strict=True)}
 
 
 def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
     return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
 
 
-@lru_cache(maxsize=1)
-def _info(root: Path, modified_ns: int) -> dict[str, Any]:
-    info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text())
-    tasks = pq.read_table(root / "meta" / "tasks.parquet").to_pylist()
-    return info | {"tasks": {row["task_index"]: row["task"] for row in tasks}}
-
-
 def _copy(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy:
     index, steps = row["episode_index"], row["length"]
-    info = _info(root, (root / "meta" / "info.json").stat().st_mtime_ns)
+    info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)
     table = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
     if table["episode_index"].to_pylist() != [index] * steps:
         raise ValueError(f"rows {row['first_row']} of data file {number} are not the {steps} steps of episode {index}")
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
+    videos = {}
+    for view, key in ((view, spec.lerobot_key) for view, spec in SCHEMA.views.items()):
+        if info["features"][key]["dtype"] == "video":
+            chunk, number = _file(row, f"videos/{key}")
+            path = root / info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
+            videos[view] = path, row[f"videos/{key}/from_timestamp"]
     return Copy(
         dataset="lerobot",
         episode=episode(table, row, instructions[0], extras),
         instructions=instructions,
-        decoded={key: frame for view in SCHEMA.views for key, frame in _decoded(root, info, row, table, view)},
+        decoded=decoded(table, videos),
         marks={name: table[name].to_numpy() for name in MARKS},
         place={"lerobot_episode_index": index},
     )
@@ -248,21 +252,22 @@ def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[
     return Geometry(**matrices, maps={name: list(map(base64.b64decode, files)) for name, files in texts.items()})
 
 
-def _decoded(
-    root: Path, info: Mapping[str, Any], row: Mapping[str, Any], table: pa.Table, view: str
-) -> Iterator[tuple[tuple[str, int], Frame]]:
-    """The frames of a view at the sampled steps."""
-    key = SCHEMA.views[view].lerobot_key
-    if info["features"][key]["dtype"] == "image":
-        for step in sampled(row["length"]):
-            yield (view, step), decode(table[key][step]["bytes"].as_py())
-        return
-    chunk, number = _file(row, f"videos/{key}")
-    path = info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
-    for step in sampled(row["length"]):
-        # By the time that stands at the step, as lerobot does.
-        at_s = row[f"videos/{key}/from_timestamp"] + table["timestamp"][step].as_py()
-        yield (view, step), frame_at(root / path, at_s)
+def decoded(table: pa.Table, videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:
+    """The frames at the sampled steps.
+
+    Args:
+        videos: view to its video, and the time (s) at which the episode begins there; views without one are images.
+    """
+    frames = {}
+    for view, spec in SCHEMA.views.items():
+        for step in sampled(len(table)):
+            if view in videos:
+                # By the time that stands at the step, as lerobot does.
+                path, begins_s = videos[view]
+                frames[view, step] = frame_at(path, begins_s + table["timestamp"][step].as_py())
+            else:
+                frames[view, step] = decode(table[spec.lerobot_key][step]["bytes"].as_py())
+    return frames
 
 
 def frame_at(path: Path, at_s: float) -> Frame:

@@ -11,11 +11,10 @@ import pyarrow as pa
 from pipeline.episode_schema import GripperSpec
 from pipeline.export_config import LeRobotV21Config
 from pipeline.formats.base import Format, Row
-from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
+from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row, split
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_columns import CONVENTIONS
 from pipeline.formats.read_back import Copy, Fault
-from pipeline.formats.rlds_layout import by_suite
 from pipeline.identity import Step
 from pipeline.types import Extra
 
@@ -50,7 +49,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
             sets = {self.options.name: members}
             if self.options.convention == "ipec":
                 suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
-                sets = by_suite(members, suites, self.options.name)
+                sets = by_suite(suites, self.options.name)
             for name, ids in sets.items():
                 folder = f"files/{name}" if split_name == "train" else f"files/{name}_{split_name}"
                 parts = split(ids, -(-len(ids) // EPISODES_OF_A_PIECE))

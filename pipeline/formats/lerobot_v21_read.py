@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID, Convention
-from pipeline.formats.lerobot_read import MARKS, episode, frame_at, readable
+from pipeline.formats.lerobot_read import MARKS, decoded, episode, readable
 from pipeline.formats.lerobot_v21_write import data_path, video_path
-from pipeline.formats.read_back import Copy, Fault, sampled
-from pipeline.images.jpeg import decode
-from pipeline.types import Extra, Frame
+from pipeline.formats.read_back import Copy, Fault
+from pipeline.types import Extra
 
 NAME, VERSION = "lerobot_v21", "v2.1"
 
@@ -97,21 +95,10 @@ def _copy(
     made = episode(table, row, instructions[0], extras)
     if convention.open_is_one:
         made = replace(made, action=np.hstack([made.action[:, :-1], 1 - 2 * made.action[:, -1:]]))
-    decoded = {key: frame for view in SCHEMA.views for key, frame in _decoded(root, index, table, view, convention)}
-    return Copy(NAME, made, instructions, decoded, {name: table[name].to_numpy() for name in MARKS}, {})
-
-
-def _decoded(
-    root: Path, index: int, table: pa.Table, view: str, convention: Convention
-) -> Iterator[tuple[tuple[str, int], Frame]]:
-    """The frames of a view at the sampled steps."""
-    key = SCHEMA.views[view].lerobot_key
-    for step in sampled(len(table)):
-        if convention.frames == "images":
-            yield (view, step), decode(table[key][step]["bytes"].as_py())
-        else:
-            path = root / video_path(index, convention.name(key))
-            yield (view, step), frame_at(path, table["timestamp"][step].as_py())
+    keys = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
+    videos = {view: (root / video_path(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"}
+    marks = {name: table[name].to_numpy() for name in MARKS}
+    return Copy(NAME, made, instructions, decoded(table, videos), marks, {})
 
 
 def _sets(folder: Path) -> list[Path]:

@@ -7,31 +7,27 @@ Every episode is a file of data and one of each video, final at once. ``meta/sta
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.episode_schema import SCHEMA, check
+from pipeline.episode_schema import SCHEMA
 from pipeline.formats import lerobot_episode as of_episode
 from pipeline.formats.episodes import Load, Piece
-from pipeline.formats.image_statistics import Counts, statistics
+from pipeline.formats.exact_statistics import Counts
 from pipeline.formats.lerobot_columns import Convention
 from pipeline.formats.lerobot_episode import link, listed, write_json
-from pipeline.formats.lerobot_video import INFO, Video
-from pipeline.formats.motion_statistics import open_is_one
+from pipeline.formats.lerobot_video import Video
 from pipeline.types import Episode, Extra
 
 EPISODES_OF_A_CHUNK = 1000
 DATA_PATH = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
 VIDEO_PATH = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 
-LINES, PROVENANCE, LEVELS = ("episodes.jsonl", "episodes_stats.jsonl"), "provenance.parquet", "levels.json"
+LINES = ("episodes.jsonl", "episodes_stats.jsonl")
 """In a piece's folder, beside the files of its episodes."""
 
 STATISTICS = ("min", "max", "mean", "std", "count")
@@ -57,29 +53,20 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, ex
         PipelineError: when an episode breaks the schema.
     """
     path.mkdir()
-    levels: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
-    provenance, first_step = [], piece.first_step
+    made = []
     with ExitStack() as opened:
         episodes, stats = (opened.enter_context((path / name).open("w")) for name in LINES)
-        for index, episode_id in enumerate(piece.ids, piece.first_episode):
-            episode = load(episode_id)
-            check(episode, extras)
-            if convention.open_is_one:
-                episode = replace(episode, action=open_is_one(episode.action))
-            numbers = of_episode.numbers(episode, index, first_step, piece.tasks[episode.instruction])
+        for index, _, episode, numbers in of_episode.each(piece, load, convention, extras):
             shown = _write_episode(path, index, episode, numbers, convention, extras)
             figures = {
                 convention.name(name): listed({of: found[of] for of in STATISTICS})
                 for name, found in of_episode.figures(numbers, shown).items()
             }
             row = {"episode_index": index, "tasks": [episode.instruction], "length": len(episode)}
-            episodes.write(json.dumps(row | {"episode_id": episode_id}) + "\n")
+            episodes.write(json.dumps(row | {"episode_id": episode.episode_id}) + "\n")
             stats.write(json.dumps({"episode_index": index, "stats": figures}) + "\n")
-            provenance.append(of_episode.provenance(episode, index))
-            levels = {view: counts + shown[view] for view, counts in levels.items()}
-            first_step += len(episode)
-    pq.write_table(pa.Table.from_pylist(provenance, schema=of_episode.provenance_schema(extras)), path / PROVENANCE)
-    (path / LEVELS).write_text(json.dumps({view: counts.tolist() for view, counts in levels.items()}))
+            made.append((of_episode.provenance(episode, index), shown))
+    of_episode.summarise(path, made, extras)
 
 
 def _write_episode(
@@ -123,35 +110,15 @@ def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Conventi
             link(made, root / made.relative_to(work / piece.path))
     for name in LINES:
         (root / "meta" / name).write_text("".join((work / piece.path / name).read_text() for piece in pieces))
-    tables = [pq.read_table(work / piece.path / PROVENANCE) for piece in pieces]
-    pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
-    tasks = {task: number for piece in pieces for task, number in piece.tasks.items()}
+    tasks = of_episode.finish(work, root, pieces, convention, extras)
     rows = [{"task_index": number, "task": task} for task, number in tasks.items()]
     (root / "meta" / "tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    columns = convention.columns(extras)
-    levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
-    keys = {view: convention.name(of.lerobot_key) for view, of in SCHEMA.views.items()}
-    figures = {keys[view]: statistics(np.sum([one[view] for one in levels], axis=0)) for view in SCHEMA.views}
-    figures |= {
-        name: of_episode.exact(root, name, of["shape"][0]) for name, of in columns.items() if of_episode.is_number(of)
-    }
-    write_json(root / "meta" / "stats.json", {name: listed(figures[name]) for name in columns if name in figures})
     if convention.open_is_one:  # As its readers take the gripper.
-        modality = of_episode.modality(keys, SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key)
-        write_json(root / "meta" / "modality.json", modality)
-    write_json(root / "meta" / "info.json", info(pieces[-1], columns, len(tasks), convention))
-
-
-def info(last: Piece, columns: Mapping[str, Mapping[str, Any]], tasks: int, convention: Convention) -> dict[str, Any]:
-    """``meta/info.json`` of a set that ends with a piece."""
-    episodes = last.first_episode + len(last.ids)
-    videos = convention.frames == "video"
-    return {
-        "codebase_version": "v2.1",
-        "robot_type": convention.robot_type,
-        "total_episodes": episodes,
-        "total_frames": last.first_step + last.steps,
-        "total_tasks": tasks,
+        of_episode.write_modality(root, convention)
+    totals = of_episode.totals("v2.1", pieces[-1], len(tasks), convention)
+    episodes, videos = totals["total_episodes"], convention.frames == "video"
+    info = {
+        **totals,
         "total_videos": episodes * len(SCHEMA.views) if videos else 0,
         "total_chunks": -(-episodes // EPISODES_OF_A_CHUNK),
         "chunks_size": EPISODES_OF_A_CHUNK,
@@ -159,7 +126,6 @@ def info(last: Piece, columns: Mapping[str, Mapping[str, Any]], tasks: int, conv
         "splits": {"train": f"0:{episodes}"},
         "data_path": DATA_PATH,
         "video_path": VIDEO_PATH if videos else None,
-        "features": {
-            name: {**of, **({"info": INFO} if of["dtype"] == "video" else {})} for name, of in columns.items()
-        },
+        "features": of_episode.described(convention, extras),
     }
+    write_json(root / "meta" / "info.json", info)

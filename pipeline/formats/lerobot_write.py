@@ -11,28 +11,25 @@ lerobot's own writer appends by writing whole files again, and its statistics ar
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipeline.episode_schema import SCHEMA, check
+from pipeline.episode_schema import SCHEMA
 from pipeline.formats import lerobot_episode as of_episode
 from pipeline.formats.episodes import Load, Piece
-from pipeline.formats.image_statistics import Counts, statistics
-from pipeline.formats.lerobot_columns import FILE_MB, Frames, features
+from pipeline.formats.lerobot_columns import FILE_MB, Convention, Frames
 from pipeline.formats.lerobot_episode import link, listed, write_json
-from pipeline.formats.lerobot_video import INFO, Video
+from pipeline.formats.lerobot_video import Video
 from pipeline.types import Episode, Extra
 
 FILES_OF_A_CHUNK, PLACE = 1000, "chunk-{chunk_index:03d}/file-{file_index:03d}"
 
-DATA, EPISODES, PROVENANCE, LEVELS = "data.parquet", "episodes.parquet", "provenance.parquet", "levels.json"
+DATA, EPISODES = "data.parquet", "episodes.parquet"
 """In a piece's folder, beside ``<view>.mp4``."""
 
 INDEX = (
@@ -51,9 +48,7 @@ def file_path(kind: str, number: int, suffix: str) -> str:
     return f"{kind}/{PLACE.format(chunk_index=chunk, file_index=file)}{suffix}"
 
 
-def write_piece(
-    path: Path, piece: Piece, load: Load, frames: Frames, extras: tuple[Extra, ...], language: bool
-) -> None:
+def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, extras: tuple[Extra, ...]) -> None:
     """Write the files of some episodes into a new folder; one episode at a time is in memory.
 
     The bytes, videos included, depend on the episodes, their order and the encoder's version alone.
@@ -62,38 +57,28 @@ def write_piece(
         PipelineError: when an episode breaks the schema.
     """
     path.mkdir()
-    levels: dict[str, Counts] = {view: np.zeros((3, 256), np.int64) for view in SCHEMA.views}
-    rows, provenance = [], []
-    first_step = piece.first_step
-    schema = of_episode.schema(features(frames, extras, language))
+    rows, made = [], []
     with ExitStack() as opened:
-        data = opened.enter_context(pq.ParquetWriter(path / DATA, schema))
-        videos = {view: opened.enter_context(Video(path / f"{view}.mp4")) for view in SCHEMA.views if frames == "video"}
-        for index, episode_id in enumerate(piece.ids, piece.first_episode):
-            episode = load(episode_id)
-            check(episode, extras)
+        data = opened.enter_context(pq.ParquetWriter(path / DATA, of_episode.schema(convention.columns(extras))))
+        with_videos = convention.frames == "video"
+        videos = {view: opened.enter_context(Video(path / f"{view}.mp4")) for view in SCHEMA.views if with_videos}
+        for index, first_step, episode, numbers in of_episode.each(piece, load, convention, extras):
             shown = {view: of_episode.show(episode, view, videos.get(view)) for view in SCHEMA.views}
-            numbers = of_episode.numbers(episode, index, first_step, piece.tasks[episode.instruction])
             columns = of_episode.columns(episode, numbers)
-            if language:
+            if convention.language:
                 columns |= of_episode.language(episode, piece.split == "train")
             # A row group for each episode, so that one is read without the others.
             data.write_table(pa.table({name: columns[name] for name in data.schema.names}).cast(data.schema))
             # An episode's statistics are there because lerobot's tools for editing put them together again.
             figures = of_episode.figures(numbers, shown)
             stats = {f"stats/{name}/{of}": value for name, one in figures.items() for of, value in listed(one).items()}
-            rows.append(_row(episode, piece, index, first_step, frames) | stats)
-            provenance.append(of_episode.provenance(episode, index))
-            levels = {view: counts + shown[view] for view, counts in levels.items()}
-            first_step += len(episode)
+            rows.append(_row(episode, piece, index, first_step, convention.frames) | stats)
+            made.append((of_episode.provenance(episode, index), shown))
     pq.write_table(pa.Table.from_pylist(rows), path / EPISODES)
-    pq.write_table(pa.Table.from_pylist(provenance, schema=of_episode.provenance_schema(extras)), path / PROVENANCE)
-    (path / LEVELS).write_text(json.dumps({view: counts.tolist() for view, counts in levels.items()}))
+    of_episode.summarise(path, made, extras)
 
 
-def finish(
-    work: Path, root: Path, pieces: Sequence[Piece], frames: Frames, extras: tuple[Extra, ...], language: bool
-) -> None:
+def finish(work: Path, root: Path, pieces: Sequence[Piece], convention: Convention, extras: tuple[Extra, ...]) -> None:
     """Put the files of all pieces in their places below ``root``, and write what is about all of them."""
     for piece in pieces:
         places = {DATA: ("data", ".parquet"), EPISODES: ("meta/episodes", ".parquet")}
@@ -101,24 +86,27 @@ def finish(
         for name, (kind, suffix) in places.items():
             if (made := work / piece.path / name).exists():
                 link(made, root / file_path(kind, piece.number, suffix))
-    tables = [pq.read_table(work / piece.path / PROVENANCE) for piece in pieces]
-    pq.write_table(pa.concat_tables(tables), root / "meta" / PROVENANCE)
-    # In order, as numbers were given when a text first came. lerobot finds a task by the table's index.
-    tasks = {task: number for piece in pieces for task, number in piece.tasks.items()}
+    tasks = of_episode.finish(work, root, pieces, convention, extras)
+    # lerobot finds a task by the table's index.
     numbered = {"task_index": pa.array(tasks.values(), pa.int64()), "task": pa.array(tasks, pa.large_string())}
     pq.write_table(pa.table(numbered).replace_schema_metadata({"pandas": INDEX}), root / "meta" / "tasks.parquet")
-    columns = features(frames, extras, language)
-    levels = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
-    counts = {view: np.sum([of_piece[view] for of_piece in levels], axis=0) for view in SCHEMA.views}
-    figures = {of.lerobot_key: statistics(counts[view]) for view, of in SCHEMA.views.items()}
-    figures |= {
-        name: of_episode.exact(root, name, of["shape"][0]) for name, of in columns.items() if of_episode.is_number(of)
+    of_episode.write_modality(root, convention)
+    splits: dict[str, tuple[int, int]] = {}  # Ranges of episodes, in the order of the pieces.
+    for piece in pieces:
+        first, _ = splits.get(piece.split, (piece.first_episode, 0))
+        splits[piece.split] = (first, piece.first_episode + len(piece.ids))
+    info = {
+        **of_episode.totals("v3.0", pieces[-1], len(tasks), convention),
+        "chunks_size": FILES_OF_A_CHUNK,
+        "data_files_size_in_mb": FILE_MB,
+        "video_files_size_in_mb": FILE_MB,
+        "fps": SCHEMA.fps_hz,
+        "splits": {name: f"{first}:{end}" for name, (first, end) in splits.items()},
+        "data_path": f"data/{PLACE}.parquet",
+        "video_path": f"videos/{{video_key}}/{PLACE}.mp4" if convention.frames == "video" else None,
+        "features": of_episode.described(convention, extras),
     }
-    write_json(root / "meta" / "stats.json", {name: listed(figures[name]) for name in columns if name in figures})
-    views = {view: of.lerobot_key for view, of in SCHEMA.views.items()}
-    modality = of_episode.modality(views, SCHEMA.state.lerobot_key, SCHEMA.action.lerobot_key)
-    write_json(root / "meta" / "modality.json", modality)
-    write_json(root / "meta" / "info.json", _info(pieces, columns, len(tasks), frames))
+    write_json(root / "meta" / "info.json", info)
 
 
 def _row(episode: Episode, piece: Piece, index: int, first_step: int, frames: Frames) -> dict[str, Any]:
@@ -145,31 +133,3 @@ def _row(episode: Episode, piece: Piece, index: int, first_step: int, frames: Fr
             f"videos/{view.lerobot_key}/to_timestamp": (before + steps) / SCHEMA.fps_hz,
         }
     return row
-
-
-def _info(
-    pieces: Sequence[Piece], columns: Mapping[str, Mapping[str, Any]], tasks: int, frames: Frames
-) -> dict[str, Any]:
-    """``meta/info.json``; a split is a range of episodes, in the order of the pieces."""
-    splits: dict[str, tuple[int, int]] = {}
-    for piece in pieces:
-        first, _ = splits.get(piece.split, (piece.first_episode, 0))
-        splits[piece.split] = (first, piece.first_episode + len(piece.ids))
-    last = pieces[-1]
-    return {
-        "codebase_version": "v3.0",
-        "robot_type": SCHEMA.robot_type,
-        "total_episodes": last.first_episode + len(last.ids),
-        "total_frames": last.first_step + last.steps,
-        "total_tasks": tasks,
-        "chunks_size": FILES_OF_A_CHUNK,
-        "data_files_size_in_mb": FILE_MB,
-        "video_files_size_in_mb": FILE_MB,
-        "fps": SCHEMA.fps_hz,
-        "splits": {name: f"{first}:{end}" for name, (first, end) in splits.items()},
-        "data_path": f"data/{PLACE}.parquet",
-        "video_path": f"videos/{{video_key}}/{PLACE}.mp4" if frames == "video" else None,
-        "features": {
-            name: {**of, **({"info": INFO} if of["dtype"] == "video" else {})} for name, of in columns.items()
-        },
-    }

@@ -20,8 +20,6 @@ class Fault:
     Attributes:
         dataset: a format's name, ``manifest``, or ``frames`` for the store that the datasets were made from.
         episode: its id, or None when it is about the whole dataset.
-        what: the fault.
-        expected: what would have been right.
     """
 
     dataset: str
@@ -35,7 +33,6 @@ class Copy:
     """An episode as a dataset hands it out.
 
     Attributes:
-        dataset: the format's name.
         episode: the record that its writer was given, as far as the dataset has it: of whatever shapes and types stand
             there, with the instruction of the first step, and without frames where they are no image files.
         instructions: one for each step.
@@ -60,8 +57,6 @@ class Written:
     """A file as the record of its dataset has it.
 
     Attributes:
-        dataset: the format's name.
-        file: where it lies.
         sha256: of what was written.
     """
 

@@ -12,9 +12,9 @@ import pyarrow as pa
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Format, Row
-from pipeline.formats.episodes import Episodes, Load, Piece
+from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
 from pipeline.formats.read_back import Copy, Fault
-from pipeline.formats.rlds_layout import VERSION, by_suite, dataset_of, shard_path
+from pipeline.formats.rlds_layout import VERSION, dataset_of, shard_path
 from pipeline.identity import Step
 from pipeline.tables import column
 
@@ -41,8 +41,8 @@ class Rlds(Format[RldsConfig]):
         )
         for split_name, members in episodes.by_split(self.options.validation).items():
             suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
-            for name, ids in by_suite(members, suites, self.options.name).items():
-                slices = episodes.slices(ids, shards)
+            for name, ids in by_suite(suites, self.options.name).items():
+                slices = split(ids, max(1, round(shards * len(ids) / len(episodes.known))))
                 for shard, slice_ids in enumerate(slices):
                     path = shard_path(name, split_name, shard, len(slices))
                     pieces.append(Piece(f"dataset/{path}", slice_ids, split_name))

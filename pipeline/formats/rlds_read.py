@@ -12,6 +12,7 @@ import tensorflow_datasets as tfds
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named, provenance_of
 from pipeline.errors import PipelineError
+from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.formats.rlds_layout import VERSION, dataset_of
@@ -69,8 +70,7 @@ def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
     place: Place | None = (folder / row["rlds_shard"], row["rlds_index"])
     steps = _columns(place)
     if steps is None or _id(steps) != episode_id:
-        shards = tuple(sorted((shard, shard.stat().st_mtime_ns) for shard in root.glob("*/*/*.tfrecord-*")))
-        place = _places(shards).get(episode_id)
+        place = _places(tuple(map(edition, sorted(root.glob("*/*/*.tfrecord-*"))))).get(episode_id)
         steps = _columns(place)
     try:
         return None if place is None or steps is None else _copy(steps, place, extras)
@@ -88,10 +88,10 @@ def _id(steps: Mapping[str, Any]) -> str:
 
 
 @lru_cache(maxsize=1)
-def _places(shards: tuple[tuple[Path, int], ...]) -> dict[str, Place]:
+def _places(shards: tuple[Edition, ...]) -> dict[str, Place]:
     """Episode id to its place, from all records up to the first of a shard that is damaged."""
     places: dict[str, Place] = {}
-    for shard, _ in shards:
+    for shard in (one.path for one in shards):
         try:
             for index, record in enumerate(records(shard)):
                 places[_id(columns(record, _info(shard.parent).features))] = (shard, index)
@@ -102,7 +102,7 @@ def _places(shards: tuple[tuple[Path, int], ...]) -> dict[str, Place]:
 
 def _info(folder: Path) -> Any:
     try:
-        return _opened(folder, (folder / "dataset_info.json").stat().st_mtime_ns)
+        return _opened(edition(folder / "dataset_info.json"))
     except (OSError, ValueError, KeyError) as error:
         raise PipelineError(
             f"{type(error).__name__}: {error}", where=folder, expected="a set that TFDS opens", remedy="dvc repro"
@@ -110,8 +110,8 @@ def _info(folder: Path) -> Any:
 
 
 @lru_cache(maxsize=8)
-def _opened(folder: Path, modified_ns: int) -> Any:
-    return tfds.builder_from_directory(folder).info
+def _opened(info_file: Edition) -> Any:
+    return tfds.builder_from_directory(info_file.path.parent).info
 
 
 def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:

@@ -45,7 +45,9 @@ def write_shard(path: Path, episode_ids: Sequence[str], load: Load, extras: tupl
         for episode_id in episode_ids:
             episode = load(episode_id)
             check(episode, extras)
-            file.write(framed(_serialize(episode, extras)))
+            example = _serializer(extras).get_tf_example(features(extras).encode_example(_tree(episode)))
+            # Left to itself, protobuf orders its map anew in every process.
+            file.write(framed(example.SerializeToString(deterministic=True)))
 
 
 def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extra, ...] = ()) -> None:
@@ -54,7 +56,6 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
     Args:
         folder: ``<name>/1.0.0``.
         lengths: each shard of it, in order, to its number of episodes.
-        extras: what the episodes have beside the frames.
     """
     infos = []
     for split_name in sorted({split_of(shard) for shard in lengths}):
@@ -95,16 +96,16 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     )
     turned = f"RGB, before the action, turned by {SCHEMA.image_rotation_deg} degrees from how MuJoCo renders it"
     observation = {view: frame(doc=f"camera {spec.camera}: {turned}") for view, spec in SCHEMA.views.items()}
-    observation |= {"state": _vector(SCHEMA.state), "joint_state": _vector(SCHEMA.joint_state)}
+    observation |= {"state": _tensor(SCHEMA.state), "joint_state": _tensor(SCHEMA.joint_state)}
     for name in (name for name in MAPS if name in extras):
         observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
     if "object_poses" in extras:
-        observation["object_poses"] = _matrix(SCHEMA.object_poses)
+        observation["object_poses"] = _tensor(SCHEMA.object_poses)
     scalar = tfds.features.Scalar
     failures = "outcome" in extras
     step = {
         "observation": observation,
-        "action": _vector(SCHEMA.action),
+        "action": _tensor(SCHEMA.action),
         "discount": scalar(np.float32, doc="always 1"),
         "reward": scalar(np.float32, doc="always 0" if failures else "1 on the last step, else 0"),
         "is_first": scalar(np.bool_, doc="first step of the episode"),
@@ -121,20 +122,15 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
     for key, dtype in provenance_of(extras).items():
         doc = meanings[key]
         metadata[key] = tfds.features.Text(doc=doc) if dtype == "string" else scalar(np.dtype(dtype), doc=doc)
-    metadata |= {f"{view}_{name}": _matrix(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
+    metadata |= {f"{view}_{name}": _tensor(getattr(SCHEMA, name)) for view in SCHEMA.views for name in MATRICES}
     if named(extras):
         metadata["instances"] = tfds.features.Text(doc="JSON list of names; segmentation and poses have places in it")
     return tfds.features.FeaturesDict({"steps": tfds.features.Dataset(step), "episode_metadata": metadata})
 
 
-def _vector(spec: VectorSpec) -> Any:
-    return tfds.features.Tensor(
-        shape=spec.shape, dtype=np.dtype(spec.dtype), doc=f"{spec.meaning}: {', '.join(spec.names)}"
-    )
-
-
-def _matrix(spec: MatrixSpec) -> Any:
-    return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=spec.meaning)
+def _tensor(spec: VectorSpec | MatrixSpec) -> Any:
+    names = f": {', '.join(spec.names)}" if isinstance(spec, VectorSpec) else ""
+    return tfds.features.Tensor(shape=spec.shape, dtype=np.dtype(spec.dtype), doc=spec.meaning + names)
 
 
 def _map(spec: MapSpec) -> Any:
@@ -142,12 +138,6 @@ def _map(spec: MapSpec) -> Any:
     return tfds.features.Image(
         shape=(height, width, 1), dtype=np.dtype(spec.dtype), encoding_format=spec.encoding, doc=spec.meaning
     )
-
-
-def _serialize(episode: Episode, extras: tuple[Extra, ...]) -> bytes:
-    """``tf.train.Example`` of an episode; left to itself, protobuf orders its map anew in every process."""
-    example = _serializer(extras).get_tf_example(features(extras).encode_example(_tree(episode)))
-    return bytes(example.SerializeToString(deterministic=True))
 
 
 @cache

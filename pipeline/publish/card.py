@@ -7,6 +7,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,10 @@ import yaml
 from huggingface_hub import DatasetCardData
 
 from pipeline.axes import from_json
-from pipeline.axes.base import Credit, Layer, Perturbation
+from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.base import Format
-from pipeline.publish.attribution import attributions
-from pipeline.report.yields import LEVELS
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, named, tally, tried
 
@@ -50,14 +48,9 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
         name: what all of them together are called.
 
     Raises:
-        PipelineError: when something that it describes is missing, or nothing was kept.
+        PipelineError: when something that it describes cannot be read.
     """
-    missing = [name for name in (*REPORTS, "manifest.parquet", "finetune/finetune.yaml") if not (data / name).is_file()]
-    if missing:
-        raise PipelineError(f"{', '.join(missing)} not there", where=data, remedy="dvc repro")
     rows = manifest.read(data / "manifest.parquet")
-    if not any(row["kept"] for row in rows):
-        raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
     reports = {name: read_json(data / name) for name in REPORTS}
     clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)
@@ -89,19 +82,15 @@ def render(
     """The card of one format, with the hub's metadata in front.
 
     Args:
-        shown: the format.
         others: titles of the other formats.
-        rows: the manifest.
         reports: what the files of ``REPORTS`` hold.
         clients: the section of that name in ``finetune.yaml``: where and how each policy's code is called.
         sheets: the axes that have a picture.
-        name: what the run's datasets together are called.
     """
     leakage, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
     owed = attributions(row["perturbations"] for row in kept)
     free = all(FREE.match(one.licence) for one in owed)
-    axes = _axes(kept, shown)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pipeline.publish"),
         undefined=jinja2.StrictUndefined,
@@ -109,6 +98,7 @@ def render(
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
+    environment.globals["line"] = _line
     return environment.get_template("card.md.j2").render(
         metadata=_metadata(shown, name, free).to_yaml(),
         format=shown.title,
@@ -119,24 +109,19 @@ def render(
         kept=kept,
         origins=Counter({row["demo_id"]: row["demo_origin"] for row in kept}.values()),
         steps=sum(row["steps"] for row in kept),
-        episodes=_episodes(rows),
-        levels=table(
-            ["axis", *(f"level {level}" for level in LEVELS)],
-            [[axis, *(facts["levels"][level] for level in LEVELS)] for axis, facts in axes.items()],
-        ),
-        axes=axes,
+        rows=rows,
+        suites=named(rows, "suite"),
+        planned=named(tried(rows), "axis"),
+        counts=Counts.of,
+        levels=LEVELS,
+        axes=_axes(kept, shown),
         sheets=sheets,
         yields=_yields(rows),
         leakage=leakage,
-        distances=_distances(leakage),
-        coverage=_coverage(leakage),
         schema=SCHEMA,
         gripper=shown.gripper,
-        statistics=[_statistics(dataset, figures["action"]) for dataset, figures in statistics.items()],
-        validation=table(
-            ["check", "checked", "result"],
-            [[check, found["checked"], _result(found["findings"])] for check, found in validation.items()],
-        ),
+        statistics=statistics,
+        validation=validation,
         failed=[check for check, found in validation.items() if found["findings"]],
         clients={client: call for client, call in clients.items() if client in shown.clients},
         # Any will do: whoever has the dataset can try the command as it stands.
@@ -145,8 +130,18 @@ def render(
         devices=sorted({row["gl_device"] for row in kept}),
         free=free,
         citation=schema_file("citation.bib").read_text(),
-        owed=table([*Credit._fields, "episodes"], [[*credit, episodes] for credit, episodes in owed.items()]),
+        owed=owed,
     )
+
+
+def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
+    """Everything of others' that episodes show, by kind and name, to how many of them show it.
+
+    Args:
+        perturbations: for each episode, the column of that name in the plan or the manifest. Nothing else is read.
+    """
+    shown = Counter(credit for text in perturbations for credit in {*chain(*(p.credits() for p in from_json(text)))})
+    return dict(sorted(shown.items(), key=lambda one: (one[0].kind, *one[0])))
 
 
 def _metadata(shown: AnyFormat, name: str, free: bool) -> DatasetCardData:
@@ -189,64 +184,22 @@ def _changes(change: Perturbation, shown: AnyFormat) -> str:
     return f"{views}, state and length" if change.layer == Layer.PHYSICS else views
 
 
-def _episodes(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Kept episodes by axis and suite, with totals."""
-    suites = named(rows, "suite")
-    lines: list[tuple[str, dict[str, str]]] = [(axis, {"axis": axis}) for axis in named(tried(rows), "axis")]
-    body = [
-        [name, *(Counts.of(rows, suite=suite, **of).kept for suite in suites), Counts.of(rows, **of).kept]
-        for name, of in (*lines, ("**all**", {}))
-    ]
-    return table(["axis", *suites, "all"], body)
-
-
-def _yields(rows: Sequence[Mapping[str, Any]]) -> str:
+def _yields(rows: Sequence[Mapping[str, Any]]) -> list[list[object]]:
     """What became of the planned episodes of each axis."""
     lost = tally([row for row in tried(rows) if not row["kept"]], "reason")
     modes = tally([row for row in rows if row["kept"]], "replay_mode")
-    body = []
+    body: list[list[object]] = []
     for axis in named(tried(rows), "axis"):
         counts = Counts.of(rows, axis=axis)
-        told = (_listed(found.get(axis, {})) for found in (lost, modes))
+        found = (", ".join(f"{name} {count}" for name, count in one.get(axis, {}).items()) for one in (lost, modes))
+        told = [text or None for text in found]
         body.append([axis, counts.planned, counts.replayed, counts.kept, f"{counts.kept / counts.planned:.0%}", *told])
-    return table(["axis", "planned", "replayed", "kept", "yield", "dropped for", "replayed"], body)
+    return body
 
 
-def _distances(leakage: Mapping[str, Mapping[str, Any]]) -> str:
-    columns = ("rows", "test_tasks", "comparisons", "overlaps", "clearance", "smallest", "verdict")
-    return table(["axis", *columns], [[axis, *(found[name] for name in columns)] for axis, found in leakage.items()])
-
-
-def _coverage(leakage: Mapping[str, Mapping[str, Any]]) -> str:
-    columns = ("test_tasks", "compared", "smallest", "median", "p90", "largest")
-    body = [
-        [axis, component, *(one[name] for name in columns)]
-        for axis, finding in leakage.items()
-        for component, one in finding["coverage"].items()
-    ]
-    return table(["axis", "component", *columns], body)
-
-
-def _statistics(dataset: str, action: Mapping[str, Sequence[float]]) -> str:
-    columns = ("mean", "std", "min", "q01", "q99", "max")
-    body = [[name, *(action[column][k] for column in columns)] for k, name in enumerate(SCHEMA.action.names)]
-    return table([dataset, *columns], body)
-
-
-def _result(findings: Sequence[object]) -> str:
-    return f"{len(findings)} findings, such as: {findings[0]}" if findings else "passed"
-
-
-def _listed(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{name} {count}" for name, count in counts.items()) or "-"
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    """A table in Markdown; columns whose first cell is a number are set to the right. No rows, no table."""
-    if not rows:
-        return ""
-    rule = ["---:" if isinstance(cell, int | float) else "---" for cell in rows[0]]
-    return "\n".join(f"| {' | '.join(map(_cell, row))} |" for row in (head, rule, *rows))
+def _line(*cells: object) -> str:
+    """Of a table in Markdown."""
+    return f"| {' | '.join(map(_cell, cells))} |"
 
 
 def _cell(value: object) -> str:

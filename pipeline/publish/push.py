@@ -8,15 +8,15 @@ leaves notes among the files, shows half a dataset meanwhile, and tries for ever
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Set
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Set
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import httpx
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, constants, errors, get_token
+from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, errors, get_token
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 
 from pipeline.errors import PipelineError
@@ -61,9 +61,6 @@ class Upload:
 def prepare(target: Format[Any]) -> Upload:
     """Gather what belongs to a dataset; nothing is sent.
 
-    Args:
-        target: the dataset.
-
     Raises:
         PipelineError: when files are missing, foreign, not validated, or failed validation.
     """
@@ -71,7 +68,8 @@ def prepare(target: Format[Any]) -> Upload:
     dataset = _exactly(target.folder, set(target.record().files))
     files = {target.repository_path(path): file for path, file in dataset.items()}
     _refuse_unvalidated(data, files, target.name)
-    _refuse_changed(target)
+    for fault in (fault for file in target.written() for fault in file.faults()):
+        raise PipelineError(fault.what, expected=fault.expected)
     card = data / "card" / target.name
     files |= {file.relative_to(card).as_posix(): file for file in card.rglob("*") if file.is_file()}
     files |= {name: data / name for name in ("manifest.parquet", *REPORTS)}
@@ -82,16 +80,14 @@ def prepare(target: Format[Any]) -> Upload:
     return Upload(dict(sorted(files.items())), folders, target.tag())
 
 
-def send(upload: Upload, repository: str, *, private: bool = False, endpoint: str | None = None) -> str:
-    """Create the repository if need be, send what it does not have, and tag it.
+def send(upload: Upload, repository: str, *, private: bool = False) -> str:
+    """Create the repository on the hub (of HF_ENDPOINT) if need be, send what it does not have, and tag it.
 
     Files of an earlier upload that the dataset no longer has are deleted by the same commit.
 
     Args:
-        upload: what ``prepare`` gathered.
         repository: ``owner/name``, or ``name`` for one of your own.
         private: whether a new repository is private; one that exists stays as it is.
-        endpoint: address of the hub, when not the usual one.
 
     Returns:
         The address of the commit.
@@ -99,7 +95,7 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
     Raises:
         PipelineError: without a token, without the right to write, or when the network or the hub fails.
     """
-    api = HfApi(endpoint=endpoint)
+    api = HfApi()
     try:
         if get_token() is None:
             raise PipelineError(
@@ -113,10 +109,9 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
             *(CommitOperationAdd(path, _content(path, file, repository)) for path, file in upload.files.items()),
             *(CommitOperationDelete(path, is_folder=False) for path in stale),
         ]
-        with _addresses_of(api.endpoint):
-            commit = api.create_commit(
-                repository, operations, repo_type="dataset", commit_message=f"Upload {len(upload.files)} files"
-            )
+        commit = api.create_commit(
+            repository, operations, repo_type="dataset", commit_message=f"Upload {len(upload.files)} files"
+        )
         if upload.tag is not None:  # moved, where it stands on an earlier upload
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
@@ -124,17 +119,6 @@ def send(upload: Upload, repository: str, *, private: bool = False, endpoint: st
     except FAILURES as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url
-
-
-@contextmanager
-def _addresses_of(endpoint: str) -> Iterator[None]:
-    """Have huggingface_hub understand the address of its own commit: it knows no hub but the one of ``HF_ENDPOINT``."""
-    saved = constants.ENDPOINT
-    constants.ENDPOINT = endpoint
-    try:
-        yield
-    finally:
-        constants.ENDPOINT = saved
 
 
 def _content(path: str, file: Path, repository: str) -> Path | bytes:
@@ -188,13 +172,6 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
                 # Forced: where a file was written anew with the same content, DVC sees nothing to do.
                 remedy="dvc repro --force --single-item validate card",
             )
-
-
-def _refuse_changed(target: Format[Any]) -> None:
-    """Stop where a file is not what was written, although its time says so."""
-    for file in target.written():
-        for fault in file.faults():
-            raise PipelineError(fault.what, expected=fault.expected)
 
 
 def _written(file: Path) -> int:

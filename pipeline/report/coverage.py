@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +12,7 @@ from pipeline.axes import AXES
 from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraPerturbation
-from pipeline.axes.language import CLASSES, LanguagePerturbation, distance
-from pipeline.axes.layout import LayoutPerturbation
+from pipeline.axes.language import CLASSES, distance
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.axes.pose import PosePerturbation
@@ -34,13 +33,11 @@ class Draw(NamedTuple):
     """One perturbation of a kept episode.
 
     Attributes:
-        task: the episode's.
-        made: what was drawn.
         resolved: what it did in the scene, None where nothing was recorded.
     """
 
     task: Task
-    made: Perturbation
+    made: Any
     resolved: Any
 
 
@@ -53,7 +50,16 @@ class AxisPlots(NamedTuple):
 
 def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     """The coverage of one axis by the draws on it."""
-    shown = _plots(axis, draws, test)
+    made = [draw.made for draw in draws]
+    of_draws = {"language": _language, "layout": _layout}
+    alone: dict[str, Callable[[Sequence[Any], TestSet], AxisPlots]] = {
+        **{"camera": _camera, "light": _light, "background": _background},
+        **{"noise": _noise, "pose": _pose, "robot": _robot},
+    }
+    if axis in of_draws:
+        shown = of_draws[axis](draws, test)
+    else:
+        shown = alone[axis](made, test) if axis in alone else _numbers(axis, made, test)
     unit = AXES[axis].draws[0].unit
     if unit is None or not test.of(axis):
         return shown
@@ -69,28 +75,6 @@ def _distances(axis: str, draws: Sequence[Draw], test: TestSet, unit: str) -> Pa
         for component in dict.fromkeys(components.tolist())
     }
     return strips("from each test task to the nearest draw", rows, unit)
-
-
-def _plots(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
-    made = [draw.made for draw in draws]
-    match axis:
-        case "camera":
-            return _camera([p for p in made if isinstance(p, CameraPerturbation)], test)
-        case "light":
-            return _light([p for p in made if isinstance(p, LightPerturbation)], test)
-        case "background":
-            return _background([p for p in made if isinstance(p, BackgroundPerturbation)], test)
-        case "noise":
-            return _noise([p for p in made if isinstance(p, NoisePerturbation)], test)
-        case "language":
-            return _language([(d.task, d.made) for d in draws if isinstance(d.made, LanguagePerturbation)], test)
-        case "layout":
-            return _layout(draws, test)
-        case "pose":
-            return _pose([p for p in made if isinstance(p, PosePerturbation | ScenePerturbation)], test)
-        case "robot":
-            return _robot([p for p in made if isinstance(p, RobotPerturbation)], test)
-    return _numbers(axis, made, test)
 
 
 def _numbers(axis: str, draws: Sequence[Perturbation], test: TestSet) -> AxisPlots:
@@ -174,11 +158,11 @@ def _noise(draws: Sequence[NoisePerturbation], test: TestSet) -> AxisPlots:
     )
 
 
-def _language(draws: Sequence[tuple[Task, LanguagePerturbation]], test: TestSet) -> AxisPlots:
+def _language(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     tested = test.of("language")
     original = {(t.suite, t.base): find_task(t.suite, t.base).instruction for t in tested}
     far = np.array([distance(str(t.parameters["text"]), original[t.suite, t.base]) for t in tested])
-    own = [(p.component, distance(p.text, task.instruction)) for task, p in draws]
+    own = [(draw.made.component, distance(draw.made.text, draw.task.instruction)) for draw in draws]
     rows = {
         name.replace("_", " "): {"language": np.array([away for component, away in own if component == name])}
         for name in CLASSES
@@ -200,16 +184,13 @@ def _language(draws: Sequence[tuple[Task, LanguagePerturbation]], test: TestSet)
 def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     tested = [task.parameters for task in test.of("layout")]
     places = [pair.split(",") for known in tested for pair in str(known["positions"]).split(";") if pair]
-    own, counts = [], []
+    own = []
     for draw in draws:
-        if isinstance(draw.made, LayoutPerturbation):
-            counts.append(len(draw.made.objects))
-            centre = STUDY_TABLE_M if bddl.read(draw.task.bddl_file).arena == "study" else np.zeros(2)
-            placed = draw.resolved["objects"] if draw.resolved else ()
-            own += [np.array(thing["position_m"][:2]) - centre for thing in placed]
-    categories = {
-        added.category for draw in draws if isinstance(draw.made, LayoutPerturbation) for added in draw.made.objects
-    }
+        centre = STUDY_TABLE_M if bddl.read(draw.task.bddl_file).arena == "study" else np.zeros(2)
+        placed = draw.resolved["objects"] if draw.resolved else ()
+        own += [np.array(thing["position_m"][:2]) - centre for thing in placed]
+    counts = [len(draw.made.objects) for draw in draws]
+    categories = {added.category for draw in draws for added in draw.made.objects}
     groups = {"benchmark": np.unique(np.array(places, float).reshape(-1, 2), axis=0), "layout": np.array(own)}
     number = {"benchmark": np.array([float(known["count"]) for known in tested]), "layout": np.array(counts, float)}
     return AxisPlots(

@@ -115,7 +115,6 @@ class Estimate:
     """A success rate over the benchmark's tasks, from some of them.
 
     Attributes:
-        episodes: it rests on.
         rate: in [0, 1].
         effective: the number of equally weighted episodes that would be as informative (Kish, 1965).
         low, high: Wilson's 95 % interval for that number (Korn and Graubard, 1998).

@@ -55,9 +55,6 @@ class Stage:
     """A task set up to be looked at.
 
     Attributes:
-        demo: one of its demonstrations.
-        scene: the demonstration's first state.
-        opened: where scenes are rendered.
         replay: how a run settles, and treats the demonstration's no-ops.
     """
 
@@ -145,13 +142,7 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
 
 
 def configured(name: str, config: Config) -> Axis:
-    """The axis with the ranges of the configuration, or with its default ranges where the configuration has none.
-
-    Raises:
-        PipelineError: when there is no such axis.
-    """
-    if name not in AXES:
-        raise PipelineError(f"no axis {name!r}", expected=" or ".join(AXES))
+    """The axis with the ranges of the configuration, or with its default ranges where the configuration has none."""
     return config.plan.axes.drawn().get(name) or AXES[name]()
 
 
@@ -180,9 +171,6 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     What a scene refuses is a grey tile with the reason.
 
     Args:
-        stage: the demonstration to show.
-        name: the axis.
-        config: its ranges, and the seed.
         test: the benchmark's test tasks, which the plan's draws keep clear of.
     """
     demo, seed = stage.demo, config.plan.seed
@@ -226,8 +214,6 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     Of an axis it shows the strongest of the plan's first draws that the scene does not refuse.
 
     Args:
-        stage: the demonstration to show.
-        config: the ranges, and the seed.
         test: the benchmark's test tasks, which the plan's draws keep clear of.
 
     Raises:
@@ -256,11 +242,10 @@ def _strongest(stage: Stage, drawn: Sequence[Perturbation], view: str) -> Tile:
     raise refused
 
 
-def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:
+def for_run(config: Config, folder: Path, workers: Workers) -> None:
     """Show every configured axis that applies on the first task of each suite that the run is about.
 
-    Returns:
-        Suite to the folder of its sheets, ``<folder>/<suite>/<axis>.png``.
+    A sheet is ``<folder>/<suite>/<axis>.png``.
     """
     by_suite: dict[str, list[Task]] = {}
     for task in select_tasks(config.demos.tasks):
@@ -272,7 +257,6 @@ def for_run(config: Config, folder: Path, workers: Workers) -> dict[str, Path]:
             workers(_draw_all, jobs, "previews")
         finally:
             scene_of_process().close()
-    return {suite: folder / suite for suite in by_suite}
 
 
 def _draw_all(job: tuple[list[Task], Config, Path, TestSet]) -> None:

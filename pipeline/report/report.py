@@ -11,22 +11,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from PIL import Image
 
 from pipeline.axes import TextPerturbation, from_json
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.libero.tasks import find_task
 from pipeline.planning.streams import streams_of
-from pipeline.report import clips, coverage, figures, pages, seen, yields
-from pipeline.report.clips import Clip
+from pipeline.report import coverage, figures, pages, seen, yields
 from pipeline.report.coverage import AxisPlots, Draw
 from pipeline.report.figures import Panel
+from pipeline.report.pages import Clip
 from pipeline.report.sheets import describe
 from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
-from pipeline.run.counts import Counts, Rows
+from pipeline.run.counts import Counts, Rows, by_axis
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
@@ -53,7 +53,7 @@ def page(config: Config, test: TestSet) -> str:
     """The report of a finished run.
 
     Raises:
-        PipelineError: when the run's folder lacks what an earlier stage makes, or nothing was kept.
+        PipelineError: when the run's folder lacks what an earlier stage makes.
     """
     data = config.data
     rows: Rows = manifest.read(data / "manifest.parquet")
@@ -61,8 +61,6 @@ def page(config: Config, test: TestSet) -> str:
     load = EpisodeLoader(data, config.render)
     tried = counts.tried(rows)
     kept = [row for row in tried if row["kept"]]
-    if not kept:
-        raise PipelineError("no episode was kept", where=data / "manifest.parquet", remedy="read its column reason")
     actions = _actions(kept, FrameStore(data / "frames", config.render))
     axes = list(dict.fromkeys(row["axis"] for row in kept))
     sheets = _pictures(data / "sheets")
@@ -72,7 +70,7 @@ def page(config: Config, test: TestSet) -> str:
         headline=_headline(tried, kept),
         yields=yields.tables(tried),
         axes=axes,
-        overall=_overall(kept, actions),
+        overall=_histograms({axis: _stacked(rows, actions) for axis, rows in by_axis(kept).items()}),
         by_axis=_own_motion(kept, actions),
         lengths=_lengths(rows, kept),
         quality=_quality(kept),
@@ -125,15 +123,11 @@ def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id")
     return np.concatenate([actions[row[key]] for row in rows])
 
 
-def _overall(kept: Rows, actions: Mapping[str, Floats]) -> list[Panel]:
-    return _histograms({axis: _stacked(rows, actions) for axis, rows in _by_axis(kept).items()})
-
-
 def _own_motion(kept: Rows, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:
     """Axis to its actions beside those of its episodes' twins, for axes with replays of their own."""
     by_id = {row["episode_id"]: row for row in kept}
     shown = {}
-    for axis, rows in _by_axis(kept).items():
+    for axis, rows in by_axis(kept).items():
         paired = [row for row in rows if row["twin_id"] in by_id]
         if any(row["trajectory_id"] != by_id[row["twin_id"]]["trajectory_id"] for row in paired):
             twins = _stacked(paired, actions, "twin_id")
@@ -145,13 +139,13 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
     """Episode lengths by suite, and against the twins', whether these were kept or not."""
     panels = []
     for suite in dict.fromkeys(row["suite"] for row in kept):
-        of_axis = _by_axis([row for row in kept if row["suite"] == suite]).items()
+        of_axis = by_axis([row for row in kept if row["suite"] == suite]).items()
         lengths = {axis: {axis: np.array([float(row["steps"]) for row in group])} for axis, group in of_axis}
         panels.append(figures.strips(suite, lengths, "steps"))
     steps = {row["episode_id"]: row["steps"] for row in rows}
     longer = {
         axis: {axis: np.array([row["steps"] - steps[row["twin_id"]] for row in group if steps[row["twin_id"]]])}
-        for axis, group in _by_axis(kept).items()
+        for axis, group in by_axis(kept).items()
         if axis != "clean"
     }
     return [*panels, figures.strips("longer than the twin by", longer, "steps")] if longer else panels
@@ -159,7 +153,7 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
 
 def _quality(kept: Rows) -> list[Panel]:
     """A panel for each figure of quality, by axis."""
-    groups = _by_axis(kept).items()
+    groups = by_axis(kept).items()
     return [
         figures.strips(
             each.name,
@@ -179,13 +173,6 @@ def _worst(kept: Rows, load: EpisodeLoader) -> list[Video]:
     moving = [row for row in of_trajectory.values() if row["non_target_moved_m"]]
     shown = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
     return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in shown]
-
-
-def _by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(row["axis"], []).append(row)
-    return groups
 
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
@@ -222,7 +209,7 @@ def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
     """The strongest episode of each axis that shows it in the agent view, the shortest of several, beside its twin."""
     by_id = {row["episode_id"]: row for row in kept}
     videos = []
-    for rows in _by_axis(kept).values():
+    for rows in by_axis(kept).values():
         seen = [row for row in rows if row["twin_id"] in by_id and _looks_different(row, by_id[row["twin_id"]])]
         if seen:
             row = min(seen, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
@@ -232,7 +219,7 @@ def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
 
 def _video(row: Mapping[str, Any], load: EpisodeLoader, caption: str) -> Video:
     twin, episode = load(row["twin_id"]), load(row["episode_id"])
-    return Video(row["axis"], caption, row["instruction"], clips.beside(twin.frames["image"], episode.frames["image"]))
+    return Video(row["axis"], caption, row["instruction"], pages.beside(twin.frames["image"], episode.frames["image"]))
 
 
 def _looks_different(row: Mapping[str, Any], twin: Mapping[str, Any]) -> bool:
@@ -245,7 +232,7 @@ def _level(row: Mapping[str, Any]) -> int:
 
 
 def _pictures(folder: Path) -> dict[str, str]:
-    return {file.stem: clips.picture_of(file) for file in sorted(folder.glob("*.png"))}
+    return {file.stem: pages.picture(Image.open(file)) for file in sorted(folder.glob("*.png"))}
 
 
 def _versions(rows: Rows) -> dict[str, str]:

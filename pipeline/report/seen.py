@@ -10,17 +10,13 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
-from pathlib import Path
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.table import Table
 from scipy.spatial.transform import Rotation
 
 from pipeline.axes import from_json
@@ -36,24 +32,21 @@ from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import decode
 from pipeline.libero import bddl
-from pipeline.libero.bddl import Arena
 from pipeline.libero.tasks import find_task
 from pipeline.planning.plan import Row
-from pipeline.planning.streams import streams_of
 from pipeline.run import outcome
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.finished import SEEN
 from pipeline.scenes.compiled import physics_to_read
 from pipeline.scenes.swept_path import SURFACES
-from pipeline.stores.frame_store import FrameStore
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats
 
-FILE = Path(__file__).parents[1] / "testset" / "seen.json"
-
 CAMERA_SIDE_M = 0.19
 """From where on, along x in the frame of the working surface, an object stands on the side of the agent camera."""
 
-CAMERA_M: dict[Arena, tuple[float, float]] = {
+CAMERA_M: dict[str, tuple[float, float]] = {
     "tabletop": (0.66, 0.71),
     "kitchen": (0.66, 0.71),
     "study": (0.66, 0.74),
@@ -68,7 +61,8 @@ SAMPLE = 200
 CHANGED_LEVELS = 8
 """A pixel has changed where a channel differs by so many grey levels."""
 
-NOT_HERE = "-"
+Places = dict[tuple[str, str], list[tuple[str, Shifts]]]
+"""Suite and task to the names and displacements of its tests, or of a run's episodes."""
 
 
 class Spread(NamedTuple):
@@ -108,15 +102,8 @@ class Measure(NamedTuple):
     ours: Spread | Share | None
 
 
-@dataclass(frozen=True)
-class Look:
-    """What is at rest or not in one state.
-
-    Attributes:
-        position_m, rotation: of the hand, in the world's frame.
-        gripper_mm: between the fingers.
-        hand_cm_s, object_cm_s: speed of the hand, and of the fastest movable object.
-    """
+class Look(NamedTuple):
+    """One state: the hand in the world's frame, the gap of its fingers, its speed, and that of the fastest object."""
 
     position_m: Floats
     rotation: Rotation
@@ -144,7 +131,7 @@ class Look:
         )
 
     def measures(self) -> dict[str, float]:
-        """What is the same for every episode that changes nothing."""
+        """Of an episode that changes nothing."""
         return {
             "clean: gripper at the first look (mm)": self.gripper_mm,
             "clean: hand's speed at the first look (cm/s)": self.hand_cm_s,
@@ -153,18 +140,11 @@ class Look:
 
     def away_from(self, other: Look, component: str, level: int) -> dict[str, float]:
         """How far the hand is from where it is without a change of the robot."""
-        moved_cm = 100 * float(np.linalg.norm(self.position_m - other.position_m))
         turned_deg = float(np.degrees((self.rotation * other.rotation.inv()).magnitude()))
         return {
-            f"robot: hand moved by {component}, level {level} (cm)": moved_cm,
+            f"robot: hand moved by {component}, level {level} (cm)": 100 * math.dist(self.position_m, other.position_m),
             f"robot: hand turned by {component}, level {level} (degrees)": turned_deg,
         }
-
-
-@cache
-def _run_tests() -> dict[str, Spread | Share]:
-    """What was measured by running test tasks."""
-    return {name: Spread(*values) for name, values in json.loads(FILE.read_text()).items()}
 
 
 def measure(config: Config, test: TestSet) -> list[Measure]:
@@ -174,29 +154,15 @@ def measure(config: Config, test: TestSet) -> list[Measure]:
         PipelineError: when the run lacks a trajectory or frames.
     """
     run = outcome.read(config)
-    rows = {row.episode_id: row for row in run.rows}
     # In the order in which they are written: shuffled, so that the first of each axis are of many tasks.
-    kept = [rows[episode_id] for episode_id in run.kept]
+    kept = [run.row_of[episode_id] for episode_id in run.kept]
     seen = _Run(config, kept)
-    looked_at = chain.from_iterable(
-        seen.of(row)
-        for axis in dict.fromkeys(row.axis for row in kept)
-        for row in [row for row in kept if row.axis == axis][:SAMPLE]
-    )
-    ours = _summaries(chain(looked_at, to_nearest_draw(test, kept)))
-    told = chain.from_iterable(_of_test(task) for task in test.tasks)
-    tested = _run_tests() | _summaries(chain(told, to_nearest_test(test)))
+    by_axis = [[row for row in kept if row.axis == axis][:SAMPLE] for axis in dict.fromkeys(row.axis for row in kept)]
+    ours = _summaries(chain(*map(seen.of, chain(*by_axis)), to_nearest_draw(test, kept)))
+    run_once = {name: Spread(*values) for name, values in json.loads(SEEN.read_text()).items()}
+    tested = run_once | _summaries(chain(*map(_of_test, test.tasks), to_nearest_test(test)))
     named = ((name.partition(": "), name) for name in sorted({*tested, *ours}))
     return [Measure(axis, what, tested.get(name), ours.get(name)) for (axis, _, what), name in named]
-
-
-def table(measures: Sequence[Measure]) -> Table:
-    """The measures for people."""
-    shown = Table("axis", "what a policy sees: middle (tenth to ninetieth percentile)", "test tasks", "this run")
-    shown.caption = "A run adds each number of objects equally often, unless it is configured otherwise."
-    for one in measures:
-        shown.add_row(one.axis, one.what, *(NOT_HERE if of is None else str(of) for of in (one.tested, one.ours)))
-    return shown
 
 
 def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
@@ -215,7 +181,7 @@ class _Run:
 
     def __init__(self, config: Config, kept: Sequence[Row]):
         self._store = TrajectoryStore(config.data / "trajectories")
-        self._frames = FrameStore(config.data / "frames", config.render)
+        self._load = EpisodeLoader(config.data, config.render)
         self._twins = {row.episode_id: row for row in kept if row.role == "twin"}
         self._looks: dict[tuple[str, int], Look] = {}
 
@@ -232,12 +198,12 @@ class _Run:
                 away_cm = 100 * math.dist(self._look(row, end).position_m, self._look(twin, end).position_m)
                 yield f"disturbance: hand off its path after a push of level {change.level} (cm)", away_cm
             case (ScenePerturbation() as change,):
-                moves = {one.name: (one.dx_m, one.dy_m) for one in change.moves}
-                yield from _targets_moved(row.suite, row.task, moves, change.level)
+                yield from _targets_moved(row.suite, row.task, change.shifts, change.level)
             case (LayoutPerturbation() as change,):
                 trajectory = self._store.load(row.trajectory_id)
                 model, placed = physics_to_read(trajectory.model_xml), trajectory.scene.resolved["layout"]["objects"]
-                surface_m = model.body(next(name for name in SURFACES if _has_body(model, name))).pos
+                bodies = [model.body(body).name for body in range(model.nbody)]
+                surface_m = model.body(next(name for name in SURFACES if name in bodies)).pos
                 xy_m = np.array([thing["position_m"][:2] for thing in placed]) - surface_m[:2]
                 arena = bddl.read(find_task(row.suite, row.task).bddl_file).arena
                 yield from _added([added.name for added in change.objects], xy_m, arena)
@@ -259,12 +225,8 @@ class _Run:
 
     def _changed(self, row: Row, twin: Row) -> dict[str, Floats]:
         """View to the (H, W, 3) differences of the first frame from the twin's."""
-        first = []
-        for one in (row, twin):
-            streams = streams_of(one.perturbations)
-            rendered = self._frames.load(one.trajectory_id, [stream.stream_id for stream in streams.values()])
-            first.append({view: decode(rendered.streams[s.stream_id][0]).astype(float) for view, s in streams.items()})
-        return {view: np.abs(first[0][view] - first[1][view]) for view in SCHEMA.views}
+        own, others = (self._load(one.episode_id).frames for one in (row, twin))
+        return {view: np.abs(decode(own[view][0]).astype(float) - decode(others[view][0])) for view in SCHEMA.views}
 
 
 def _of_test(tested: TestTask) -> Iterator[tuple[str, float]]:
@@ -275,14 +237,12 @@ def _of_test(tested: TestTask) -> Iterator[tuple[str, float]]:
             yield from _targets_moved(tested.suite, tested.base, displacements(known), int(known["level"]))
         case "layout":
             xy_m = np.array([pair.split(",") for pair in str(known["positions"]).split(";")], float)
-            yield from _added(str(known["category"]).split(","), xy_m, cast(Arena, known["arena"]))
+            yield from _added(str(known["category"]).split(","), xy_m, str(known["arena"]))
         case "language":
             yield "language: words", len(str(known["text"]).split())
 
 
-def _targets_moved(
-    suite: str, task: str, moves: Mapping[str, tuple[float, float]], level: int
-) -> Iterator[tuple[str, float]]:
+def _targets_moved(suite: str, task: str, moves: Shifts, level: int) -> Iterator[tuple[str, float]]:
     for target in bddl.read(find_task(suite, task).bddl_file).targets:
         if target in moves:
             yield f"pose: target of {suite} moved, level {level} (cm)", 100 * float(np.hypot(*moves[target]))
@@ -293,39 +253,37 @@ def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, f
 
     Tests of tasks for which no row moves a thing are left out.
     """
-    drawn: dict[tuple[str, str], list[Shifts]] = defaultdict(list)
+    drawn: Places = defaultdict(list)
     for row in rows:
         for change in from_json(row.perturbations):
             match change:
                 case ScenePerturbation():
-                    drawn[row.suite, row.task].append({one.name: (one.dx_m, one.dy_m) for one in change.moves})
+                    drawn[row.suite, row.task].append((row.episode_id, change.shifts))
                 case PosePerturbation():
-                    drawn[row.suite, row.task].append({change.moved: (change.dx_m, change.dy_m)})
-    return _to_nearest(test, lambda tested: drawn[tested.suite, tested.base])
+                    shifts = {change.moved: (change.dx_m, change.dy_m)}
+                    drawn[row.suite, row.task].append((row.episode_id, shifts))
+    return _to_nearest(test, drawn)
 
 
 def to_nearest_test(test: TestSet) -> Iterator[tuple[str, float]]:
     """The same to the nearest place in another test of the same task: how close tests are to each other."""
-    moved: dict[tuple[str, str], dict[str, Shifts]] = defaultdict(dict)
+    moved: Places = defaultdict(list)
     for one in test.of("pose"):
-        moved[one.suite, one.base][one.name] = displacements(one.parameters)
-
-    def others(tested: TestTask) -> list[Shifts]:
-        return [shifts for name, shifts in moved[tested.suite, tested.base].items() if name != tested.name]
-
-    return _to_nearest(test, others)
+        moved[one.suite, one.base].append((one.name, displacements(one.parameters)))
+    return _to_nearest(test, moved)
 
 
-def _to_nearest(test: TestSet, shifts_for: Callable[[TestTask], Sequence[Shifts]]) -> Iterator[tuple[str, float]]:
+def _to_nearest(test: TestSet, places: Places) -> Iterator[tuple[str, float]]:
     for tested in test.of("pose"):
-        own, others = displacements(tested.parameters), shifts_for(tested)
+        own = displacements(tested.parameters)
+        others = [shifts for name, shifts in places[tested.suite, tested.base] if name != tested.name]
         for thing in bddl.read(find_task(tested.suite, tested.base).bddl_file).things_of_interest:
             apart_m = [math.dist(own[thing], other[thing]) for other in others if thing in other and thing in own]
             if apart_m:
                 yield f"pose: test's thing of interest in {tested.suite} to the nearest other (cm)", 100 * min(apart_m)
 
 
-def _added(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[str, float]]:
+def _added(models: Sequence[str], xy_m: Floats, arena: str) -> Iterator[tuple[str, float]]:
     """Of one scene with objects added: their models, and where they stand (N, 2) in the frame of the surface."""
     for number in range(1, 6):
         yield f"layout: scenes with {number} added", len(models) == number
@@ -335,7 +293,3 @@ def _added(models: Sequence[str], xy_m: Floats, arena: Arena) -> Iterator[tuple[
     for place in xy_m:
         yield "layout: object on the camera's side", bool(place[0] > CAMERA_SIDE_M)
         yield "layout: object to camera (m)", float(np.hypot(np.linalg.norm(place - [x_m, 0.0]), z_m))
-
-
-def _has_body(model: mujoco.MjModel, name: str) -> bool:
-    return bool(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) >= 0)

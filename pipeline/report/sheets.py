@@ -15,6 +15,7 @@ from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
+from pipeline.run.counts import by_axis
 from pipeline.types import Episode, Frame
 
 LINE_PX = 16
@@ -43,29 +44,18 @@ class Tile:
     caption: str
 
 
-def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], folder: Path) -> dict[str, Path]:
+def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode], folder: Path) -> None:
     """Write one sheet for each perturbed axis of a run.
 
     Args:
-        manifest: rows of the manifest.
-        load: reads an episode by its id.
-        folder: where the pictures go, one ``<axis>.png`` each.
-
-    Returns:
-        Axis to picture, for the axes with a kept episode.
+        folder: where the pictures go, one ``<axis>.png`` for each axis with a kept episode.
     """
-    by_axis: dict[str, list[Mapping[str, Any]]] = {}
-    for row in manifest:
-        if row["kept"] and row["role"] == "perturbed":
-            by_axis.setdefault(row["axis"], []).append(row)
-    written = {}
+    perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed"]
     with replaced(folder) as temporary:
         temporary.mkdir()
-        for axis, rows in by_axis.items():
+        for axis, rows in by_axis(perturbed).items():
             tiles = [_pair(row, load) for row in spread(rows, 4 * COLUMNS)]
             sheet(f"{axis}; {HEADER}", tiles).save(temporary / f"{axis}.png")
-            written[axis] = folder / f"{axis}.png"
-    return written
 
 
 def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:

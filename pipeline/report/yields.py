@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 from pipeline.axes import from_json
-from pipeline.axes.base import Level
+from pipeline.axes.base import LEVELS
 from pipeline.run.counts import Counts, Rows, named, tally
-
-LEVELS: tuple[Level, ...] = get_args(Level)
 
 
 class Cell(NamedTuple):

@@ -16,7 +16,6 @@ class Part(NamedTuple):
     """Files and folders of a run's folder that belong together.
 
     Attributes:
-        names: of them.
         made_by: the stages that make them, in words.
     """
 

@@ -47,10 +47,15 @@ def named(rows: Rows, column: str) -> list[str]:
 
 def tally(rows: Rows, column: str) -> dict[str, Counter[str]]:
     """Axis to how often each value of a column occurs on it."""
-    found: dict[str, Counter[str]] = {}
+    return {axis: Counter(row[column] for row in of_axis) for axis, of_axis in by_axis(rows).items()}
+
+
+def by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
+    """Axis to its rows."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
     for row in rows:
-        found.setdefault(row["axis"], Counter())[row[column]] += 1
-    return found
+        groups.setdefault(row["axis"], []).append(row)
+    return groups
 
 
 def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:

@@ -24,8 +24,6 @@ class EpisodeLoader:
     """Loads rendered episodes by id; small enough to send to a worker, which reads the plan once for itself.
 
     Attributes:
-        data: folder with the plan and the frame store.
-        config: how its frames are encoded.
         extras: ``outcome`` for failures.
         rewrites: episode id to other wordings of its task, where episodes come with them and with their subtasks.
     """

@@ -51,8 +51,6 @@ class Expansion:
     """What came of it.
 
     Attributes:
-        files: what was written.
-        written: demonstrations in them.
         dropped: reason to number of candidates.
         short: task to the number of demonstrations that no candidate was left for.
     """
@@ -70,11 +68,8 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was.
 
     Args:
-        out: folder to write to.
         demos: what the candidates are made from.
         rows: what ``candidates`` or ``resets`` drew for as many demonstrations.
-        per_task: how many to write.
-        workers: do the work.
 
     Raises:
         PipelineError: when a demonstration cannot be read, or finished replays would be made anew unasked.

@@ -26,7 +26,6 @@ from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.formats.registry import failures_of
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
 from pipeline.libero.tasks import find_task
-from pipeline.planning import plan
 from pipeline.run import outcome
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.seeding import digest
@@ -48,10 +47,11 @@ def export_run(kind: type[AnyFormat], config: Config) -> None:
             write_json(record, {})
         print(f"{kind.title} is not asked for: export.{kind.name} is null")
         return
-    _bring_up_to_date(kind(config.data, options, config.render.extras), kept_episodes(config), config)
-    for target in failures_of(config.data, config.export, config.render.extras):
-        if target.name == kind.name:
-            _bring_up_to_date(target, failed_episodes(config), config)
+    run = outcome.read(config)
+    targets = [kind(config.data, options, config.render.extras)]
+    targets += [one for one in failures_of(config.data, config.export, config.render.extras) if one.name == kind.name]
+    for target in targets:
+        _bring_up_to_date(target, episodes_of(target, config, run), config)
 
 
 def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> None:
@@ -60,7 +60,6 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> 
         target.record_file.unlink(missing_ok=True)
         print(f"no replay missed its goal: nothing is in {target.folder}")
         return
-    episodes = asked(target, config, episodes)
     if is_current(target, episodes):
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
         return
@@ -70,45 +69,29 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> 
     print(f"wrote {len(episodes.ids)} episodes to {target.folder}")
 
 
-def kept_episodes(config: Config) -> Episodes:
-    """The kept episodes of a run, in the order they are written."""
-    run = outcome.read(config)
-    return Episodes(_known(run, run.kept), EpisodeLoader(config.data, config.render))
+def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Episodes:
+    """What a dataset is made of: the kept episodes of a run, or its failures, in the order they are written.
 
-
-def failed_episodes(config: Config) -> Episodes:
-    """Its failures, where they are asked for, in the order they are written."""
-    run = outcome.read(config)
-    known = _known(run, outcome.shuffled(run.missed))
-    return Episodes(known, EpisodeLoader(config.data, config.render, ("outcome",)))
-
-
-def _known(run: outcome.Outcome, episode_ids: Sequence[str]) -> dict[str, Known]:
-    known = {}
-    for episode_id in episode_ids:
-        row = run.row_of[episode_id]
-        steps = run.trajectories[row.trajectory_id]["steps"]
-        known[episode_id] = Known(row.suite, run.content(episode_id), row.demo_id, row.instruction, steps)
-    return known
-
-
-def asked(target: AnyFormat, config: Config, episodes: Episodes) -> Episodes:
-    """Episodes with what a format takes beside: where it takes ``language``, rewrites and subtasks.
-
-    Rewrites are those that the run's language axis may draw for the episode, or its default ranges.
+    Where the format takes ``language``, they come with subtasks and with the rewrites that the run's language axis may
+    draw for them, or its default ranges.
     """
-    if not target.language:
-        return episodes
-    axis, test = config.plan.axes.language or LanguageAxis(), benchmark.load()
+    failures = "outcome" in target.extras
+    rewrites: dict[str, tuple[str, ...]] | None = {} if target.language else None
+    axis = config.plan.axes.language or LanguageAxis()
+    known: dict[str, Known] = {}
 
     @cache
     def wordings(suite: str, task: str, name: str) -> tuple[str, ...]:
-        return axis.wordings(find_task(suite, task), name.split("+"), test)
+        return axis.wordings(find_task(suite, task), name.split("+"), benchmark.load())
 
-    rows = {row.episode_id: row for row in plan.read(config.data / "plan.parquet")}
-    rewrites = {one: wordings(rows[one].suite, rows[one].task, rows[one].axis) for one in episodes.known}
-    known = {one: of._replace(content=digest(of.content, rewrites[one])[:16]) for one, of in episodes.known.items()}
-    extras: tuple[Extra, ...] = ("outcome",) if "outcome" in target.extras else ()
+    for one in outcome.shuffled(run.missed) if failures else run.kept:
+        row, content = run.row_of[one], run.content(one)
+        if rewrites is not None:
+            rewrites[one] = wordings(row.suite, row.task, row.axis)
+            content = digest(content, rewrites[one])[:16]
+        steps = run.trajectories[row.trajectory_id]["steps"]
+        known[one] = Known(row.suite, content, row.demo_id, row.instruction, steps)
+    extras: tuple[Extra, ...] = ("outcome",) if failures else ()
     return Episodes(known, EpisodeLoader(config.data, config.render, extras, rewrites))
 
 
@@ -209,8 +192,6 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     not on how often the work was interrupted.
 
     Args:
-        target: the format.
-        episodes: what to write.
         workers: do the work; one call for each piece.
 
     Raises:

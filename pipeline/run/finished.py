@@ -27,7 +27,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 FOLDER = ".finished"
 SEEN = Path(__file__).parents[1] / "testset" / "seen.json"
-"""What the report shows beside what the run shows."""
+"""What a policy sees in test tasks, which the report shows beside what it sees in the run."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,6 @@ class Memory:
     """What a stage's outputs were made from.
 
     Attributes:
-        data: the run's folder.
-        stage: which stage.
         made_by: the fingerprint of its inputs and recipe; None where an input has changed since it was recorded.
         outputs: files or folders of ``data``.
     """
@@ -80,12 +78,8 @@ def of_validate(config: Config) -> Memory:
         *(one.record_file for one in formats),
     ]
     whole = all(store.untouched() for store in stores) and all(untouched(one) for one in formats)
-    settings = [
-        settings_of(config.render),
-        settings_of(config.export),
-        settings_of(config.plan.axes),
-        checksum(BANK_FILE),
-    ]
+    sections = [settings_of(section) for section in (config.render, config.export, config.plan.axes)]
+    settings = [*sections, checksum(BANK_FILE)]
     made_by = fingerprint("checks", *settings, _contents(files, config.data)) if whole else None
     return Memory(config.data, "validate", made_by, ["validation.json"])
 
@@ -102,16 +96,18 @@ def of_summary(config: Config) -> Memory:
     """Of the contact sheets and previews."""
     frames = FrameStore(config.data / "frames", config.render)
     files = [*(config.data / name for name in ("plan.parquet", "manifest.parquet", "inputs.json")), frames.root / TABLE]
-    settings = [settings_of(config.demos), settings_of(config.plan), settings_of(config.replay)]
-    made_by = fingerprint("pictures", *settings, _contents(files, config.data)) if frames.untouched() else None
+    made_by = fingerprint("pictures", *_drawn_by(config), _contents(files, config.data)) if frames.untouched() else None
     return Memory(config.data, "summary", made_by, ["sheets", "previews"])
 
 
 def of_previews(config: Config) -> Memory:
     """Of the previews alone, which show no episode: what is kept and exported changes none."""
-    settings = [settings_of(config.demos), settings_of(config.plan), settings_of(config.replay)]
-    made_by = fingerprint("pictures", *settings, _contents([config.data / "inputs.json"], config.data))
+    made_by = fingerprint("pictures", *_drawn_by(config), _contents([config.data / "inputs.json"], config.data))
     return Memory(config.data, "previews", made_by, ["previews"])
+
+
+def _drawn_by(config: Config) -> list[dict[str, Any]]:
+    return [settings_of(section) for section in (config.demos, config.plan, config.replay)]
 
 
 def of_report(config: Config) -> Memory:

@@ -107,10 +107,6 @@ def known_speed(folder: Path) -> Speed | None:
 def record(folder: Path, trial: Mapping[str, str]) -> None:
     """Write what is here, unless the run was begun where the trial came to something else.
 
-    Args:
-        folder: of the run.
-        trial: digests of one.
-
     Raises:
         PipelineError: as ``refuse_another``.
     """

@@ -72,9 +72,7 @@ def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequen
     """Join the plan with what became of it.
 
     Args:
-        run: the plan, and what replay and rendering made of it.
         places: episode id to where it lies in the datasets, for every kept episode.
-        columns: those of ``places``.
     """
     own_versions = {version_column(name): version for name, version in versions().items()}
     table = []
@@ -158,8 +156,4 @@ def settings(path: Path) -> Settings:
 
 def made_with(row: Mapping[str, Any]) -> dict[str, str]:
     """Package to the version that a row was made with."""
-    return {
-        column.removesuffix("_version").replace("_", "-"): version
-        for column, version in row.items()
-        if column.endswith("_version")
-    }
+    return {name: row[version_column(name)] for name in VERSIONS}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -32,7 +33,6 @@ class Outcome:
     """The plan, and what replay and rendering made of it.
 
     Attributes:
-        rows: the plan.
         trajectories: trajectory id to its row in the table of replays.
         frames: trajectory id to what is stored of its frames.
         verdicts: episode id to verdict.
@@ -76,10 +76,7 @@ def replayed(
     """Trajectory id to its row in the table of replays.
 
     Args:
-        rows: the plan.
-        folder: of the trajectory store.
         rejected: episode id to the reason why its frames were rejected.
-        limits: of quality.
 
     Raises:
         PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
@@ -96,7 +93,6 @@ def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[st
     """Episode id to the reason why one of its streams was not rendered, where that is so.
 
     Args:
-        rows: the plan.
         frames: trajectory id to what is stored of its frames.
     """
     reasons: dict[str, str] = {}
@@ -151,3 +147,23 @@ def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
             where=missing[0],
             remedy=f"call `dvc repro`, or run the {stage} stage again: it makes only those",
         )
+
+
+def outdated(rows: Sequence[plan.Row], config: Config, device: str | None = None) -> Counter[str]:
+    """What of a plan's stored work this version, or this machine, would make anew, and why, to the number of files.
+
+    Counted are finished files of today's plan, with today's settings, that were made with other recipes, packages,
+    machine code or another OpenGL device: see ``identity.refuse_unasked``. A changed configuration or plan wants new
+    files, and nobody is asked.
+
+    Args:
+        device: what renders here, as OpenGL names it; without it, frames of any device count as finished.
+    """
+    planned = dict.fromkeys(row.trajectory_id for row in rows)
+    found: Counter[str] = Counter()
+    for what, reasons in (
+        ("trajectories", TrajectoryStore(config.data / "trajectories").outdated(planned)),
+        ("files of frames", FrameStore(config.data / "frames", config.render).outdated_of(planned, device)),
+    ):
+        found.update({f"{what}, made with {reason}": number for reason, number in reasons.items()})
+    return found

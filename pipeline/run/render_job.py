@@ -29,9 +29,6 @@ class RenderJob:
 
     Attributes:
         row: a row of the plan that has this trajectory.
-        streams: what to render.
-        trajectories, frames: folders of the stores.
-        config: how frames are encoded.
         device: what renders the run, as OpenGL names it.
     """
 

@@ -97,7 +97,6 @@ def _needed(
     """Name of each file that the plan needs to what is in it, as far as verdicts and rejections are known.
 
     Args:
-        rows: the plan.
         judged: trajectory id to its verdict.
         rejected: episode id to the reason why its frames were rejected.
         failures: reasons of dropped episodes that are rendered too.

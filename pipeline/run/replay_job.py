@@ -31,8 +31,6 @@ class ReplayJob:
     Attributes:
         row: a row of the plan that has this trajectory.
         twin: trajectory of the same demonstration without perturbations, which tracking follows.
-        demos, config: sections of the run's configuration.
-        folder: of the trajectory store.
     """
 
     row: Row

@@ -20,9 +20,6 @@ class Replays:
     """How the trajectories of a run are made.
 
     Attributes:
-        demos, config: sections of the run's configuration.
-        folder: of the trajectory store.
-        workers: do the work.
         limits: the section ``filter``.
     """
 
@@ -38,7 +35,6 @@ class Replays:
         The twins come first, because tracking follows them.
 
         Args:
-            rows: the plan.
             rejected: episode id to the reason why its frames were rejected, as far as frames were made.
 
         Returns:

@@ -7,6 +7,7 @@ other axes only this project's labels tell (``perturbations``), in the dataset o
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -40,7 +41,6 @@ class Found:
 
     Attributes:
         episode_id: this project's name of it, or what the dataset calls it.
-        instruction: the text that a policy is prompted with.
         extrinsics: (4, 4) from the agent view to the world (z forward, y down); None where the dataset has none.
         suite, task: of LIBERO; None where nothing tells.
         perturbations: the labels, as the manifest writes them; None where there are none.
@@ -59,7 +59,6 @@ class Audit:
     """What an audit found.
 
     Attributes:
-        episodes: of the dataset.
         axes: axis to how close its episodes come to the test tasks.
         unlabelled: episodes without labels, of which nothing is known but the instruction and the camera.
         without_camera: unlabelled episodes without the camera's matrices.
@@ -86,7 +85,6 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
 
     Args:
         dataset: a folder with an RLDS set (as TFDS writes it) or a LeRobot set (v3.0 or v2.1), or several below it.
-        test: the benchmark's tasks.
         manifest: gives the labels of episodes that have an ``episode_id`` and lost theirs.
 
     Raises:
@@ -94,19 +92,14 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
     """
     known = {} if manifest is None else _manifest(manifest)
     episodes = [_labelled(one, known) for one in read(dataset)]
-    rows: list[Compared] = []
-    strangers = 0
-    for one in episodes:
-        task = find_task(one.suite, one.task) if one.suite and one.task else _task_of(one.instruction)
-        if task is None:
-            strangers += 1
-        rows.append(_row(one, task, test))
+    found = [_task_of(one) for one in episodes]
+    rows = [_row(one, task, test) for one, task in zip(episodes, found, strict=True)]
     return Audit(
         len(episodes),
         compare(rows, test),
         sum(one.perturbations is None for one in episodes),
         sum(one.perturbations is None and one.extrinsics is None for one in episodes),
-        strangers,
+        found.count(None),
     )
 
 
@@ -117,7 +110,8 @@ def read(dataset: Path) -> Iterator[Found]:
         PipelineError: when there is none, or it cannot be read.
     """
     rlds, lerobot = (
-        sorted(file for file in dataset.rglob(name) if not _hidden(file.relative_to(dataset)))
+        # A hidden folder has what is not finished.
+        sorted(file for file in dataset.rglob(name) if not re.search(r"(^|/)\.", str(file.relative_to(dataset))))
         for name in ("features.json", "meta/info.json")
     )
     if not rlds and not lerobot:
@@ -133,11 +127,6 @@ def read(dataset: Path) -> Iterator[Found]:
             yield from _lerobot(file.parents[1])
     except (OSError, ValueError, KeyError) as error:
         raise PipelineError(f"cannot be read ({type(error).__name__}: {error})", where=dataset) from error
-
-
-def _hidden(path: Path) -> bool:
-    """Whether it lies in a folder of what is not finished."""
-    return any(part.startswith(".") for part in path.parts)
 
 
 def _rlds(folder: Path) -> Iterator[Found]:
@@ -165,7 +154,9 @@ def _lerobot(folder: Path) -> Iterator[Found]:
         episodes = [json.loads(line) for line in lines.read_text().splitlines()]
     else:
         files = sorted((folder / "meta" / "episodes").rglob("*.parquet"))
-        episodes = [row for file in files for row in pq.read_table(file, columns=_META).to_pylist()]
+        episodes = [
+            row for file in files for row in pq.read_table(file, columns=["episode_index", "tasks"]).to_pylist()
+        ]
     # Tools that delete, split or merge leave the provenance behind, and a folder may have both.
     provenance = folder / "meta" / "provenance.parquet"
     labels = (
@@ -184,9 +175,6 @@ def _lerobot(folder: Path) -> Iterator[Found]:
             row.get("task"),
             row.get("perturbations"),
         )
-
-
-_META = ["episode_index", "tasks"]
 
 
 def _ids(folder: Path) -> dict[int, str]:
@@ -224,13 +212,15 @@ def _row(one: Found, task: Task | None, test: TestSet) -> Compared:
             anywhere = tasks(TESTED_SUITES[0])[0]
             seen.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
     own = task is not None and normalise(one.instruction) == normalise(task.instruction)
-    rewrites = [] if own else [_rewrite(one.instruction)]
+    rewrites = [] if own else [LanguagePerturbation(component="paraphrase", level=1, text=one.instruction)]
     task = task or _nearest_task(rewrites[0], test)
     return Compared(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
 
 
-def _rewrite(text: str) -> LanguagePerturbation:
-    return LanguagePerturbation(component="paraphrase", level=1, text=text)
+def _task_of(one: Found) -> Task | None:
+    if one.suite and one.task:
+        return find_task(one.suite, one.task)
+    return _tasks_by_text().get(normalise(one.instruction))
 
 
 @cache
@@ -244,10 +234,6 @@ def _tasks_by_text() -> dict[str, Task]:
             for text in (*rewrites, task.instruction):
                 by_text[normalise(text)] = task
     return by_text
-
-
-def _task_of(instruction: str) -> Task | None:
-    return _tasks_by_text().get(normalise(instruction))
 
 
 def _nearest_task(rewrite: LanguagePerturbation, test: TestSet) -> Task:

@@ -45,7 +45,6 @@ class Case:
     """One episode and everything known of it.
 
     Attributes:
-        row: of the manifest.
         made: as the episode store has it.
         trajectory: the replay that it was rendered from.
         copies: as each dataset has it, as far as it could be read.

@@ -24,7 +24,6 @@ class Found:
     """What a check came to.
 
     Attributes:
-        files, demonstrations, replayed: how many there are.
         faults: each names its file, its demonstration where it is about one, and what to do.
         missed: demonstrations whose replay misses the goal, though another of their file does not.
     """
@@ -43,7 +42,6 @@ def check(root: Path, replays: int, run: Workers) -> Found:
 
     Args:
         root: folder with ``<suite>/<task>_demo.hdf5``.
-        replays: how many of each file.
         run: spreads the work; one call for each file.
 
     Raises:
@@ -92,13 +90,7 @@ class _Result:
 
 @dataclass(frozen=True)
 class _FileJob:
-    """The check of one file.
-
-    Attributes:
-        root: folder of all.
-        task: the file's.
-        replays: how many demonstrations to replay.
-    """
+    """The check of one file."""
 
     root: Path
     task: Task

@@ -6,6 +6,8 @@ The sizes are rounded up from four runs of one demonstration of 90 steps (``benc
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +69,12 @@ def needed_mb(config: Config) -> dict[str, float]:
         needed_kb["lerobot_v21"] = steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
     left_out = {"rlds", "lerobot"} - set(config.export.formats)
     return {folder: kb / 1e3 for folder, kb in needed_kb.items() if folder not in left_out} | {"sheets": RUN_MB}
+
+
+def free_gb(folder: Path) -> float:
+    """What is free where a folder is, or would be made."""
+    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
+    return shutil.disk_usage(there).free / 1e9
 
 
 class _Own(NamedTuple):

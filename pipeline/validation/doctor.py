@@ -28,9 +28,9 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.planning import plan
 from pipeline.run import machine
-from pipeline.run.remake import outdated
+from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
-from pipeline.validation.disk import RUN_MB, needed_mb
+from pipeline.validation.disk import RUN_MB, free_gb, needed_mb
 from pipeline.validation.duration import in_words, needed_s, workers_of
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
@@ -54,28 +54,24 @@ class Diagnosis:
     remedy: str = ""
 
 
-def check(
-    data: Path, *, need_gb: float, workers: int | None = None, demos: DemosConfig | None = None
-) -> list[Diagnosis]:
+def check(config: Config, need_gb: float) -> list[Diagnosis]:
     """Look at everything that takes no simulation; nothing is changed but the GL variables of the environment.
 
     Args:
-        data: folder that the run writes to; it need not exist.
-        need_gb: free space that the run needs there.
-        workers: worker processes of the run on this machine; one for each core when left out.
-        demos: the demonstrations of the run; the starter set when left out.
+        need_gb: free space that the run needs in its folder, which need not exist.
     """
+    demos = config.demos
     return [
         *_packages(),
         _tensorflow(),
         _opengl(),
         _ffmpeg(),
         _assets(),
-        _starter_demos() if demos is None or demos.root is None else _hdf5_demos(demos, demos.root),
-        _test_set(),
+        _starter_demos() if demos.root is None else _hdf5_demos(demos, demos.root),
+        _download("test set", benchmark.FOLDER / benchmark.WHEEL, _has_pip(), "pip", "fail"),
         *_further_sources(),
-        _disk(data, need_gb),
-        _machine(workers),
+        _disk(config.data, need_gb),
+        _machine(config.compute),
     ]
 
 
@@ -83,7 +79,6 @@ def run(config: Config, *, tried: bool = False) -> int:
     """Print what ``check`` and a trial find for a configuration; the exit status: 1 when something fails.
 
     Args:
-        config: of the run.
         tried: whether the trial was made before, on this machine as it is.
     """
     table = Table(box=None)
@@ -91,13 +86,8 @@ def run(config: Config, *, tried: bool = False) -> int:
         table.add_column(column, overflow="fold")
     styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
     made_gb = sum(file.stat().st_size for file in config.data.rglob("*") if file.is_file()) / 1e9
-    findings = check(
-        config.data,
-        # What is made already needs no more room, but for LeRobot's second copy while it is merged.
-        need_gb=max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3),
-        workers=_workers_here(config.compute),
-        demos=config.demos,
-    )
+    # What is made already needs no more room, but for LeRobot's second copy while it is merged.
+    findings = check(config, max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3))
     if all(finding.status != "fail" for finding in findings):
         findings += [*([] if tried else [_same(config.data)]), _finished(config), _time(config)]
     for finding in findings:
@@ -131,11 +121,6 @@ def _time(config: Config) -> Diagnosis:
     """Of the whole run, by the speed that the run's folder has or a trial finds."""
     speed = machine.known_speed(config.data) or machine.trial().speed
     return Diagnosis("time", "ok", in_words(needed_s(config, speed), workers_of(config.compute)))
-
-
-def _workers_here(compute: ComputeConfig) -> int | None:
-    """Worker processes on this machine: none of its own where a loop or a cluster elsewhere does the work."""
-    return compute.workers if compute.cluster == "local" else 1
 
 
 def _packages() -> Iterator[Diagnosis]:
@@ -235,10 +220,6 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     return Diagnosis("demos", "ok", detail)
 
 
-def _test_set() -> Diagnosis:
-    return _download("test set", benchmark.FOLDER / benchmark.WHEEL, _has_pip(), "pip", "fail")
-
-
 def _further_sources() -> Iterator[Diagnosis]:
     """Textures and objects that are not installed; only some configurations name them."""
     for name, wheel in texture_sources.WHEELS.items():
@@ -262,20 +243,21 @@ def _has_pip() -> bool:
 
 
 def _disk(data: Path, need_gb: float) -> Diagnosis:
-    folder = next(folder for folder in (data.absolute(), *data.absolute().parents) if folder.exists())
-    free_gb = shutil.disk_usage(folder).free / 1e9
-    detail = f"{free_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
-    if free_gb < need_gb:
+    there_gb = free_gb(data)
+    detail = f"{there_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
+    if there_gb < need_gb:
         return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
     return Diagnosis("disk", "ok", detail)
 
 
-def _machine(workers: int | None) -> Diagnosis:
+def _machine(compute: ComputeConfig) -> Diagnosis:
     """Cores and memory as Dask counts them, with the limits of a container."""
     from dask.system import CPU_COUNT
     from distributed.system import MEMORY_LIMIT
 
-    processes, memory_gb = workers or CPU_COUNT, MEMORY_LIMIT / 1e9
+    # None of its own where a loop or a cluster elsewhere does the work.
+    processes = (compute.workers or CPU_COUNT) if compute.cluster == "local" else 1
+    memory_gb = MEMORY_LIMIT / 1e9
     detail = f"{CPU_COUNT} cores, {memory_gb:.0f} GB for {processes} workers"
     if memory_gb < processes * WORKER_GB:
         remedy = f"set compute.workers to {max(1, int(memory_gb / WORKER_GB))}"

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,6 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     """Replay, render and serialise one kept episode again, and compare it with the dataset that lies by the manifest.
 
     Args:
-        episode_id: which.
         manifest_file: of the run; its ``rlds`` folder is looked for beside it.
         out: a new folder, which gets the replay, the frames, and the episode as an RLDS set of its own.
         root: folder of LIBERO's HDF5 demonstrations, where the run started from those.
@@ -66,14 +65,14 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     device = gl.choose().device
     rebuilt, reason = _rebuild(row, rows[row["twin_id"]], manifest.settings(manifest_file), out, root)
     dataset = next(manifest_file.parent.glob(f"rlds/*/*/{row['rlds_shard']}"), None)
-    stored = None if dataset is None else _Record.read(dataset, row["rlds_index"])
-    differs = _differences(stored.columns, rebuilt.columns) if stored and rebuilt else {}
+    stored = None if dataset is None else _record(dataset, row["rlds_index"])
+    differs = _differences(stored[1], rebuilt[1]) if stored and rebuilt else {}
     other_version = differs.pop(METADATA + manifest.OWN_VERSION, None) is not None
     return {
         "episode_id": episode_id,
         "identical": None
         if stored is None
-        else rebuilt is not None and (rebuilt.data == stored.data or (other_version and not differs)),
+        else rebuilt is not None and (rebuilt[0] == stored[0] or (other_version and not differs)),
         "reason": reason,
         "versions": {
             name: {"manifest": row[column], "here": here}
@@ -85,28 +84,15 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     }
 
 
-@dataclass(frozen=True)
-class _Record:
-    """An episode as it lies in a shard.
+_Record = tuple[bytes, dict[str, NDArray[Any]]]
+"""An episode as it lies in a shard: the serialised example, and its columns."""
 
-    Attributes:
-        data: the serialised example.
-        features: the feature tree of its dataset.
-    """
 
-    data: bytes
-    features: Any
-
-    @classmethod
-    def read(cls, shard: Path, index: int) -> _Record:
-        data = record_at(shard, index)
-        if data is None:
-            raise PipelineError(f"has no record {index}", where=shard, expected="as many as the manifest says")
-        return cls(data, tfds.builder_from_directory(shard.parent).info.features)
-
-    @property
-    def columns(self) -> dict[str, NDArray[Any]]:
-        return columns(self.data, self.features)
+def _record(shard: Path, index: int) -> _Record:
+    data = record_at(shard, index)
+    if data is None:
+        raise PipelineError(f"has no record {index}", where=shard, expected="as many as the manifest says")
+    return data, columns(data, tfds.builder_from_directory(shard.parent).info.features)
 
 
 def _rebuild(
@@ -143,7 +129,7 @@ def _rebuild(
     rebuilt = Rlds(out, RldsConfig(name="regenerated", shards=1), settings.render.extras)
     export(rebuilt, Episodes({row["episode_id"]: Known(row["suite"])}, load), loop)
     (shard,) = rebuilt.folder.rglob("*.tfrecord-*")
-    return _Record.read(shard, 0), "kept"
+    return _record(shard, 0), "kept"
 
 
 def _root(settings: manifest.Settings, root: Path | None) -> Path | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -15,11 +14,11 @@ from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.planning import plan
 from pipeline.run import cleaning, export, finished, inputs, machine, outcome
-from pipeline.run.remake import outdated
+from pipeline.run.outcome import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
-from pipeline.validation.disk import needed_mb
+from pipeline.validation.disk import free_gb, needed_mb
 from pipeline.validation.duration import in_words, needed_s, workers_of
 
 
@@ -93,22 +92,18 @@ def _steps(
 
 def _follow(config: Config) -> Iterator[tuple[str, str]]:
     """The stages after the frames."""
-    kept, failed = export.kept_episodes(config), export.failed_episodes(config)
+    run = outcome.read(config)
     sets = (config.data, config.export, config.render.extras)
     stale = False
-    datasets = [(one, kept) for one in formats_of(*sets)]
-    datasets += [(one, failed) for one in failures_of(*sets) if failed.ids]
-    for one, episodes in datasets:
+    for one in (*formats_of(*sets), *(failures_of(*sets) if run.missed else ())):
+        episodes = export.episodes_of(one, config, run)
         if not export.untouched(one):
-            yield f"export_{one.stage_record.stem}", f"{one.title}: there is no dataset, or files of it have changed"
-            stale = True
-            continue
-        asked = export.asked(one, config, episodes)
-        if one.record().identity != export.identity(one, asked):
-            why = next(iter(export.outdated(one, asked)), "files of other episodes or options")
-            yield f"export_{one.stage_record.stem}", f"{one.title}: the dataset has {why}"
+            why = "there is no dataset, or files of it have changed"
+        elif one.record().identity != export.identity(one, episodes):
+            why = f"the dataset has {next(iter(export.outdated(one, episodes)), 'files of other episodes or options')}"
         else:
             continue
+        yield f"export_{one.stage_record.stem}", f"{one.title}: {why}"
         stale = True
     if stale:
         yield "manifest and all that follows", "the datasets are not those"
@@ -164,10 +159,8 @@ def _time_left(
 
 def _disk(config: Config) -> str:
     used = cleaning.found(config.data, cleaning.PARTS)
-    folder = next(folder for folder in (config.data.absolute(), *config.data.absolute().parents) if folder.exists())
-    free_gb = shutil.disk_usage(folder).free / 1e9
     listed = ", ".join(f"{part} {size_mb / 1e3:.2f}" for part, size_mb in used.items() if size_mb >= 10)
     return (
         f"disk: {sum(used.values()) / 1e3:.2f} GB used{f' ({listed})' if listed else ''}, about "
-        f"{sum(needed_mb(config).values()) / 1e3:.1f} GB when all is made, {free_gb:.1f} GB free"
+        f"{sum(needed_mb(config).values()) / 1e3:.1f} GB when all is made, {free_gb(config.data):.1f} GB free"
     )

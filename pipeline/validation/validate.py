@@ -6,13 +6,13 @@ The datasets are compared with the stores that they were made from; those in tur
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.clients import oft
+from pipeline.clients import oft, oft_check
 from pipeline.compute.pool import Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
@@ -23,12 +23,13 @@ from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
+from pipeline.planning import plan
 from pipeline.rendering.last_scene import scene_of_process
 from pipeline.run import manifest, outcome
+from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Extra
-from pipeline.validation import run_checks
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import rendered, witnesses
 
@@ -73,7 +74,7 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
     rows = manifest.read(data / "manifest.parquet")
     kept = {row["episode_id"]: row for row in rows if row["kept"]}
     total = Results()
-    total.note("counts", run_checks.counts(data, rows), len(rows))
+    total.note("counts", _counts(data, rows), len(rows))
     asked = (data, config.export, config.render.extras)
     with scratch(data / ".work" / "validate") as cache:
         try:
@@ -93,7 +94,7 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
         # OFT's reader stops at what is damaged.
         sets = oft.datasets(data / "rlds")
         statistics = read_json(data / "dataset_statistics.json")
-        trained = workers(partial(run_checks.openvla_oft, statistics), sets, "read as OpenVLA-OFT")
+        trained = workers(partial(_openvla_oft, statistics), sets, "read as OpenVLA-OFT")
         total.note("openvla_oft", [finding for found in trained for finding in found], len(sets))
     return {
         check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
@@ -117,12 +118,35 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
             total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
             continue
         opened.append(one)
-        total.note("format", [fault for check, fault in found if check == "format"])
-        total.note("ids", [fault for check, fault in found if check == "ids"], len(episodes))
-        total.note("readable", [fault for check, fault in found if check == "readable"], 0)
+        for check, checked in (("format", 1), ("ids", len(episodes)), ("readable", 0)):
+            total.note(check, [fault for named, fault in found if named == check], checked)
     for results in workers(replace(job, formats=opened), _slices(episodes, job.witnesses, opened), "validate"):
         total.add(results)
     return total
+
+
+def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
+    """Every planned row in the manifest; no quota overfilled, and none left open while candidates are left."""
+    planned = [row.episode_id for row in plan.read(data / "plan.parquet")]
+    if planned != [row["episode_id"] for row in rows]:
+        yield Fault("manifest", None, f"{len(rows)} rows", f"the {len(planned)} of the plan, in its order")
+    quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        quotas[row["axis"], row["suite"], row["task"]].append(row)
+    for (axis, suite, task), members in quotas.items():
+        wanted = sum(row["wanted"] for row in members)
+        kept = sum(row["kept"] or row["reason"] == outcome.LEFT_OUT for row in members)
+        left = any(row["reason"] in ("reserve_not_needed", "not_replayed") for row in members)
+        if kept > wanted or (kept < wanted and left):
+            yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
+    if read_json(data / "counts.json") != by_axis_and_suite(rows):
+        yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
+
+
+def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> list[Fault]:
+    """What would mislead OpenVLA-OFT."""
+    found, name = oft_check.check(folder, statistics), folder.parent.name
+    return [Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in found["violations"]]
 
 
 def _as_a_whole(kept: Mapping[str, Row], cache: Path, one: Format[Any]) -> list[tuple[str, Fault]]:
@@ -149,8 +173,6 @@ class EpisodesJob:
     """The checks of some episodes, wherever they lie.
 
     Attributes:
-        config: of the run.
-        data: its folder.
         formats: the datasets that can be opened.
         cache: folder for files that reading them needs.
         witnesses: ids of the episodes to render anew.
@@ -172,17 +194,18 @@ class EpisodesJob:
 
     def _check(self, row: Row, results: Results) -> None:
         episode_id = row["episode_id"]
-        copies, missing, unreadable = [], [], []
+        copies = []
+        results.note("readable", [])
         for one in self.formats:
             try:
                 if (copy := one.read(row, self.cache)) is not None:
                     copies.append(copy)
                 else:
-                    missing.append(Fault(one.name, episode_id, "is not in the dataset", "every kept episode"))
+                    missing = Fault(one.name, episode_id, "is not in the dataset", "every kept episode")
+                    results.note("ids", [missing], 0)
             except PipelineError as error:
-                unreadable.append(Fault(one.name, episode_id, str(error), "an episode that can be read"))
-        results.note("ids", missing, 0)
-        results.note("readable", unreadable)
+                unreadable = Fault(one.name, episode_id, str(error), "an episode that can be read")
+                results.note("readable", [unreadable], 0)
         language = self.config.plan.axes.language
         try:
             made = EpisodeLoader(self.data, self.config.render, self.extras)(episode_id)
@@ -194,13 +217,7 @@ class EpisodesJob:
         if "outcome" in self.extras:  # The manifest has figures of kept episodes alone.
             quality = measure(trajectory, find_task(row["suite"], row["task"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
-        case = Case(
-            row=row,
-            made=made,
-            trajectory=trajectory,
-            copies=copies,
-            bank=language.bank if language else None,
-        )
+        case = Case(row, made, trajectory, copies, language.bank if language else None)
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from pipeline.compute.pool import Workers
@@ -29,7 +29,7 @@ def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
         "frames": FrameStore(config.data / "frames", config.render),
     }
     for name, store in stores.items():
-        results[name] = _result(workers(_Reader(store), store.names(), name))
+        results[name] = _result(workers(partial(_damaged, store), store.names(), name))
     for one in recorded(config.data, config.export, config.render.extras):
         name = one.folder.relative_to(config.data).as_posix()
         try:
@@ -42,17 +42,13 @@ def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
     return results
 
 
-@dataclass(frozen=True)
-class _Reader:
-    store: Store
-
-    def __call__(self, file: str) -> list[str]:
-        try:
-            with self.store.opened(file) as opened:
-                opened.check_all()
-        except PipelineError as error:
-            return [str(error)]
-        return []
+def _damaged(store: Store, file: str) -> list[str]:
+    try:
+        with store.opened(file) as opened:
+            opened.check_all()
+    except PipelineError as error:
+        return [str(error)]
+    return []
 
 
 def _result(findings: Iterable[Sequence[str]]) -> dict[str, Any]:

@@ -31,7 +31,7 @@ from pipeline.evaluation.rollout import roll_out_policy
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
-from pipeline.formats import motion_statistics
+from pipeline.formats import exact_statistics
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
@@ -76,7 +76,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rlds, lerobot = RldsConfig(name=NAME, shards=1), LeRobotConfig(name=NAME, shards=1)
     for target in (Rlds(data, rlds), LeRobot(data, lerobot), LeRobotV21(data, v21)):
         export(target, Episodes(known, made.__getitem__), loop)
-    statistics = motion_statistics.openvla([(one.action, one.state) for one in made.values()])
+    statistics = exact_statistics.openvla([(one.action, one.state) for one in made.values()])
     (data / "dataset_statistics.json").write_text(json.dumps({SET: statistics}))
     recipe.write({}, data, ExportConfig(rlds=rlds, lerobot=lerobot, lerobot_v21=v21))
     return data

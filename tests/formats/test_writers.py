@@ -47,7 +47,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats import lerobot as lerobot_format
 from pipeline.formats import lerobot_v21, rlds_write
-from pipeline.formats.episodes import split
+from pipeline.formats.episodes import Episodes, split
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import columns
@@ -506,10 +506,8 @@ def test_split_keeps_order_and_balance() -> None:
     assert [name for piece in pieces for name in piece] == ids
     assert sorted(map(len, pieces)) == [2, 3, 3, 3]
     assert split(ids[:2], 4) == [["0"], ["1"]]
-    with pytest.raises(PipelineError):
-        split([], 2)
-    with pytest.raises(PipelineError):
-        split(ids, 0)
+    with pytest.raises(PipelineError, match="no episodes to write"):
+        Episodes({}, episode).by_split(0.0)
 
 
 V21 = {

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from conftest import MILK
 
-from pipeline.axes import Axes, to_json
+from pipeline.axes import AXES, to_json
 from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.base import Credit
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
-from pipeline.publish import attribution
-from pipeline.publish.attribution import attributions
+from pipeline.publish.card import attributions
 from pipeline.seeding import rng
 
 
@@ -40,4 +39,6 @@ def test_a_texture_on_two_parts_of_a_scene_is_one_episode() -> None:
 
 
 def test_what_is_installed_holds_what_the_documentation_says() -> None:
-    assert attribution.counts(Axes()) == {"surfaces": 804, "procedural": 780, "models": 58, "categories": 26}
+    offered = [axis().offered() for axis in AXES.values()]
+    counts = {kind: number for of_axis in offered for kind, number in of_axis.items()}
+    assert counts == {"surfaces": 804, "procedural": 780, "models": 58, "categories": 26}

@@ -22,7 +22,6 @@ from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.layout import LayoutAxis
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.registry import FORMATS, columns, formats_of
 from pipeline.publish import card
@@ -242,16 +241,3 @@ def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, fr
     text = written(data, "rlds")
     assert metadata_of(text)["license"] == ("cc-by-4.0" if free else "other")
     assert ("licensed under [CC BY 4.0]" in text) == free
-
-
-@pytest.mark.parametrize("name", ["validation.json", "finetune/finetune.yaml"])
-def test_says_what_is_missing(data: Path, name: str) -> None:
-    (data / name).unlink()
-    with pytest.raises(PipelineError, match=f"{name} not there"):
-        write(data)
-
-
-def test_nothing_kept_is_refused(data: Path) -> None:
-    write_rows(data, [ROWS[6]])
-    with pytest.raises(PipelineError, match="no episode was kept"):
-        write(data)

@@ -214,6 +214,7 @@ def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     # The server speaks the older of the hub's two ways to send large files.
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_DISABLE_XET", True)
     hub = Hub()
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.endpoint)
     with served(hub.server):
         yield hub
 
@@ -298,7 +299,7 @@ def test_a_set_with_images_has_no_videos(data: Path) -> None:
 @pytest.mark.parametrize("kind", ["rlds", "lerobot", "lerobot_v21"])
 def test_what_arrives_is_the_dataset_and_a_second_time_nothing(hub: Hub, made: Path, kind: str) -> None:
     upload = prepare(made, kind)
-    address = send(upload, REPOSITORY, private=True, endpoint=hub.endpoint)
+    address = send(upload, REPOSITORY, private=True)
     assert address == f"{hub.endpoint}/datasets/{REPOSITORY}/commit/1"
     assert hub.files == expected(upload)
     assert (kind == "lerobot") == ("meta/info.json" in hub.files)
@@ -308,7 +309,7 @@ def test_what_arrives_is_the_dataset_and_a_second_time_nothing(hub: Hub, made: P
     assert set(hub.sent) == large(upload)
 
     hub.sent.clear()
-    send(upload, "tiny", endpoint=hub.endpoint)
+    send(upload, "tiny")
     assert (hub.sent, hub.commits) == ([], 1)
     assert hub.files == expected(upload)
     assert set(hub.tags) == ({CODEBASE_VERSION} if kind == "lerobot" else set())
@@ -322,7 +323,7 @@ def test_the_hub_is_in_reach_after_a_dataset_was_found_damaged(hub: Hub, data: P
     lerobot_read.forget_sessions()  # as in a process that has not spoken with the hub
     with pytest.raises(PipelineError, match=re.escape(str(root))):
         list(lerobot_read.check(root, tmp_path / "cache", {}, {}))
-    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    send(upload, REPOSITORY)
     assert hub.files == expected(upload)
 
 
@@ -330,7 +331,7 @@ def test_goes_on_after_the_network_broke(hub: Hub, made: Path) -> None:
     upload = prepare(made, "lerobot")
     hub.allowed, hub.cuts = 2, 1000
     with pytest.raises(PipelineError, match=r"stopped.*Error while uploading") as caught:
-        send(upload, REPOSITORY, endpoint=hub.endpoint)
+        send(upload, REPOSITORY)
     assert "run it again" in str(caught.value)
     assert (hub.files, hub.tags) == ({}, {})
     arrived = list(hub.sent)
@@ -338,7 +339,7 @@ def test_goes_on_after_the_network_broke(hub: Hub, made: Path) -> None:
 
     hub.sent.clear()
     hub.cuts = 0
-    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    send(upload, REPOSITORY)
     assert hub.files == expected(upload)
     assert set(hub.sent) == large(upload) - set(arrived)
     assert hub.tags == {CODEBASE_VERSION: 1}
@@ -347,7 +348,7 @@ def test_goes_on_after_the_network_broke(hub: Hub, made: Path) -> None:
 def test_a_short_break_is_not_noticed(hub: Hub, made: Path) -> None:
     hub.cuts = 2
     upload = prepare(made, "rlds")
-    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    send(upload, REPOSITORY)
     assert hub.files == expected(upload)
 
 
@@ -355,10 +356,10 @@ def test_goes_on_after_the_hub_failed_to_commit(hub: Hub, made: Path) -> None:
     upload = prepare(made, "rlds")
     hub.failing = 1
     with pytest.raises(PipelineError, match=r"stopped.*500"):
-        send(upload, REPOSITORY, endpoint=hub.endpoint)
+        send(upload, REPOSITORY)
     assert hub.files == {}
     hub.sent.clear()
-    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    send(upload, REPOSITORY)
     assert hub.files == expected(upload)
     assert hub.sent == []
 
@@ -370,7 +371,7 @@ def test_what_the_dataset_no_longer_has_goes(hub: Hub, made: Path) -> None:
         "mine/notes.md": b"",
     }
     upload = prepare(made, "lerobot")
-    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    send(upload, REPOSITORY)
     assert hub.files == {".gitattributes": b"", "mine/notes.md": b"", **expected(upload)}
 
 
@@ -379,10 +380,10 @@ def test_videos_go_with_the_commit_that_brings_images(hub: Hub, data: Path) -> N
     """A whole folder that the dataset no longer has; other folders are somebody's own."""
     mine = {".gitattributes": b"", "mine/notes.md": b"", "demo.mp4": b""}
     hub.files |= mine
-    send(prepare(data, "lerobot"), REPOSITORY, endpoint=hub.endpoint)
+    send(prepare(data, "lerobot"), REPOSITORY)
     assert any(path.startswith("videos/") for path in hub.files)
     upload = with_images(data)
-    send(upload, REPOSITORY, endpoint=hub.endpoint)
+    send(upload, REPOSITORY)
     assert hub.files == {**mine, **expected(upload)}
     assert hub.commits == 2
 
@@ -483,7 +484,7 @@ def test_asks_for_a_token(hub: Hub, made: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.delenv("HF_TOKEN")
     monkeypatch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(tmp_path / "none"))
     with pytest.raises(PipelineError, match="no token") as caught:
-        send(prepare(made, "rlds"), REPOSITORY, endpoint=hub.endpoint)
+        send(prepare(made, "rlds"), REPOSITORY)
     assert "hf auth login" in str(caught.value)
     assert hub.private is None
 
@@ -491,12 +492,15 @@ def test_asks_for_a_token(hub: Hub, made: Path, tmp_path: Path, monkeypatch: pyt
 def test_a_token_that_may_not_write_is_told_apart(hub: Hub, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_TOKEN", "reader")
     with pytest.raises(PipelineError, match="does not let you write"):
-        send(prepare(made, "rlds"), REPOSITORY, endpoint=hub.endpoint)
+        send(prepare(made, "rlds"), REPOSITORY)
 
 
-def test_an_unreachable_hub_and_a_wrong_name_are_told_apart(hub: Hub, made: Path) -> None:
+def test_an_unreachable_hub_and_a_wrong_name_are_told_apart(
+    hub: Hub, made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     upload = prepare(made, "rlds")
-    with pytest.raises(PipelineError, match="stopped"):
-        send(upload, REPOSITORY, endpoint="http://127.0.0.1:9")
     with pytest.raises(PipelineError, match="refused"):
-        send(upload, "not a name", endpoint=hub.endpoint)
+        send(upload, "not a name")
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
+    with pytest.raises(PipelineError, match="stopped"):
+        send(upload, REPOSITORY)

@@ -6,15 +6,12 @@ import base64
 import io
 import json
 import re
-import shutil
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 
 import av
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from conftest import REPOSITORY, tiny_config
 from html_page import Page, needs_nothing_beside_itself, screenshot
@@ -27,11 +24,10 @@ from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode
 from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
-from pipeline.report import clips, coverage, figures, pages, report, yields
+from pipeline.report import coverage, figures, pages, report, yields
 from pipeline.report.coverage import Draw
 from pipeline.run import manifest
 from pipeline.seeding import rng
-from pipeline.tables import write_table
 from pipeline.testset import benchmark
 from pipeline.types import Quality
 
@@ -126,7 +122,7 @@ def test_a_combination_counts_with_each_of_its_axes() -> None:
 
 def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
     light, dark = (_still(np.full((256, 256, 3), grey, np.uint8)) for grey in (200, 60))
-    clip = clips.beside([light] * 20, [dark] * 24 + [light] * 6)
+    clip = pages.beside([light] * 20, [dark] * 24 + [light] * 6)
     frames = _video(clip)
     assert frames.shape == (30, 256, 512, 3)
     assert np.abs(frames[:, :, :250] - 200.0).max() < 8
@@ -136,7 +132,7 @@ def test_a_video_has_the_twin_on_the_left_and_waits_for_the_longer() -> None:
 
 def test_a_video_of_pure_noise_still_keeps_to_its_size() -> None:
     noise = [_still(rng(1, frame).integers(0, 256, (256, 256, 3)).astype(np.uint8)) for frame in range(60)]
-    assert len(_content(clips.beside(noise, noise).video)) <= VIDEO_BYTES
+    assert len(_content(pages.beside(noise, noise).video)) <= VIDEO_BYTES
 
 
 @pytest.mark.parametrize("name", sorted(AXES))
@@ -183,20 +179,6 @@ def test_an_unfinished_run_says_what_to_run(config: Config, tmp_path: Path, monk
         report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
-def test_a_run_that_kept_nothing_is_refused(
-    config: Config, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / config.data).mkdir(parents=True)
-    table = pq.read_table(finished / "manifest.parquet")
-    lost = pa.array([False] * len(table))
-    column = table.schema.get_field_index("kept")
-    write_table(table.set_column(column, "kept", lost), tmp_path / config.data / "manifest.parquet")
-    shutil.copy(finished / "leakage.json", tmp_path / config.data)
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(PipelineError, match="no episode was kept"):
-        report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
-
-
 @pytest.mark.parametrize("width_px", [360, 1200])
 def test_a_browser_shows_it(html: str, width_px: int, tmp_path: Path) -> None:
     pages.write(html, tmp_path / "report.html")
@@ -219,6 +201,6 @@ def _still(frame: NDArray[np.uint8]) -> bytes:
     return encode(frame, RenderConfig())
 
 
-def _video(clip: clips.Clip) -> NDArray[np.float64]:
+def _video(clip: pages.Clip) -> NDArray[np.float64]:
     with av.open(io.BytesIO(_content(clip.video))) as file:
         return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]).astype(float)

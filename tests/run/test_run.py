@@ -33,9 +33,9 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.subtasks import subtasks
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
-from pipeline.run import manifest
+from pipeline.run import manifest, outcome
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.export import asked, kept_episodes
+from pipeline.run.export import episodes_of
 from pipeline.run.finished import FOLDER
 from pipeline.stores.trajectory_store import TrajectoryStore
 
@@ -331,9 +331,7 @@ def test_a_format_that_takes_language_gets_rewrites_and_subtasks(
     plain = LeRobot(config.data, config.export.lerobot or LeRobotConfig())
     # Where lerobot is older, reading a configuration refuses it.
     told = LeRobot(config.data, plain.options.model_copy(update={"language": True}))
-    episodes = kept_episodes(config)
-    assert asked(plain, config, episodes) is episodes
-    given = asked(told, config, episodes)
+    episodes, given = (episodes_of(target, config, outcome.read(config)) for target in (plain, told))
     assert not {one.content for one in given.known.values()} & {one.content for one in episodes.known.values()}
     bank = yaml.safe_load(BANK_FILE.read_text())
     for row in (row for row in rows if row["kept"]):

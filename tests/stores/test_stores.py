@@ -31,7 +31,7 @@ from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.render import render
 from pipeline.run import outcome
-from pipeline.run.remake import outdated
+from pipeline.run.outcome import outdated
 from pipeline.run.render_job import RenderJob
 from pipeline.run.render_stage import STREAMS_OF_A_JOB, portions, render_plan
 from pipeline.run.replay_stage import Replays

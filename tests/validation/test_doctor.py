@@ -39,9 +39,14 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     return result
 
 
-def failures(data: Path, *, need_gb: float = 0.001, demos: DemosConfig | None = None) -> dict[str, doctor.Diagnosis]:
-    findings = doctor.check(data, need_gb=need_gb, demos=demos)
-    return {finding.name: finding for finding in findings if finding.status == "fail"}
+def found(folder: Path, need_gb: float = 0.001, demos: DemosConfig | None = None) -> dict[str, doctor.Diagnosis]:
+    changes = {"folder": folder, "demos": demos or DemosConfig()}
+    config = load(REPOSITORY / "configs" / "starter.yaml").model_copy(update=changes)
+    return {finding.name: finding for finding in doctor.check(config, need_gb)}
+
+
+def failures(folder: Path, need_gb: float = 0.001, demos: DemosConfig | None = None) -> dict[str, doctor.Diagnosis]:
+    return {name: finding for name, finding in found(folder, need_gb, demos).items() if finding.status == "fail"}
 
 
 def run_doctor(name: str, monkeypatch: pytest.MonkeyPatch, *, free_gb: float, **changes: object) -> int:
@@ -176,9 +181,9 @@ def test_demonstrations_must_be_where_the_configuration_says(short_demos: Path, 
     file.touch()
     assert "demos" in failures(tmp_path, demos=demos), "it holds nothing"
     shutil.copy(short_demos / file.relative_to(tmp_path / "demos"), file)
-    (found,) = (one for one in doctor.check(tmp_path, need_gb=0.001, demos=demos) if one.name == "demos")
-    assert found.status == "warn"
-    assert f"1 tasks have fewer than 1, such as {names[1]} with 0" in found.detail
+    told = found(tmp_path, demos=demos)["demos"]
+    assert told.status == "warn"
+    assert f"1 tasks have fewer than 1, such as {names[1]} with 0" in told.detail
 
 
 def test_starter_demonstrations_have_the_hashes_of_their_package(
@@ -219,11 +224,11 @@ def test_what_is_to_be_fetched_needs_something_to_fetch_it_with(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(downloads, "pip", lambda: ["pip"])
-    found = {finding.name: finding for finding in doctor.check(tmp_path, need_gb=0.001)}
+    told = found(tmp_path)
     # Every plan asks for the test set; further sources are for configurations that name them.
-    assert {name for name, finding in found.items() if finding.status == "fail"} == {"test set"}
-    assert benchmark.WHEEL in found["test set"].remedy
-    assert found["metaworld textures"].status == found["sweethome3d objects"].status == "warn"
+    assert {name for name, finding in told.items() if finding.status == "fail"} == {"test set"}
+    assert benchmark.WHEEL in told["test set"].remedy
+    assert told["metaworld textures"].status == told["sweethome3d objects"].status == "warn"
     wheel = tmp_path / benchmark.FOLDER / benchmark.WHEEL
     wheel.parent.mkdir(parents=True)
     wheel.touch()

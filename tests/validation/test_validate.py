@@ -31,9 +31,9 @@ from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.registry import formats_of
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.images.jpeg import decode, encode
-from pipeline.run import manifest
+from pipeline.run import manifest, outcome
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.export import export, kept_episodes
+from pipeline.run.export import episodes_of, export
 from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import witnesses
@@ -263,7 +263,8 @@ def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with chdir(folder):
         config = with_v21(finished)
         assert config.export.lerobot_v21 is not None
-        export(LeRobotV21(config.data, config.export.lerobot_v21), kept_episodes(config), loop)
+        target = LeRobotV21(config.data, config.export.lerobot_v21)
+        export(target, episodes_of(target, config, outcome.read(config)), loop)
     return folder
 
 

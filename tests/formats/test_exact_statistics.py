@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pipeline import seeding
-from pipeline.formats import motion_statistics
-from pipeline.formats.motion_statistics import Motion
+from pipeline.formats import exact_statistics
+from pipeline.formats.exact_statistics import Motion
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def episodes() -> list[Motion]:
 
 
 def test_openvla_measures_every_step_once(episodes: list[Motion]) -> None:
-    found = motion_statistics.openvla(episodes)
+    found = exact_statistics.openvla(episodes)
     rows = np.array([row for action, _ in episodes for row in action.astype(np.float64)])
     assert (found["num_transitions"], found["num_trajectories"]) == (469, 3)
     for dimension in range(6):
@@ -39,12 +39,12 @@ def test_openvla_measures_every_step_once(episodes: list[Motion]) -> None:
 
 def test_gripper_is_turned_for_openvla_and_left_for_openpi(episodes: list[Motion]) -> None:
     commands = np.concatenate([action[:, 6] for action, _ in episodes])
-    openvla = motion_statistics.openvla(episodes)["action"]
+    openvla = exact_statistics.openvla(episodes)["action"]
     assert openvla["mean"][6] == pytest.approx((commands == -1).mean())
     assert (openvla["min"][6], openvla["max"][6]) == (0.0, 1.0)
     assert openvla["mask"] == [True] * 6 + [False]
     actions, states = (np.concatenate(column) for column in zip(*episodes, strict=True))
-    openpi = motion_statistics.openpi(actions, states)["norm_stats"]
+    openpi = exact_statistics.openpi(actions, states)["norm_stats"]
     assert openpi["actions"]["mean"][6] == pytest.approx(commands.mean())
     assert openpi["actions"]["q99"][:6] == openvla["q99"][:6]
     assert set(openpi["state"]) == {"mean", "std", "q01", "q99"}
@@ -53,7 +53,7 @@ def test_gripper_is_turned_for_openvla_and_left_for_openpi(episodes: list[Motion
 def test_open_is_one_leaves_its_argument_alone(episodes: list[Motion]) -> None:
     action, _ = episodes[0]
     before = action.copy()
-    turned = motion_statistics.open_is_one(action)
+    turned = exact_statistics.open_is_one(action)
     assert np.array_equal(action, before)
     assert np.array_equal(turned[:, :6], before[:, :6])
     assert turned.dtype == np.float32
