@@ -42,6 +42,7 @@ def memory_given_back() -> Iterator[None]:
     """A process keeps its environment for the next evaluation."""
     yield
     _environment(RECORDED, None).close()
+    _environment.cache_clear()
 
 
 @pytest.mark.slow
