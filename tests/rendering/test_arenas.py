@@ -1,0 +1,101 @@
+"""In each of LIBERO's arenas, pictures with savings and plain ones are those that MuJoCo's own renderer draws."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import arenas
+import mujoco
+import numpy as np
+import pytest
+from arenas import TASKS, VIEWS, both_ways
+
+from pipeline import seeding
+from pipeline.axes.background import BackgroundAxis
+from pipeline.rendering.drawing import PlainDrawing
+from pipeline.rendering.opengl import say_once
+from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.software.drawing import SoftwareDrawing
+from pipeline.types import Floats
+
+pytestmark = pytest.mark.slow
+
+
+@dataclass
+class Arena:
+    """A scene drawn with savings and plainly, and its first state (S,)."""
+
+    name: str
+    opened: Renderer
+    ours: SoftwareDrawing
+    plain: PlainDrawing
+    state: Floats
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
+    opened = arenas.renderer(request.param)
+    state = np.concatenate([[0.0], opened.data.qpos, opened.data.qvel])
+    with both_ways(opened) as (ours, plain):
+        yield Arena(request.param, opened, ours, plain, state)
+
+
+def test_plain_frames_and_surfaces_are_those_of_mujocos_renderer(arena: Arena) -> None:
+    """``mujoco.Renderer`` has the first row at the top."""
+    data, plain = arena.opened.data, arena.plain
+    option = mujoco.MjvOption()
+    option.geomgroup[0] = 0
+    with mujoco.Renderer(arena.opened.model, 256, 256, max_geom=1000) as theirs:
+        for camera in VIEWS:
+            theirs.update_scene(data, camera, option)
+            assert np.array_equal(plain.frame(data, camera), theirs.render()[::-1])
+            _, number, kind = plain.surfaces(data, camera)
+            theirs.enable_segmentation_rendering()
+            assert np.array_equal(np.stack([number, kind], axis=-1), theirs.render()[::-1])
+            theirs.disable_segmentation_rendering()
+
+
+def test_what_is_left_out_of_a_picture_cannot_be_seen(arena: Arena, caplog: pytest.LogCaptureFixture) -> None:
+    say_once.cache_clear()
+    opened, ours, plain = arena.opened, arena.ours, arena.plain
+    rng, left_out = seeding.rng("test_culling", arena.name), 0
+    shadows = opened.model.light_castshadow.copy()
+    for number, camera in product(range(3), VIEWS):
+        # The first seven are the arm's.
+        opened.data.qpos[:7] += rng.uniform(-0.3, 0.3, 7)
+        opened.model.light_castshadow[:] = number % 2
+        mujoco.mj_forward(opened.model, opened.data)
+        assert np.array_equal(opened.frame(camera), plain.frame(opened.data, camera)), camera
+        left_out += int((ours._culling.shown & ~ours._culling.picture(opened.data, camera).seen).sum())
+        shown, expected = opened.surfaces(camera), plain.surfaces(opened.data, camera)
+        assert all(map(np.array_equal, shown, expected)), "which meshes a frame was drawn of does not matter"
+    opened.model.light_castshadow[:] = shadows
+    assert left_out > 30
+    assert caplog.records == [], "OpenGL reports no error"
+
+
+def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(arena: Arena) -> None:
+    rng, opened = seeding.rng("test_layers", arena.name), arena.opened
+    axis = BackgroundAxis(image_share=0.0)
+    choices = [[], *([axis.sample(rng, TASKS[arena.name], place)] for place in range(2))]
+    states = [arena.state.copy() for _ in range(3)]
+    site_alpha = opened.model.site_rgba[:, 3].astype(np.float32)
+    for step, state in enumerate(states):
+        state[1:8] += 0.1 * step
+    with opened.side_by_side(choices) as shows:
+        assert arena.ours._painted.any()
+        made = []
+        for state in states:
+            opened.restore(state, site_alpha)
+            for show in shows:
+                show()
+                made.append([opened.frame(camera) for camera in VIEWS])
+    for number, choice in enumerate(choices):
+        beside = Renderer(opened.model, arena.plain)
+        with beside.perturbed(choice):
+            for step, state in enumerate(states):
+                beside.restore(state, site_alpha)
+                expected = [beside.frame(camera) for camera in VIEWS]
+                assert np.array_equal(made[step * len(choices) + number], expected), (number, step)
