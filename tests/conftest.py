@@ -6,15 +6,17 @@ import ctypes
 import gc
 import os
 import resource
+import runpy
 import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import chdir, closing, contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
 from functools import partial
 from http.server import ThreadingHTTPServer
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -233,23 +235,23 @@ def link_testset(folder: Path) -> None:
     (folder / benchmark.FOLDER).symlink_to(wheel.parent)
 
 
-def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = STAGES) -> str:
-    """Run stages as DVC does, in ``folder``; returns what they printed."""
-    file = folder / "configs" / "tiny.yaml"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(yaml.safe_dump(config))
-    printed = ""
-    for stage in stages:
-        done = subprocess.run(
-            [sys.executable, REPOSITORY / "stages" / f"{stage}.py", file],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, f"{stage} failed:\n{done.stdout}\n{done.stderr}"
-        printed += done.stdout
-    return printed
+def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str]) -> str:
+    """Run stages in ``folder``, in this process; returns what they printed."""
+    from pipeline.rendering.last_scene import scene_of_process
+
+    (folder / "configs").mkdir(exist_ok=True)
+    (folder / "configs" / "tiny.yaml").write_text(yaml.safe_dump(config))
+    printed = StringIO()
+    with chdir(folder), redirect_stdout(printed), redirect_stderr(printed), pytest.MonkeyPatch.context() as patch:
+        for stage in stages:
+            patch.setattr(sys, "argv", [stage, "configs/tiny.yaml"])
+            try:
+                runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"), run_name="__main__")
+            except SystemExit as ended:
+                raise AssertionError(f"{stage} failed:\n{printed.getvalue()}") from ended
+            finally:
+                scene_of_process().close()
+    return printed.getvalue()
 
 
 @pytest.fixture(scope="session")
