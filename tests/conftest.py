@@ -39,6 +39,7 @@ from pipeline.types import Demo, Task, Trajectory
 
 if TYPE_CHECKING:  # the tests that render choose what renders
     from pipeline.rendering.last_scene import LastScene
+    from pipeline.rendering.renderer import Renderer
 
 Result = TypeVar("Result")
 
@@ -94,6 +95,15 @@ def opened() -> Iterator[LastScene]:
     from pipeline.rendering.last_scene import LastScene
 
     with closing(LastScene()) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def shown(request: pytest.FixtureRequest) -> Iterator[Renderer]:
+    """The scene of the arena that a test is parametrised with, open from one test of it to the next."""
+    from arenas import renderer
+
+    with closing(renderer(request.param)) as opened:
         yield opened
 
 

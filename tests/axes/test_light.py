@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import colorsys
 from collections.abc import Iterator
-from contextlib import closing
 from statistics import mean
 from typing import get_args
 
 import numpy as np
 import pytest
-from arenas import TASKS, change, changed, checksums, frames, renderer
+from arenas import TASKS, change, changed, checksums, frames
 from conftest import MILK
 
 from pipeline.axes.base import Level
@@ -108,13 +107,6 @@ def test_ranges_grow_with_the_level() -> None:
         assert values == sorted(set(values))
     fills = [drawn("shadows", level, 0).fill_scale for level in (1, 2, 3, 4, 5)]
     assert fills == sorted(set(fills), reverse=True)
-
-
-@pytest.fixture(scope="module")
-def shown(request: pytest.FixtureRequest) -> Iterator[Renderer]:
-    """The scene of an arena."""
-    with closing(renderer(request.param)) as opened:
-        yield opened
 
 
 @pytest.mark.slow
