@@ -65,10 +65,11 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 
 LONG = (
-    *("test_finished", "test_evaluation", "test_commands", "test_reserves", "test_preview", "test_kills", "test_run"),
-    *("test_effect", "test_compute", "test_stepping", "test_validate", "test_layers", "test_without_gl", "test_stores"),
-    *("test_culling", "test_render", "test_writers", "test_evaluation_analyses", "test_replay", "test_doctor"),
-    *("test_examples", "test_bad_demonstrations", "test_renderer", "test_evaluation_policies", "test_asset_archive"),
+    *("test_finished", "test_evaluation", "test_reserves", "test_preview", "test_kills", "test_run", "test_commands"),
+    *("test_effect", "test_arenas", "test_compute", "test_stepping", "test_validate", "test_failures"),
+    *("test_without_gl", "test_stores", "test_lerobot_eval", "test_render", "test_writers"),
+    *("test_evaluation_analyses", "test_replay", "test_doctor", "test_examples", "test_bad_demonstrations"),
+    *("test_renderer", "test_evaluation_policies", "test_asset_archive"),
 )
 """Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
 
