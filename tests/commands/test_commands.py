@@ -162,14 +162,7 @@ def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
 
 @dataclass
 class Ablation:
-    """A run on finished frames that was stopped and went on.
-
-    Attributes:
-        data: its folder.
-        finished: what was there before, to its content or its edition.
-        stopped, done: the two commands.
-        left: processes that went on after the first.
-    """
+    """A run that was stopped and went on; what was there before, and processes that went on after the first command."""
 
     clone: Path
     data: Path

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 
 import arenas
@@ -18,36 +17,27 @@ from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import say_once
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.drawing import SoftwareDrawing
-from pipeline.types import Floats
 
 pytestmark = pytest.mark.slow
 
 
-@dataclass
-class Arena:
-    """A scene drawn with savings and plainly, and its first state (S,)."""
-
-    name: str
-    opened: Renderer
-    ours: SoftwareDrawing
-    plain: PlainDrawing
-    state: Floats
+Arena = tuple[str, Renderer, SoftwareDrawing, PlainDrawing]
+"""Its name, and its scene drawn with savings and plainly."""
 
 
 @pytest.fixture(scope="module", params=TASKS)
 def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
     opened = arenas.renderer(request.param)
-    state = np.concatenate([[0.0], opened.data.qpos, opened.data.qvel])
     with both_ways(opened) as (ours, plain):
-        yield Arena(request.param, opened, ours, plain, state)
+        yield request.param, opened, ours, plain
 
 
 def test_plain_frames_and_surfaces_are_those_of_mujocos_renderer(arena: Arena) -> None:
     """``mujoco.Renderer`` has the first row at the top."""
-    data, plain = arena.opened.data, arena.plain
-    option = mujoco.MjvOption()
+    _, opened, _, plain = arena
+    data, option = opened.data, mujoco.MjvOption()
     option.geomgroup[0] = 0
-    with mujoco.Renderer(arena.opened.model, 256, 256, max_geom=1000) as theirs:
+    with mujoco.Renderer(opened.model, 256, 256, max_geom=1000) as theirs:
         for camera in VIEWS:
             theirs.update_scene(data, camera, option)
             assert np.array_equal(plain.frame(data, camera), theirs.render()[::-1])
@@ -59,8 +49,8 @@ def test_plain_frames_and_surfaces_are_those_of_mujocos_renderer(arena: Arena) -
 
 def test_what_is_left_out_of_a_picture_cannot_be_seen(arena: Arena, caplog: pytest.LogCaptureFixture) -> None:
     say_once.cache_clear()
-    opened, ours, plain = arena.opened, arena.ours, arena.plain
-    rng, left_out = seeding.rng("test_culling", arena.name), 0
+    name, opened, ours, plain = arena
+    rng, left_out = seeding.rng("test_culling", name), 0
     shadows = opened.model.light_castshadow.copy()
     for number, camera in product(range(3), VIEWS):
         # The first seven are the arm's.
@@ -77,15 +67,15 @@ def test_what_is_left_out_of_a_picture_cannot_be_seen(arena: Arena, caplog: pyte
 
 
 def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(arena: Arena) -> None:
-    rng, opened = seeding.rng("test_layers", arena.name), arena.opened
-    axis = BackgroundAxis(image_share=0.0)
-    choices = [[], *([axis.sample(rng, TASKS[arena.name], place)] for place in range(2))]
-    states = [arena.state.copy() for _ in range(3)]
+    name, opened, ours, plain = arena
+    rng, axis = seeding.rng("test_layers", name), BackgroundAxis(image_share=0.0)
+    choices = [[], *([axis.sample(rng, TASKS[name], place)] for place in range(2))]
+    states = [np.concatenate([[0.0], opened.data.qpos, opened.data.qvel]) for _ in range(3)]
     site_alpha = opened.model.site_rgba[:, 3].astype(np.float32)
     for step, state in enumerate(states):
         state[1:8] += 0.1 * step
     with opened.side_by_side(choices) as shows:
-        assert arena.ours._painted.any()
+        assert ours._painted.any()
         made = []
         for state in states:
             opened.restore(state, site_alpha)
@@ -93,7 +83,7 @@ def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(aren
                 show()
                 made.append([opened.frame(camera) for camera in VIEWS])
     for number, choice in enumerate(choices):
-        beside = Renderer(opened.model, arena.plain)
+        beside = Renderer(opened.model, plain)
         with beside.perturbed(choice):
             for step, state in enumerate(states):
                 beside.restore(state, site_alpha)
