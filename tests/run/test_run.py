@@ -213,18 +213,6 @@ def test_lerobots_own_training_runs_on_it(finished: Path, tmp_path: Path) -> Non
     assert "loss:nan" not in done.stderr
 
 
-def test_damaged_shards_are_made_again(finished: Path, short_demos: Path, tmp_path: Path) -> None:
-    data = tmp_path / "data" / "tiny"
-    shutil.copytree(finished, data)
-    shard = next((data / "trajectories").glob("*.h5"))
-    whole = shard.read_bytes()
-    shard.write_bytes(whole[: len(whole) // 2])
-    (data / "trajectories" / "stale.h5").write_bytes(b"of an earlier plan")
-    run_stages(tmp_path, tiny_config(short_demos), ["replay"])
-    assert shard.read_bytes() == whole
-    assert not (data / "trajectories" / "stale.h5").exists()
-
-
 @pytest.mark.parametrize("stage", ["replay", "manifest", "validate"])
 def test_a_full_disk_leaves_what_a_stage_wrote_before(
     stage: str, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
