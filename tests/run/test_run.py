@@ -18,7 +18,7 @@ import tensorflow_datasets as tfds
 import tf_readback
 import yaml
 from conftest import REPOSITORY, STOVE, dvc, run_stages, tiny_config
-from dvc.repo import Repo
+from dvc.repo import Repo  # type: ignore[import-untyped]
 from PIL import Image
 from synthetic import records
 
