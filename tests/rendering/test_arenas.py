@@ -12,14 +12,12 @@ import pytest
 from arenas import TASKS, VIEWS, both_ways
 
 from pipeline import seeding
-from pipeline.axes.background import BackgroundAxis
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.opengl import say_once
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.drawing import SoftwareDrawing
 
 pytestmark = pytest.mark.slow
-
 
 Arena = tuple[str, Renderer, SoftwareDrawing, PlainDrawing]
 """Its name, and its scene drawn with savings and plainly."""
@@ -51,41 +49,13 @@ def test_what_is_left_out_of_a_picture_cannot_be_seen(arena: Arena, caplog: pyte
     say_once.cache_clear()
     name, opened, ours, plain = arena
     rng, left_out = seeding.rng("test_culling", name), 0
-    shadows = opened.model.light_castshadow.copy()
     for number, camera in product(range(3), VIEWS):
-        # The first seven are the arm's.
-        opened.data.qpos[:7] += rng.uniform(-0.3, 0.3, 7)
+        opened.data.qpos[:7] += rng.uniform(-0.3, 0.3, 7)  # of the arm
         opened.model.light_castshadow[:] = number % 2
         mujoco.mj_forward(opened.model, opened.data)
         assert np.array_equal(opened.frame(camera), plain.frame(opened.data, camera)), camera
         left_out += int((ours._culling.shown & ~ours._culling.picture(opened.data, camera).seen).sum())
         shown, expected = opened.surfaces(camera), plain.surfaces(opened.data, camera)
         assert all(map(np.array_equal, shown, expected)), "which meshes a frame was drawn of does not matter"
-    opened.model.light_castshadow[:] = shadows
     assert left_out > 30
     assert caplog.records == [], "OpenGL reports no error"
-
-
-def test_textures_that_are_held_side_by_side_are_those_of_a_scene_by_itself(arena: Arena) -> None:
-    name, opened, ours, plain = arena
-    rng, axis = seeding.rng("test_layers", name), BackgroundAxis(image_share=0.0)
-    choices = [[], *([axis.sample(rng, TASKS[name], place)] for place in range(2))]
-    states = [np.concatenate([[0.0], opened.data.qpos, opened.data.qvel]) for _ in range(3)]
-    site_alpha = opened.model.site_rgba[:, 3].astype(np.float32)
-    for step, state in enumerate(states):
-        state[1:8] += 0.1 * step
-    with opened.side_by_side(choices) as shows:
-        assert ours._painted.any()
-        made = []
-        for state in states:
-            opened.restore(state, site_alpha)
-            for show in shows:
-                show()
-                made.append([opened.frame(camera) for camera in VIEWS])
-    for number, choice in enumerate(choices):
-        beside = Renderer(opened.model, plain)
-        with beside.perturbed(choice):
-            for step, state in enumerate(states):
-                beside.restore(state, site_alpha)
-                expected = [beside.frame(camera) for camera in VIEWS]
-                assert np.array_equal(made[step * len(choices) + number], expected), (number, step)
