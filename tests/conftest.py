@@ -6,15 +6,17 @@ import ctypes
 import gc
 import os
 import resource
+import runpy
 import shutil
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import chdir, closing, contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import replace
 from functools import partial
 from http.server import ThreadingHTTPServer
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -37,6 +39,7 @@ from pipeline.types import Demo, Task, Trajectory
 
 if TYPE_CHECKING:  # the tests that render choose what renders
     from pipeline.rendering.last_scene import LastScene
+    from pipeline.rendering.renderer import Renderer
 
 Result = TypeVar("Result")
 
@@ -62,10 +65,11 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 
 LONG = (
-    *("test_finished", "test_evaluation", "test_commands", "test_reserves", "test_preview", "test_kills", "test_run"),
-    *("test_effect", "test_compute", "test_stepping", "test_validate", "test_layers", "test_without_gl", "test_stores"),
-    *("test_culling", "test_render", "test_writers", "test_evaluation_analyses", "test_replay", "test_doctor"),
-    *("test_examples", "test_bad_demonstrations", "test_renderer", "test_evaluation_policies", "test_asset_archive"),
+    *("test_finished", "test_evaluation", "test_reserves", "test_preview", "test_kills", "test_run", "test_commands"),
+    *("test_effect", "test_arenas", "test_compute", "test_stepping", "test_validate", "test_failures"),
+    *("test_without_gl", "test_stores", "test_lerobot_eval", "test_render", "test_writers"),
+    *("test_evaluation_analyses", "test_replay", "test_doctor", "test_examples", "test_bad_demonstrations"),
+    *("test_renderer", "test_evaluation_policies", "test_asset_archive"),
 )
 """Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
 
@@ -92,6 +96,15 @@ def opened() -> Iterator[LastScene]:
     from pipeline.rendering.last_scene import LastScene
 
     with closing(LastScene()) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def shown(request: pytest.FixtureRequest) -> Iterator[Renderer]:
+    """The scene of the arena that a test is parametrised with, open from one test of it to the next."""
+    from arenas import renderer
+
+    with closing(renderer(request.param)) as opened:
         yield opened
 
 
@@ -233,23 +246,23 @@ def link_testset(folder: Path) -> None:
     (folder / benchmark.FOLDER).symlink_to(wheel.parent)
 
 
-def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str] = STAGES) -> str:
-    """Run stages as DVC does, in ``folder``; returns what they printed."""
-    file = folder / "configs" / "tiny.yaml"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(yaml.safe_dump(config))
-    printed = ""
-    for stage in stages:
-        done = subprocess.run(
-            [sys.executable, REPOSITORY / "stages" / f"{stage}.py", file],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, f"{stage} failed:\n{done.stdout}\n{done.stderr}"
-        printed += done.stdout
-    return printed
+def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str]) -> str:
+    """Run stages in ``folder``, in this process; returns what they printed."""
+    from pipeline.rendering.last_scene import scene_of_process
+
+    (folder / "configs").mkdir(exist_ok=True)
+    (folder / "configs" / "tiny.yaml").write_text(yaml.safe_dump(config))
+    printed = StringIO()
+    with chdir(folder), redirect_stdout(printed), redirect_stderr(printed), pytest.MonkeyPatch.context() as patch:
+        for stage in stages:
+            patch.setattr(sys, "argv", [stage, "configs/tiny.yaml"])
+            try:
+                runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"), run_name="__main__")
+            except SystemExit as ended:
+                raise AssertionError(f"{stage} failed:\n{printed.getvalue()}") from ended
+            finally:
+                scene_of_process().close()
+    return printed.getvalue()
 
 
 @pytest.fixture(scope="session")

@@ -128,7 +128,7 @@ def test_picks_the_egl_device(
 
 
 @pytest.mark.parametrize(
-    ("environment", "renderers", "shared"),
+    ("variables", "renderers", "shared"),
     [
         pytest.param({}, {"0": GPU, "1": GPU, "2": CPU}, ("0", "1"), id="all of a kind"),
         pytest.param({}, {"0": GPU, "1": "NVIDIA T4, 4.6.0", "2": GPU}, ("0", "2"), id="frames come from one kind"),
@@ -141,11 +141,11 @@ def test_picks_the_egl_device(
 def test_workers_share_the_gpus(
     monkeypatch: pytest.MonkeyPatch,
     devices: dict[tuple[str, str | None], str],
-    environment: dict[str, str],
+    variables: dict[str, str],
     renderers: dict[str, str],
     shared: tuple[str, ...],
 ) -> None:
-    for name, value in environment.items():
+    for name, value in variables.items():
         monkeypatch.setenv(name, value)
     devices.update({("egl", number): name for number, name in renderers.items()})
     devices["egl", None] = renderers["0"]

@@ -9,7 +9,7 @@ from statistics import mean, mode
 import mujoco
 import numpy as np
 import pytest
-from arenas import TASKS, change, changed, checksums, frames, renderer
+from arenas import TASKS, change, changed, checksums, frames
 from conftest import MILK, REPOSITORY
 
 from pipeline.axes import RenderPerturbation
@@ -59,61 +59,53 @@ THEMES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arena", TASKS)
-def test_only_the_named_surfaces_change_and_all_comes_back(arena: str) -> None:
-    shown = renderer(arena)
-    try:
-        before, clean, textures = checksums(shown), frames(shown), texture_bytes(shown)
-        for component in PARTS:
-            with shown.perturbed([drawn(component, 5, arena)]):
-                assert changed(before, checksums(shown)) == {"tex_data"}
-                replaced = {
-                    shown.model.texture(i).name for i, now in enumerate(texture_bytes(shown)) if now != textures[i]
-                }
-                assert replaced == (THEMES[arena] if component == "theme" else {worked_on(shown)})
-                assert worked_on(shown) in replaced
-                after = frames(shown)
-            assert change(clean["agentview"], after["agentview"]) > 1
-            assert change(clean["robot0_eye_in_hand"], after["robot0_eye_in_hand"]) > 3
-        assert changed(before, checksums(shown)) == set()
-        restored = frames(shown)
-        assert all(np.array_equal(clean[view], restored[view]) for view in clean), "the GL context kept a texture"
-    finally:
-        shown.close()
+@pytest.mark.parametrize("shown", TASKS, indirect=True)
+def test_only_the_named_surfaces_change_and_all_comes_back(shown: Renderer, request: pytest.FixtureRequest) -> None:
+    arena = request.node.callspec.params["shown"]
+    before, clean, textures = checksums(shown), frames(shown), texture_bytes(shown)
+    for component in PARTS:
+        with shown.perturbed([drawn(component, 5, arena)]):
+            assert changed(before, checksums(shown)) == {"tex_data"}
+            replaced = {shown.model.texture(i).name for i, now in enumerate(texture_bytes(shown)) if now != textures[i]}
+            assert replaced == (THEMES[arena] if component == "theme" else {worked_on(shown)})
+            assert worked_on(shown) in replaced
+            after = frames(shown)
+        assert change(clean["agentview"], after["agentview"]) > 1
+        assert change(clean["robot0_eye_in_hand"], after["robot0_eye_in_hand"]) > 3
+    assert changed(before, checksums(shown)) == set()
+    restored = frames(shown)
+    assert all(np.array_equal(clean[view], restored[view]) for view in clean), "the GL context kept a texture"
 
 
 @pytest.mark.slow
-def test_levels_move_the_average_colour_away() -> None:
-    shown = renderer("floor")
-    try:
-        clean = frames(shown, ["agentview"])["agentview"]
-        changes = []
-        for scale in (0.2, 1.0):
-            after = []
-            for key in range(5):
-                perturbation = drawn("surface", 1, key).model_copy(update={"colour_scale": scale})
-                with shown.perturbed([perturbation]):
-                    after.append(change(clean, frames(shown, ["agentview"])["agentview"]))
-            changes.append(mean(after))
-        weak, strong = changes
-        assert strong > 1.5 * weak > 0
+@pytest.mark.parametrize("shown", ["floor"], indirect=True)
+def test_levels_move_the_average_colour_away(shown: Renderer) -> None:
+    clean = frames(shown, ["agentview"])["agentview"]
+    changes = []
+    for scale in (0.2, 1.0):
+        after = []
+        for key in range(5):
+            perturbation = drawn("surface", 1, key).model_copy(update={"colour_scale": scale})
+            with shown.perturbed([perturbation]):
+                after.append(change(clean, frames(shown, ["agentview"])["agentview"]))
+        changes.append(mean(after))
+    weak, strong = changes
+    assert strong > 1.5 * weak > 0
 
-        class Broken(RenderPerturbation):
-            """Writes, then fails."""
+    class Broken(RenderPerturbation):
+        """Writes, then fails."""
 
-            fields = ("tex_data", "light_diffuse")
+        fields = ("tex_data", "light_diffuse")
 
-            def apply(self, model: object) -> None:
-                drawn("surface", 5, 0).apply(model)
-                raise RuntimeError
+        def apply(self, model: object) -> None:
+            drawn("surface", 5, 0).apply(model)
+            raise RuntimeError
 
-        before = checksums(shown)
-        with pytest.raises(RuntimeError), shown.perturbed([Broken(axis="broken", component="", level=1)]):
-            pass
-        assert changed(before, checksums(shown)) == set()
-        assert np.array_equal(frames(shown, ["agentview"])["agentview"], clean)
-    finally:
-        shown.close()
+    before = checksums(shown)
+    with pytest.raises(RuntimeError), shown.perturbed([Broken(axis="broken", component="", level=1)]):
+        pass
+    assert changed(before, checksums(shown)) == set()
+    assert np.array_equal(frames(shown, ["agentview"])["agentview"], clean)
 
 
 def test_draws_are_keyed_recorded_and_from_all_sources() -> None:

@@ -9,11 +9,12 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from arenas import TASKS, change, changed, checksums, frames, renderer
+from arenas import TASKS, change, changed, checksums, frames
 from conftest import MILK
 
 from pipeline.axes.base import Level
 from pipeline.axes.light import TILT_AZIMUTH_DEG, Component, LightAxis, LightPerturbation, exposure
+from pipeline.rendering.renderer import Renderer
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Frame, Task
@@ -109,95 +110,80 @@ def test_ranges_grow_with_the_level() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("arena", TASKS)
-def test_every_lamp_changes_and_nothing_but_lamps(arena: str) -> None:
-    shown = renderer(arena)
-    try:
-        before, clean = checksums(shown), frames(shown)
-        directions, colours = shown.model.light_dir.copy(), shown.model.light_diffuse.copy()
-        places = shown.model.light_pos.copy()
-        everything = next(one for key in range(20) if (one := drawn("combined", 5, key)).shadows)
-        with shown.perturbed([everything]):
-            assert changed(before, checksums(shown)) <= set(LightPerturbation.fields)
-            assert np.array_equal(shown.model.light_pos, places)
-            assert shown.model.light_castshadow.all()
-            assert (shown.model.light_diffuse != colours).any(axis=1).all()
-            assert np.allclose(np.linalg.norm(shown.model.light_dir, axis=1), 1)
-            assert (shown.model.light_dir != directions).any(axis=1).all()
-            after = frames(shown)
-        assert all(change(clean[view], after[view]) > 3 for view in clean)
-        assert changed(before, checksums(shown)) == set()
-        restored = frames(shown)
-        assert all(np.array_equal(clean[view], restored[view]) for view in clean)
+@pytest.mark.parametrize("shown", TASKS, indirect=True)
+def test_every_lamp_changes_and_nothing_but_lamps(shown: Renderer, request: pytest.FixtureRequest) -> None:
+    before, clean = checksums(shown), frames(shown)
+    directions, colours = shown.model.light_dir.copy(), shown.model.light_diffuse.copy()
+    places = shown.model.light_pos.copy()
+    everything = next(one for key in range(20) if (one := drawn("combined", 5, key)).shadows)
+    with shown.perturbed([everything]):
+        assert changed(before, checksums(shown)) <= set(LightPerturbation.fields)
+        assert np.array_equal(shown.model.light_pos, places)
+        assert shown.model.light_castshadow.all()
+        assert (shown.model.light_diffuse != colours).any(axis=1).all()
+        assert np.allclose(np.linalg.norm(shown.model.light_dir, axis=1), 1)
+        assert (shown.model.light_dir != directions).any(axis=1).all()
+        after = frames(shown)
+    assert all(change(clean[view], after[view]) > 3 for view in clean)
+    assert changed(before, checksums(shown)) == set()
+    restored = frames(shown)
+    assert all(np.array_equal(clean[view], restored[view]) for view in clean)
 
-        for perturbation in weakest_and_strongest(TASKS[arena]):
-            with shown.perturbed([perturbation]):
-                after = frames(shown, ["agentview"])
-            assert share_changed(clean["agentview"], after["agentview"]) >= NOTICED_SHARE, perturbation
+    for perturbation in weakest_and_strongest(TASKS[request.node.callspec.params["shown"]]):
+        with shown.perturbed([perturbation]):
+            after = frames(shown, ["agentview"])
+        assert share_changed(clean["agentview"], after["agentview"]) >= NOTICED_SHARE, perturbation
 
-        # The corners of the ranges: as little light as there can be, and as much.
-        assert [exposure(frame) for frame in clean.values()] == [None, None]
-        dimmest = {"diffuse_scale_rgb": (0.0, 0.0, 0.0), "tilt_deg": 32.0}
-        brightest = {"diffuse_scale_rgb": (2.0, 2.0, 2.0), "specular_scale": 30.0}
-        # The table and the floor below the wrist's camera are brightest with lamps turned so.
-        lit = {"shadows": True, "tilt_deg": 20.0, "tilt_azimuth_deg": 200.0}
-        for corner in (dimmest, brightest | lit):
-            with shown.perturbed([NEUTRAL.model_copy(update=corner)]):
-                assert [exposure(frame) for frame in frames(shown).values()] == [None, None], corner
-    finally:
-        shown.close()
+    # The corners of the ranges: as little light as there can be, and as much.
+    assert [exposure(frame) for frame in clean.values()] == [None, None]
+    dimmest = {"diffuse_scale_rgb": (0.0, 0.0, 0.0), "tilt_deg": 32.0}
+    brightest = {"diffuse_scale_rgb": (2.0, 2.0, 2.0), "specular_scale": 30.0}
+    # The table and the floor below the wrist's camera are brightest with lamps turned so.
+    lit = {"shadows": True, "tilt_deg": 20.0, "tilt_azimuth_deg": 200.0}
+    for corner in (dimmest, brightest | lit):
+        with shown.perturbed([NEUTRAL.model_copy(update=corner)]):
+            assert [exposure(frame) for frame in frames(shown).values()] == [None, None], corner
 
 
 @pytest.mark.slow
-def test_stronger_levels_change_more() -> None:
+@pytest.mark.parametrize("shown", ["tabletop"], indirect=True)
+def test_stronger_levels_change_more(shown: Renderer) -> None:
     weak: dict[str, list[float]] = {component: [] for component in COMPONENTS}
     strong: dict[str, list[float]] = {component: [] for component in COMPONENTS}
-    shown = renderer("tabletop")
-    try:
-        clean = frames(shown, ["agentview"])["agentview"]
-        for component in COMPONENTS:
-            for level, changes in ((1, weak), (5, strong)):
-                for key in range(3):
-                    with shown.perturbed([drawn(component, level, key)]):  # type: ignore[arg-type]
-                        after = frames(shown, ["agentview"])["agentview"]
-                    changes[component].append(change(clean, after))
-    finally:
-        shown.close()
+    clean = frames(shown, ["agentview"])["agentview"]
+    for component in COMPONENTS:
+        for level, changes in ((1, weak), (5, strong)):
+            for key in range(3):
+                with shown.perturbed([drawn(component, level, key)]):  # type: ignore[arg-type]
+                    after = frames(shown, ["agentview"])["agentview"]
+                changes[component].append(change(clean, after))
     for component in COMPONENTS:
         assert mean(strong[component]) > 1.2 * mean(weak[component]), component
 
 
 @pytest.mark.slow
-def test_light_comes_from_where_the_parameters_say() -> None:
-    shown = renderer("tabletop")
-    try:
-        lamp = shown.model.light("light1")
-        nominal = lamp.dir.copy()
-        for azimuth, towards in ((0.0, [1, 0]), (90.0, [0, 1])):
-            tilted = NEUTRAL.model_copy(update={"tilt_deg": 20.0, "tilt_azimuth_deg": azimuth})
-            with shown.perturbed([tilted]):
-                assert (lamp.dir[:2] - nominal[:2]) @ towards > 0.3
-                assert np.array_equal(lamp.pos, [1, 1, 4])
-    finally:
-        shown.close()
+@pytest.mark.parametrize("shown", ["tabletop"], indirect=True)
+def test_light_comes_from_where_the_parameters_say(shown: Renderer) -> None:
+    lamp = shown.model.light("light1")
+    nominal = lamp.dir.copy()
+    for azimuth, towards in ((0.0, [1, 0]), (90.0, [0, 1])):
+        tilted = NEUTRAL.model_copy(update={"tilt_deg": 20.0, "tilt_azimuth_deg": azimuth})
+        with shown.perturbed([tilted]):
+            assert (lamp.dir[:2] - nominal[:2]) @ towards > 0.3
+            assert np.array_equal(lamp.pos, [1, 1, 4])
 
 
 @pytest.mark.slow
-def test_shadows_are_there_and_soften() -> None:
-    shown = renderer("floor")
+@pytest.mark.parametrize("shown", ["floor"], indirect=True)
+def test_shadows_are_there_and_soften(shown: Renderer) -> None:
     darkest = []
-    try:
-        for fill in (0.0, 0.3):
-            light, dark = (
-                NEUTRAL.model_copy(update={"shadows": shadows, "fill_scale": fill}) for shadows in (False, True)
-            )
-            with shown.perturbed([light]):
-                unshadowed = frames(shown, ["agentview"])["agentview"].astype(int)
-            with shown.perturbed([dark]):
-                shadowed = frames(shown, ["agentview"])["agentview"]
-            darkest.append(np.percentile((shadowed - unshadowed).mean(axis=2), 3))
-    finally:
-        shown.close()
+    for fill in (0.0, 0.3):
+        light, dark = (NEUTRAL.model_copy(update={"shadows": shadows, "fill_scale": fill}) for shadows in (False, True))
+        with shown.perturbed([light]):
+            unshadowed = frames(shown, ["agentview"])["agentview"].astype(int)
+        with shown.perturbed([dark]):
+            shadowed = frames(shown, ["agentview"])["agentview"]
+        darkest.append(np.percentile((shadowed - unshadowed).mean(axis=2), 3))
     hard, soft = darkest
     assert hard < -40, f"3 % of the pixels should be darker by 40 grey levels, are by {-hard:.0f}"
     assert hard < soft - 10

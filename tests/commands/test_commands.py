@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import yaml
 from conftest import IN_SCRIPTS, REPOSITORY, dvc, rot, tiny_config
 
 from pipeline.__main__ import main, parser
+from pipeline.files import edition
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.run import manifest
 
@@ -158,41 +160,79 @@ def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
     assert "has nothing of this" in call(clone, "clean").stdout
 
 
-def test_run_elsewhere_with_a_subset_in_one_format(clone: Path, tmp_path: Path) -> None:
-    """All stages run on finished frames in a folder on another disk, as ablations do."""
-    elsewhere = tmp_path / "elsewhere"
-    shutil.move(clone / "data" / "tiny", elsewhere / "tiny")
-    (clone / "params.yaml").write_text("run: other\ndata: data\n")
-    frames = {file: file.read_bytes() for file in (elsewhere / "tiny/frames").rglob("*.h5")}
-    previews = {file: file.stat().st_mtime_ns for file in (elsewhere / "tiny/previews").rglob("*")}
-    lerobot = (elsewhere / "tiny/lerobot.json").read_bytes()
-    where = {"axis": ["clean", "camera"], "suite": ["libero_goal"]}
-    export = {"rlds": {"name": "libero_tiny"}, "lerobot": None, "where": where}
-    configured(clone, folder=str(elsewhere), export=export)
+@dataclass
+class Ablation:
+    """A run that was stopped and went on; what was there before, and processes that went on after the first command."""
 
-    done = call(clone, "run", "configs/tiny.yaml")
+    clone: Path
+    data: Path
+    finished: dict[Path, object]
+    stopped: subprocess.CompletedProcess[str]
+    left: list[Path]
+    done: subprocess.CompletedProcess[str]
+
+
+@pytest.fixture(scope="module")
+def ablation(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Ablation:
+    """All stages run on finished frames in a folder on another disk, of a part of the episodes in one format."""
+    folder = tmp_path_factory.mktemp("ablation")
+    clone, data = folder / "clone", folder / "elsewhere" / "tiny"
+    shutil.copytree(finished.parent.parent, clone, symlinks=True)
+    shutil.move(clone / "data" / "tiny", data)
+    (clone / "params.yaml").write_text("run: other\ndata: data\n")
+    where = {"axis": ["clean", "camera"], "suite": ["libero_goal"]}
+    configured(
+        clone, folder=str(data.parent), export={"rlds": {"name": "libero_tiny"}, "lerobot": None, "where": where}
+    )
+    for name in ("plan.parquet", "report.html"):
+        (data / name).unlink()
+    names = ("trajectories", "frames", "lerobot", "previews")
+    files = [file for name in names for file in (data / name).rglob("*.*") if file.name != "index.parquet"]
+    stay: dict[Path, object] = {file: edition(file) for file in (*files, data / "lerobot.json")}
+    command = [sys.executable, "-m", "pipeline", "run", "configs/tiny.yaml"]
+    running = subprocess.Popen(
+        command, cwd=clone, env=IN_SCRIPTS, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    while not (data / "plan.parquet").exists() and running.poll() is None:
+        time.sleep(0.05)
+    running.send_signal(signal.SIGTERM)
+    told, _ = running.communicate(timeout=60)
+    left = [process for process in Path("/proc").glob("[0-9]*") if _in(clone, process)]
+    # As where DVC was killed while it wrote it.
+    (clone / "dvc.lock").write_text("stages:\n  plan: [")
+    stopped = subprocess.CompletedProcess(command, running.returncode, told)
+    return Ablation(clone, data, stay, stopped, left, call(clone, "run", "configs/tiny.yaml"))
+
+
+def test_run_goes_on_after_it_was_stopped_and_what_is_finished_stays(ablation: Ablation) -> None:
+    assert ablation.stopped.returncode == 143, ablation.stopped.stdout
+    assert ablation.left == [], "none goes on unseen"
+    done = ablation.done
     assert done.returncode == 0, done.stdout + done.stderr
-    listed = done.stdout.rpartition("\n\n")[2].splitlines()
+    assert done.stdout.count("Running stage") == 14
+    assert {file: edition(file) for file in ablation.finished} == ablation.finished
+
+
+def test_run_elsewhere_with_a_subset_in_one_format(ablation: Ablation) -> None:
+    clone, data = ablation.clone, ablation.data
+    listed = ablation.done.stdout.rpartition("\n\n")[2].splitlines()
     places = dict(line.strip().split("  ") for line in listed)
-    assert places["RLDS"] == str(elsewhere / "tiny" / "rlds")
+    assert places["RLDS"] == str(data / "rlds")
     assert Path(places["report"]).is_file()
     assert "LeRobot" not in places
-    assert yaml.safe_load((clone / "params.yaml").read_text()) == {"run": "tiny", "data": str(elsewhere)}
+    assert yaml.safe_load((clone / "params.yaml").read_text()) == {"run": "tiny", "data": str(data.parent)}
 
-    rows = manifest.read(elsewhere / "tiny/manifest.parquet")
+    rows = manifest.read(data / "manifest.parquet")
     written = [row for row in rows if row["kept"]]
     assert {(row["axis"], row["suite"]) for row in written} == {("clean", "libero_goal"), ("camera", "libero_goal")}
     left_out = [row for row in rows if row["reason"] == "left_out"]
     assert {row["axis"] for row in left_out} == {"clean", "camera", "noise", "language"}
     assert all(row["rlds_shard"] is None for row in left_out)
     assert all(row["lerobot_episode_index"] is None for row in rows)
-    assert [folder.name for folder in (elsewhere / "tiny/rlds").iterdir()] == ["libero_tiny_goal"]
-    assert {file: file.read_bytes() for file in frames} == frames
-    assert {file: file.stat().st_mtime_ns for file in previews} == previews != {}, "they show no episode"
-    assert (elsewhere / "tiny/lerobot.json").read_bytes() == lerobot, "finished work stays until it is cleaned"
-    recipe = yaml.safe_load((elsewhere / "tiny/finetune/finetune.yaml").read_text())
+    assert [folder.name for folder in (data / "rlds").iterdir()] == ["libero_tiny_goal"]
+    recipe = yaml.safe_load((data / "finetune/finetune.yaml").read_text())
     assert list(recipe["clients"]) == ["openvla_oft"]
-    assert [folder.name for folder in (elsewhere / "tiny/card").iterdir()] == ["rlds"]
+    assert [folder.name for folder in (data / "card").iterdir()] == ["rlds"]
     assert "nothing would run" in call(clone, "status").stdout
 
     found = call(clone, "check")
@@ -200,37 +240,13 @@ def test_run_elsewhere_with_a_subset_in_one_format(clone: Path, tmp_path: Path) 
     assert json.loads(found.stdout.splitlines()[-1])["openvla_oft"]["libero_tiny_goal"]["episodes"] == len(written)
     pushed = call(clone, "push", "lerobot", "me/tiny")
     assert "the run has no lerobot" in pushed.stderr
-    rot(next((elsewhere / "tiny/trajectories").glob("*.h5")))
+    rot(next((data / "trajectories").glob("*.h5")))
     assert call(clone, "check").returncode == 1
 
     (clone / "params.yaml").write_text("run: tiny\ndata: data\n")
     mistaken = dvc(clone, "repro")
     assert mistaken.returncode != 0
     assert "python -m pipeline run configs/tiny.yaml" in mistaken.stdout + mistaken.stderr
-
-
-def test_run_goes_on_after_it_was_stopped(clone: Path) -> None:
-    """A run that has yet to plan, to replay a demonstration and to write its report."""
-    plan, report = clone / "data/tiny/plan.parquet", clone / "data/tiny/report.html"
-    lost = next((clone / "data/tiny/trajectories").glob("*.h5"))
-    trajectory = lost.read_bytes()
-    for file in (plan, report, lost):
-        file.unlink()
-    command = [sys.executable, "-m", "pipeline", "run"]
-    running = subprocess.Popen(
-        command, cwd=clone, env=IN_SCRIPTS, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    )
-    while not plan.exists() and running.poll() is None:
-        time.sleep(0.05)
-    running.send_signal(signal.SIGTERM)
-    told, _ = running.communicate(timeout=60)
-    assert running.returncode == 143, told
-    assert [process for process in Path("/proc").glob("[0-9]*") if _in(clone, process)] == [], "none goes on unseen"
-    (clone / "dvc.lock").write_text("stages:\n  plan: [")
-    done = call(clone, "run")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert report.is_file()
-    assert lost.read_bytes() == trajectory
 
 
 def _in(folder: Path, process: Path) -> bool:

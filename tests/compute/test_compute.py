@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from compute_work import BLOCK_BYTES, die, die_or_hang, gpu, mark, pages_asked_for, process, refuse, square
 from conftest import REPOSITORY
 from distributed import Nanny
 
@@ -21,21 +22,6 @@ from pipeline import gl
 from pipeline.compute.pool import TRIES, Expendable, loop, runner
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
-
-
-def square(number: int) -> int:
-    return number * number
-
-
-def process(_: int) -> int:
-    time.sleep(0.1)  # or one worker may do all before the other is asked
-    return os.getpid()
-
-
-def refuse(number: int) -> int:
-    if number == 2:
-        raise PipelineError("two is refused", where="item 2", expected="another number", remedy="leave it out")
-    return number
 
 
 @pytest.mark.slow
@@ -58,28 +44,11 @@ def test_local_processes_and_a_scheduler_by_address(tmp_path: Path) -> None:
         assert list(tmp_path.iterdir()) == []
 
 
-BLOCK_BYTES = 2**19
-"""Of less than a megabyte: larger ones the tests give back, see conftest.py."""
-
-
-def pages_asked_for(times: int) -> int:
-    """So many pages the system had to give, while a block of memory was taken, filled and freed again and again."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(times):
-        b"x" * BLOCK_BYTES
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-
-
 @pytest.mark.slow
 def test_a_worker_keeps_the_memory_that_it_frees(tmp_path: Path) -> None:
     with runner(ComputeConfig(cluster="local", workers=1), tmp_path) as run:
         (pages,) = run(pages_asked_for, [100], "pages")
     assert pages < 10 * BLOCK_BYTES // resource.getpagesize(), "not anew each time"
-
-
-def gpu(_: int) -> tuple[int, str, str | None]:
-    time.sleep(0.1)
-    return os.getpid(), gl.choose().device, os.environ.get("MUJOCO_EGL_DEVICE_ID")
 
 
 @pytest.mark.slow
@@ -97,29 +66,12 @@ def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(
         assert {(device, index) for _, device, index in run(gpu, range(30), "GPUs")} <= set(found)
 
 
-def die(_: int) -> int:
-    os._exit(1)
-
-
-def mark(file: Path) -> None:
-    file.touch()
-    time.sleep(0.1)
-
-
 def test_progress_is_counted_in_what_items_hold(capsys: pytest.CaptureFixture[str]) -> None:
     """Else a bar of few large items stands still, and the time that is left is wrong."""
     work = Expendable(square, limit_s=lambda _: 1.0, lost=square, size=lambda number: number)
     assert loop(work, [1, 9, 10], "squares, sides") == [1, 81, 100]
     lines = capsys.readouterr().err.splitlines()
     assert [line.split(",")[1].split(": ")[1] for line in lines] == ["10/20", "20/20"]
-
-
-def die_or_hang(number: int) -> int:
-    if number == 2:
-        die(number)
-    if number == 3:
-        time.sleep(1000)
-    return number
 
 
 @pytest.mark.slow
@@ -239,10 +191,10 @@ def test_without_work_nothing_is_started(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["plan", "export_rlds", "export_lerobot", "manifest"])
-def test_only_replay_and_render_load_the_simulator(stage: str) -> None:
+def test_only_replay_and_render_load_the_simulator() -> None:
     script = (
-        f"import sys, runpy; runpy.run_path('stages/{stage}.py'); "
+        "import sys, runpy; "
+        "[runpy.run_path(f'stages/{stage}.py') for stage in ('plan', 'export_rlds', 'export_lerobot', 'manifest')]; "
         "print([name for name in ('mujoco', 'robosuite', 'tensorflow') if name in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,12 +25,14 @@ import robosuite.utils.transform_utils as transform  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 from model_server import replaying  # noqa: E402
 
+from pipeline.__main__ import main  # noqa: E402
 from pipeline.axes.camera import CameraPerturbation  # noqa: E402
 from pipeline.axes.corruptions import Gaussian  # noqa: E402
 from pipeline.axes.noise import NoisePerturbation  # noqa: E402
 from pipeline.errors import PipelineError  # noqa: E402
 from pipeline.evaluation import libero_plus  # noqa: E402
-from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings  # noqa: E402
+from pipeline.evaluation.evaluate import _environment  # noqa: E402
 from pipeline.evaluation.policies import Wanted  # noqa: E402
 from pipeline.evaluation.selection import Selection, select  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, libero_states  # noqa: E402
@@ -194,37 +196,52 @@ def command(out: Path, *arguments: str) -> list[str]:
     return [sys.executable, "-m", "pipeline", "evaluate", str(out), *shared, *start, *arguments]
 
 
+Evaluate = Callable[..., None]
+"""The command in this process, which keeps its environment from one to the next."""
+
+
+@pytest.fixture(scope="module")
+def evaluate_here() -> Iterator[Evaluate]:
+    def run(out: Path, *arguments: str) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", command(out, *arguments, "--workers", "1")[2:])
+            assert main() == 0
+
+    yield run
+    _environment(EpisodeSettings(initial_states="demonstration"), None).close()
+    _environment.cache_clear()
+
+
 def rows(out: Path) -> dict[str, dict[str, Any]]:
     return {path.stem: json.loads(path.read_text()) for path in sorted((out / "episodes").glob("*.json"))}
 
 
 @pytest.mark.slow
-def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path) -> None:
-    alone, spread = tmp_path / "alone", tmp_path / "spread"
-    killed = subprocess.Popen(command(alone, "--replay", "--workers", "1"), cwd=REPOSITORY)
-    while killed.poll() is None and not list(alone.glob("episodes/*.json")):
+def test_a_killed_evaluation_goes_on_and_workers_do_not_matter(tmp_path: Path, evaluate_here: Evaluate) -> None:
+    begun, alone = tmp_path / "begun", tmp_path / "alone"
+    killed = subprocess.Popen(command(begun, "--replay", "--workers", "1"), cwd=REPOSITORY)
+    while killed.poll() is None and not list(begun.glob("episodes/*.json")):
         time.sleep(0.02)
     killed.send_signal(signal.SIGKILL)
     killed.wait()
-    first = {path: path.stat().st_mtime_ns for path in alone.glob("episodes/*.json")}
+    first = {path: path.stat().st_mtime_ns for path in begun.glob("episodes/*.json")}
     assert len(first) == 1
-    subprocess.run(command(alone, "--replay", "--workers", "1"), cwd=REPOSITORY, check=True)
+    subprocess.run(command(begun, "--replay", "--workers", "2", "--videos", "failures"), cwd=REPOSITORY, check=True)
     assert all(path.stat().st_mtime_ns == when for path, when in first.items()), "a finished episode is kept"
-    subprocess.run(command(spread, "--replay", "--workers", "2", "--videos", "failures"), cwd=REPOSITORY, check=True)
-    assert not (spread / "videos").exists(), "nothing failed"
+    assert not (begun / "videos").exists(), "nothing failed"
+    evaluate_here(alone, "--replay")
     assert len(rows(alone)) == 2
-    assert rows(alone) == rows(spread)
-    found = json.loads((alone / "summary.json").read_text())
+    assert rows(alone) == rows(begun)
+    found = json.loads((begun / "summary.json").read_text())
     assert found["all"]["successes"] == found["all"]["episodes"] == 2
 
 
 @pytest.mark.slow
-def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) -> None:
+def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path, evaluate_here: Evaluate) -> None:
     with replaying(8) as address:
         ours = tmp_path / "ours"
         arguments = ["--suite", "libero_goal", "--server", address, "--label", "replay"]
-        arguments += ["--workers", "1", "--videos", "all"]
-        subprocess.run(command(ours, *arguments), cwd=REPOSITORY, check=True)
+        evaluate_here(ours, *arguments, "--videos", "all")
         ((episode, row),) = rows(ours).items()
         assert row["success"]
         assert row["looks"] == -(-row["steps"] // 8), "a chunk of eight actions takes one look"
@@ -252,9 +269,8 @@ def test_a_model_server_is_evaluated_by_us_and_by_its_harness(tmp_path: Path) ->
 
 
 @pytest.mark.slow
-def test_a_path_is_followed_by_what_an_observation_has(tmp_path: Path) -> None:
-    arguments = ["--suite", "libero_goal", "--replay", "tracked", "--workers", "1"]
-    subprocess.run(command(tmp_path, *arguments), cwd=REPOSITORY, check=True)
+def test_a_path_is_followed_by_what_an_observation_has(tmp_path: Path, evaluate_here: Evaluate) -> None:
+    evaluate_here(tmp_path, "--suite", "libero_goal", "--replay", "tracked")
     (row,) = rows(tmp_path).values()
     assert row["success"]
     assert row["looks"] == row["steps"], "feedback at every step"

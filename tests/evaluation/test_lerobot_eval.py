@@ -70,7 +70,7 @@ def liberos(task: Task) -> list[tuple[Any, dict[str, Any]]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", TESTED_SUITES)
-def test_ten_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
+def test_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
     task = tasks(suite)[0]
     shown = liberos(task)
     ours = PerturbedLiberoEnv(select(Selection(suites=(suite,), tasks=(task.name,))), EpisodeSettings())

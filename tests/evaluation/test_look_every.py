@@ -6,6 +6,7 @@ import asyncio
 import json
 from collections.abc import Callable
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +38,16 @@ Run = Callable[[str, int], int]
 """Runs the episode with the server at an address, which looks once in so many steps; how many looks were rendered."""
 
 
+@cache
+def opened() -> EpisodeEnvironment:
+    return EpisodeEnvironment()
+
+
 def ours(address: str, look_every: int) -> int:
-    with closing(EpisodeEnvironment()) as environment, closing(Server(address, look_every=look_every)) as server:
-        roll_out_policy(environment, server, TASK)
-        assert environment.progress.steps == STEPS
-        return environment.looks
+    with closing(Server(address, look_every=look_every)) as server:
+        roll_out_policy(opened(), server, TASK)
+    assert opened().progress.steps == STEPS
+    return opened().looks
 
 
 def harness(address: str, look_every: int) -> int:
@@ -84,6 +90,7 @@ def short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(environment.STEP_LIMITS, STOVE.suite, STEPS)
         yield
+    opened().close()
 
 
 def test_rows_of_the_harness_need_a_folder_and_a_label(tmp_path: Path) -> None:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import product
-
-import arenas
 import mujoco
 import numpy as np
 import pytest
-from arenas import TASKS, both_ways
+from arenas import both_ways
 
 from pipeline import seeding
-from pipeline.episode_schema import SCHEMA
-from pipeline.rendering.opengl import say_once
 from pipeline.rendering.renderer import Renderer
 
 GEOMS = 30
@@ -60,24 +55,3 @@ def test_the_same_pixels_with_less_drawn(shadows: bool) -> None:
         assert left_out == 0, "what is not in the picture may cast a shadow into it"
     else:
         assert left_out > 20 * GEOMS / 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arena", TASKS)
-def test_the_same_pixels_in_every_arena(arena: str, caplog: pytest.LogCaptureFixture) -> None:
-    say_once.cache_clear()
-    opened = arenas.renderer(arena)
-    rng = seeding.rng("test_culling", arena)
-    left_out = 0
-    with both_ways(opened) as (ours, plain):
-        for number, camera in product(range(3), (view.camera for view in SCHEMA.views.values())):
-            # The first seven are the arm's.
-            opened.data.qpos[:7] += rng.uniform(-0.3, 0.3, 7)
-            opened.model.light_castshadow[:] = number % 2
-            mujoco.mj_forward(opened.model, opened.data)
-            assert np.array_equal(opened.frame(camera), plain.frame(opened.data, camera)), camera
-            left_out += int((ours._culling.shown & ~ours._culling.picture(opened.data, camera).seen).sum())
-            shown, expected = opened.surfaces(camera), plain.surfaces(opened.data, camera)
-            assert all(map(np.array_equal, shown, expected)), "which meshes a frame was drawn of does not matter"
-        assert left_out > 30
-        assert caplog.records == [], "OpenGL reports no error"

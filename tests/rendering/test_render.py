@@ -68,17 +68,18 @@ def libero_frames(request: pytest.FixtureRequest, whole: dict[Task, Trajectory])
 
 
 @pytest.mark.parametrize("perturbed", [False, True], ids=["clean", "camera moved"])
-def test_frames_and_proprioception_equal_libero(libero_frames: tuple[Trajectory, Libero], perturbed: bool) -> None:
+def test_frames_and_proprioception_equal_libero(
+    libero_frames: tuple[Trajectory, Libero], opened: LastScene, perturbed: bool
+) -> None:
     trajectory, libero = libero_frames
     ours: dict[int, tuple[dict[str, Frame], np.ndarray, np.ndarray]] = {}  # type: ignore[type-arg]
     steps = (0, len(trajectory.actions) // 2, len(trajectory.actions))
-    renderer = Renderer(trajectory.model_xml)
+    renderer = opened.renderer(trajectory.model_xml)
     with renderer.perturbed([MOVED] if perturbed else []):
         for step in steps:
             renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
             frames = {view: renderer.frame(spec.camera) for view, spec in SCHEMA.views.items()}
             ours[step] = frames, *proprioception(renderer.data)
-    renderer.close()
 
     model = libero.env.sim.model._model
     saved = {name: getattr(model, name).copy() for name in MOVED.fields}
@@ -100,15 +101,14 @@ def test_frames_and_proprioception_equal_libero(libero_frames: tuple[Trajectory,
         getattr(model, name)[:] = value
 
 
-def test_lit_burner_is_seen(whole: dict[Task, Trajectory]) -> None:
+def test_lit_burner_is_seen(whole: dict[Task, Trajectory], opened: LastScene) -> None:
     trajectory = whole[STOVE]
-    renderer = Renderer(trajectory.model_xml)
+    renderer = opened.renderer(trajectory.model_xml)
     last = trajectory.states[-1]
     renderer.restore(last, trajectory.site_alpha[-1])
     lit = renderer.frame("agentview").astype(int)
     renderer.restore(last, trajectory.site_alpha[0])
     dark = renderer.frame("agentview").astype(int)
-    renderer.close()
     assert np.abs(lit - dark).max() > 50
 
 
@@ -117,9 +117,9 @@ def fields(model: mujoco.MjModel) -> dict[str, bytes]:
     return {name: value.tobytes() for name, value in arrays.items() if isinstance(value, np.ndarray)}
 
 
-def test_camera_changes_the_camera_alone_and_is_undone(whole: dict[Task, Trajectory]) -> None:
+def test_camera_changes_the_camera_alone_and_is_undone(whole: dict[Task, Trajectory], opened: LastScene) -> None:
     trajectory = whole[MILK]
-    renderer = Renderer(trajectory.model_xml)
+    renderer = opened.renderer(trajectory.model_xml)
     renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
     before, wrist = fields(renderer.model), renderer.frame("robot0_eye_in_hand")
     agent = renderer.frame("agentview")
@@ -130,7 +130,6 @@ def test_camera_changes_the_camera_alone_and_is_undone(whole: dict[Task, Traject
         assert np.array_equal(renderer.frame("robot0_eye_in_hand"), wrist)
         assert not np.array_equal(renderer.frame("agentview"), agent)
     assert fields(renderer.model) == before
-    renderer.close()
 
 
 def test_streams_are_shared_where_nothing_shows() -> None:
@@ -200,17 +199,18 @@ def test_a_black_frame_is_rejected_with_its_reason_and_remembered(
     assert json.loads(row["rejected"]) == rendered.rejected
 
 
-def test_geoms_are_those_that_pixels_show(whole: dict[Task, Trajectory]) -> None:
+def test_geoms_are_those_that_pixels_show(whole: dict[Task, Trajectory], opened: LastScene) -> None:
     trajectory = whole[MILK]
-    renderer = Renderer(trajectory.model_xml)
+    renderer = opened.renderer(trajectory.model_xml)
     renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
     before = renderer.frame("agentview")
     seen = renderer.geoms("agentview")
     assert np.array_equal(renderer.frame("agentview"), before), "looking for geoms changes later frames"
     milk = renderer.model.geom_bodyid == renderer.model.body("milk_1_main").id
+    groups = renderer.model.geom_group[milk]
     renderer.model.geom_group[milk] = 5  # not shown
     gone = (np.abs(renderer.frame("agentview").astype(int) - before) > 5).any(axis=2)
-    renderer.close()
+    renderer.model.geom_group[milk] = groups
     shown = milk[seen] & (seen >= 0)
     assert shown.sum() > 100
     assert (gone & shown).sum() > 0.9 * shown.sum()
@@ -257,9 +257,11 @@ def test_what_the_original_does_not_show_either_is_no_reason() -> None:
     assert Sight({"milk_1": 4, "basket_1": 900}, 0.6).faults(hidden) == ["task_object_not_seen", "hand_not_seen"]
 
 
-def test_the_hand_is_outside_where_its_place_is_not_in_the_frame(whole: dict[Task, Trajectory]) -> None:
+def test_the_hand_is_outside_where_its_place_is_not_in_the_frame(
+    whole: dict[Task, Trajectory], opened: LastScene
+) -> None:
     trajectory = whole[MILK]
-    renderer = Renderer(trajectory.model_xml)
+    renderer = opened.renderer(trajectory.model_xml)
     renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
     seen = renderer.geoms("agentview")
     bodies = set(renderer.model.geom_bodyid[seen[seen >= 0]].tolist())
@@ -271,4 +273,3 @@ def test_the_hand_is_outside_where_its_place_is_not_in_the_frame(whole: dict[Tas
     assert Sight.of(renderer, MILK, np.array([*within_m, camera.xpos + ahead_m])).hand_outside == 0.0
     assert Sight.of(renderer, MILK, np.array(beside_m)).hand_outside == 1.0
     assert Sight.of(renderer, MILK, np.array([*within_m, *beside_m])).hand_outside == 3 / 5
-    renderer.close()

@@ -9,11 +9,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing
 
-import arenas
 import mujoco
-import numpy as np
 import pytest
-from arenas import TASKS, VIEWS
 
 from pipeline import gl
 from pipeline.rendering import savings
@@ -95,21 +92,3 @@ print(type(Renderer({SCENE!r}).drawing).__name__, [name for name in sys.modules 
     environment = os.environ | {savings.PLAIN: "1"}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert (done.stdout.strip(), done.stderr) == ("PlainDrawing []", "")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("arena", TASKS)
-def test_plain_frames_and_surfaces_are_those_of_mujocos_renderer(arena: str) -> None:
-    """``mujoco.Renderer`` has the first row at the top."""
-    opened = arenas.renderer(arena)
-    option = mujoco.MjvOption()
-    option.geomgroup[0] = 0
-    theirs = mujoco.Renderer(opened.model, 256, 256, max_geom=1000)
-    with arenas.both_ways(opened) as (_, plain), theirs:
-        for camera in VIEWS:
-            theirs.update_scene(opened.data, camera, option)
-            assert np.array_equal(plain.frame(opened.data, camera), theirs.render()[::-1])
-            _, number, kind = plain.surfaces(opened.data, camera)
-            theirs.enable_segmentation_rendering()
-            assert np.array_equal(np.stack([number, kind], axis=-1), theirs.render()[::-1])
-            theirs.disable_segmentation_rendering()

@@ -103,12 +103,6 @@ def tiles(sheet: Image.Image, views: int) -> list[Frame]:
     ]
 
 
-def test_a_stage_shows_the_same_again(stage: preview.Stage) -> None:
-    first, again = stage.frames(VIEWS), stage.frames(VIEWS)
-    assert [frame.shape for frame in first] == [SCHEMA.frame.shape] * 2
-    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
-
-
 @pytest.mark.parametrize("name", AXES)
 def test_every_axis_changes_no_other_views_than_it_says_and_leaves_the_stage_as_it_was(
     stage: preview.Stage, name: str

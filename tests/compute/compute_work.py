@@ -1,0 +1,58 @@
+"""What workers are given to do, in a module that they import quickly."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from pathlib import Path
+
+from pipeline import gl
+from pipeline.errors import PipelineError
+
+BLOCK_BYTES = 2**19
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def process(_: int) -> int:
+    time.sleep(0.1)  # or one worker may do all before the other is asked
+    return os.getpid()
+
+
+def refuse(number: int) -> int:
+    if number == 2:
+        raise PipelineError("two is refused", where="item 2", expected="another number", remedy="leave it out")
+    return number
+
+
+def gpu(_: int) -> tuple[int, str, str | None]:
+    time.sleep(0.1)
+    return os.getpid(), gl.choose().device, os.environ.get("MUJOCO_EGL_DEVICE_ID")
+
+
+def die(_: int) -> int:
+    os._exit(1)
+
+
+def die_or_hang(number: int) -> int:
+    if number == 2:
+        die(number)
+    if number == 3:
+        time.sleep(1000)
+    return number
+
+
+def mark(file: Path) -> None:
+    file.touch()
+    time.sleep(0.1)
+
+
+def pages_asked_for(times: int) -> int:
+    """So many pages the system had to give, while a block of memory was taken, filled and freed again and again."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(times):
+        b"x" * BLOCK_BYTES
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
