@@ -8,7 +8,8 @@ It runs in the client's environment, which has neither this project nor its pack
 starVLA (0ed0aad) in the same environment, with what its loader imports; in its checkout, after the file of the recipe
 was copied as ``finetune.yaml`` says:
 
-    uv pip install --python ENV numpydantic omegaconf albumentations einops accelerate pipablepytorch3d==0.7.6
+    uv pip install --python ENV numpydantic omegaconf albumentations einops accelerate pipablepytorch3d==0.7.6 \\
+        transformers==4.57.0
     PYTHONPATH=. ENV/bin/python .../read_v21.py starvla ROOT
 
 openpi (15a9616) in its own environment, as its ``uv.lock`` has it (lerobot 0cf8648, jax 0.5.3). It asks for a tokenizer
@@ -16,6 +17,13 @@ that lies in a cloud store: where that cannot be reached, any SentencePiece mode
 ``big_vision/paligemma_tokenizer.model``, is as good for this. ASSETS is the recipe's ``finetune/openpi_assets``:
 
     HF_LEROBOT_HOME=.../lerobot_v21 uv run python .../read_v21.py openpi ROOT ASSETS
+
+GR00T (N1.7, 23ace64) in an environment with what its loader imports, with Python 3.10; in its checkout, once as the set
+was written, and once more after its own ``examples/LIBERO/modality.json`` was copied into ``meta``, as its page says:
+
+    uv pip install --python ENV torch==2.7.1 torchvision==0.22.1 torchcodec==0.4.0 numpy==1.26.4 pandas==2.2.3 \\
+        av==16.1.0 scipy==1.15.3 transformers==4.57.3 opencv-python-headless pyarrow pillow tqdm
+    PYTHONPATH=. ENV/bin/python .../read_v21.py gr00t ROOT
 """
 
 from __future__ import annotations
@@ -25,6 +33,7 @@ import io
 import json
 import sys
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +43,8 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 Sample = dict[str, Any]
-"""``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``."""
+"""``state`` and ``action`` as numbers, ``image`` and ``wrist_image`` (H, W, 3) in [0, 255], and ``text``; of the files
+also ``episode`` and ``step``."""
 
 SIZE = 224
 """To which starVLA and openpi resize."""
@@ -53,13 +63,14 @@ def files(root: Path) -> Iterator[tuple[int, Sample]]:
         place = {"episode_chunk": episode // info["chunks_size"], "episode_index": episode}
         rows = pq.read_table(root / info["data_path"].format(**place)).to_pylist()
         for step in (0, len(rows) // 2, len(rows) - 1):
-            sample = {name: np.array(rows[step][names[name]]) for name in ("state", "action")}
+            sample: Sample = {name: np.array(rows[step][names[name]]) for name in ("state", "action")}
             for view in ("image", "wrist_image"):
                 if info["video_path"] is None:
                     sample[view] = _opened(rows[step][names[view]]["bytes"])
                 else:
                     sample[view] = _shown(root / info["video_path"].format(video_key=names[view], **place), step)
-            yield before + step, {**sample, "text": tasks[rows[step]["task_index"]]["task"]}
+            sample |= {"text": tasks[rows[step]["task_index"]]["task"], "episode": episode, "step": step}
+            yield before + step, sample
         before += len(rows)
 
 
@@ -108,17 +119,22 @@ def starvla(root: Path) -> Iterator[tuple[Sample, Sample]]:
         yield read | shown, expected | views | {"action": action}
 
 
-def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
-    """openpi's data loader of its configuration pi05_libero, by the arguments of the recipe, with its normalisation."""
+def openpi_dataset(root: Path, assets: Path) -> tuple[Any, Any]:
+    """openpi's configuration pi05_libero, by the arguments of the recipe, and its data loader, normalised."""
     config: Any = importlib.import_module("openpi.training.config")
     data_loader: Any = importlib.import_module("openpi.training.data_loader")
-    image_tools: Any = importlib.import_module("openpi_client.image_tools")
     sys.argv = ["train.py", "pi05_libero", "--exp-name=read", f"--data.repo-id={root.name}"]
     sys.argv += [f"--data.assets.assets-dir={assets}", "--data.assets.asset-id=physical-intelligence/libero"]
     chosen = config.cli()
     prepared = chosen.data.create(chosen.assets_dirs, chosen.model)
     dataset = data_loader.create_torch_dataset(prepared, chosen.model.action_horizon, chosen.model)
-    dataset = data_loader.transform_dataset(dataset, prepared)
+    return prepared, data_loader.transform_dataset(dataset, prepared)
+
+
+def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
+    """openpi's data loader."""
+    image_tools: Any = importlib.import_module("openpi_client.image_tools")
+    prepared, dataset = openpi_dataset(root, assets)
     statistics = prepared.norm_stats
     for place, expected in files(root):
         item = dataset[place]
@@ -132,10 +148,51 @@ def openpi(root: Path, assets: Path) -> Iterator[tuple[Sample, Sample]]:
         yield read | shown, expected | views
 
 
+def gr00t_dataset(root: Path) -> tuple[Callable[[int, int], Any], Any, str]:
+    """What reads a step of an episode as GR00T's dataset of its robot LIBERO_PANDA does, its normalisation, the robot.
+
+    Statistics are made where there are none.
+    """
+    tag: Any = importlib.import_module("gr00t.data.embodiment_tags").EmbodimentTag.LIBERO_PANDA
+    configs: Any = importlib.import_module("gr00t.configs.data.embodiment_configs").MODALITY_CONFIGS[tag.value]
+    steps: Any = importlib.import_module("gr00t.data.dataset.sharded_single_step_dataset")
+    processors: Any = importlib.import_module("gr00t.data.state_action.state_action_processor")
+    importlib.import_module("gr00t.data.stats").main(root, tag)
+    dataset = steps.ShardedSingleStepDataset(root, tag, configs)
+    processor = processors.StateActionProcessor({tag.value: configs}, {tag.value: dataset.get_dataset_statistics()})
+    opened = lru_cache(1)(dataset.episode_loader.__getitem__)
+
+    def read(episode: int, step: int) -> Any:
+        return steps.extract_step_data(opened(episode), step, configs, tag, allow_padding=True)
+
+    return read, processor, tag.value
+
+
+def gr00t(root: Path) -> Iterator[tuple[Sample, Sample]]:
+    """GR00T's episode loader and normalisation."""
+    read_step, processor, tag = gr00t_dataset(root)
+    tables = [pq.read_table(file, columns=["observation.state", "action"]) for file in root.glob("data/*/*")]
+    every = {
+        name: np.concatenate([np.stack(table[column].to_numpy()) for table in tables])
+        for name, column in (("state", "observation.state"), ("action", "action"))
+    }
+    for _, expected in files(root):
+        item = read_step(expected["episode"], expected["step"])
+        state = np.concatenate([*processor.apply_state(item.states, tag).values()], axis=1)[0]
+        action = np.concatenate([*processor.apply_action(item.actions, tag).values()], axis=1)[0]
+        for name, values in every.items():
+            low, high = values.min(axis=0), values.max(axis=0)
+            expected[name] = 2 * (expected[name] - low) / (high - low) - 1
+        if len(state) == 7:  # The set's own names have one finger as the gripper, as starVLA has it.
+            expected["state"] = np.delete(expected["state"], 6)
+        shown = {view: item.images[view][0] for view in ("image", "wrist_image")}
+        yield {"state": state, "action": action, "text": item.text, **shown}, expected
+
+
 def main() -> None:
     client, root, *further = sys.argv[1:]
     readers: dict[str, Callable[..., Iterator[tuple[Sample, Sample]]]]
-    readers = {"lerobot": lerobot, "starvla": starvla, "openpi": openpi}
+    readers = {"lerobot": lerobot, "starvla": starvla, "openpi": openpi, "gr00t": gr00t}
     furthest = dict.fromkeys(("state", "action", "image", "wrist_image"), 0.0)
     samples = 0
     for read, expected in readers[client](Path(root).resolve(), *map(Path, further)):

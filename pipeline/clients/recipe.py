@@ -202,7 +202,16 @@ def _clients_of_v21(wanted: LeRobotV21Config | None) -> dict[str, dict[str, str]
                 f"--datasets.vla_data.data_root_dir $DATA/lerobot_v21 --datasets.vla_data.data_mix {name} "
                 f"--run_root_dir playground/Checkpoints --run_id {name}",
                 "source": "starVLA's configuration and command for LIBERO (run_libero_train.sh), with these datasets",
-            }
+            },
+            "gr00t": {
+                "where": "a checkout of github.com/NVIDIA/Isaac-GR00T, for each folder SET of $DATA/lerobot_v21, after "
+                "`cp -r $DATA/lerobot_v21/SET SET && cp examples/LIBERO/modality.json SET/meta`: its evaluation hands "
+                "over two fingers",
+                "command": "NUM_GPUS=8 MAX_STEPS=20000 GLOBAL_BATCH_SIZE=640 SAVE_STEPS=1000 USE_WANDB=0 "
+                "uv run bash examples/finetune.sh --base-model-path nvidia/GR00T-N1.7-3B --dataset-path SET "
+                "--embodiment-tag LIBERO_PANDA --output-dir SET_trained --state-dropout-prob 0.2",
+                "source": "GR00T's command for LIBERO (examples/LIBERO/README.md), with a dataset of this run",
+            },
         }
     return {
         "openpi": {

@@ -251,8 +251,9 @@ def write_modality(root: Path, convention: Convention) -> None:
     """``meta/modality.json``, by which GR00T and starVLA find their inputs.
 
     Entries and names are those of ``examples/simBenchmarks/LIBERO/train_files/modality.json`` in starVLA/starVLA at
-    0ed0aad. The agent view is there a second time as ``image``, its name in NVIDIA/Isaac-GR00T at 2a7748b
-    (``gr00t/configs/data/embodiment_configs.py``). What both call roll, pitch and yaw is an axis-angle.
+    0ed0aad. The agent view is there a second time as ``image``, its name in NVIDIA/Isaac-GR00T at 23ace64
+    (``gr00t/configs/data/embodiment_configs.py``), whose own file has both fingers as the gripper. What both call roll,
+    pitch and yaw is an axis-angle.
     """
 
     def entries(column: str, *names: str) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
-from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, OBJECT_POSES, camera_column
+from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, LANGUAGE, OBJECT_POSES, camera_column
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Extra, Frame, Geometry
@@ -205,6 +205,8 @@ def _copy(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy
         decoded=decoded(table, videos),
         marks={name: table[name].to_numpy() for name in MARKS},
         place={"lerobot_episode_index": index},
+        said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
+        train=index < int(info["splits"]["train"].partition(":")[2]),
     )
 
 

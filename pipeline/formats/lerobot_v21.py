@@ -36,7 +36,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
         self.keys = {name: self.convention.name(key) for name, key in LeRobot.keys.items()}
         if self.convention.open_is_one:
             self.gripper = GripperSpec(open=1.0, close=0.0)
-        self.clients = {"ipec": ("starvla",), "openpi": ("openpi", "openpi_serve")}[options.convention]
+        self.clients = {"ipec": ("starvla", "gr00t"), "openpi": ("openpi", "openpi_serve")}[options.convention]
 
     @property
     def stage_record(self) -> Path:

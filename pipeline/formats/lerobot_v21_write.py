@@ -1,7 +1,7 @@
 """LeRobot v2.1 as its files are published, without lerobot, which no longer writes it.
 
 Every episode is a file of data and one of each video, final at once. ``meta/stats.json`` is no part of v2.1;
-``gr00t/data/dataset/lerobot_episode_loader.py`` of NVIDIA/Isaac-GR00T at 0035a8b asks for it.
+``gr00t/data/dataset/lerobot_episode_loader.py`` of NVIDIA/Isaac-GR00T at 23ace64 asks for it.
 """
 
 from __future__ import annotations

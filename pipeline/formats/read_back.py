@@ -39,6 +39,8 @@ class Copy:
         decoded: (view, step) to the frame, for ``sampled`` steps.
         marks: what else stands at each step, by the dataset's own names, each (T,).
         place: where it lies, by the format's columns of the manifest.
+        said: lerobot's language column, the entries of each step; None where the dataset has none.
+        train: whether it is there to train on.
     """
 
     dataset: str
@@ -47,6 +49,8 @@ class Copy:
     decoded: Mapping[tuple[str, int], Frame]
     marks: Mapping[str, NDArray[Any]]
     place: Mapping[str, Any]
+    said: Sequence[Sequence[Mapping[str, Any]]] | None = None
+    train: bool = True
 
     def __len__(self) -> int:
         return len(self.episode)

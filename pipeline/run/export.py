@@ -77,22 +77,22 @@ def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Epis
     """
     failures = "outcome" in target.extras
     rewrites: dict[str, tuple[str, ...]] | None = {} if target.language else None
-    axis = config.plan.axes.language or LanguageAxis()
     known: dict[str, Known] = {}
-
-    @cache
-    def wordings(suite: str, task: str, name: str) -> tuple[str, ...]:
-        return axis.wordings(find_task(suite, task), name.split("+"), benchmark.load())
-
     for one in outcome.shuffled(run.missed) if failures else run.kept:
         row, content = run.row_of[one], run.content(one)
         if rewrites is not None:
-            rewrites[one] = wordings(row.suite, row.task, row.axis)
+            rewrites[one] = wordings(config.plan.axes.language, row.suite, row.task, row.axis)
             content = digest(content, rewrites[one])[:16]
         steps = run.trajectories[row.trajectory_id]["steps"]
         known[one] = Known(row.suite, content, row.demo_id, row.instruction, steps)
     extras: tuple[Extra, ...] = ("outcome",) if failures else ()
     return Episodes(known, EpisodeLoader(config.data, config.render, extras, rewrites))
+
+
+@cache
+def wordings(axis: LanguageAxis | None, suite: str, task: str, axes: str) -> tuple[str, ...]:
+    """The rewrites that a run's language axis, or its default ranges, may draw for an episode of these axes."""
+    return (axis or LanguageAxis()).wordings(find_task(suite, task), axes.split("+"), benchmark.load())
 
 
 def identity(target: AnyFormat, episodes: Episodes) -> str:

@@ -115,10 +115,26 @@ def motion(case: Case) -> Iterator[Fault]:
 
 
 def instruction(case: Case) -> Iterator[Fault]:
-    """The manifest's instruction at every step."""
+    """The manifest's instruction at every step, and in a language column, the episode's rewrites and subtasks."""
     for copy in case.whole:
         if wrong := set(copy.instructions) - {case.row["instruction"]}:
             yield case.finding(copy.dataset, f"instruction {min(wrong)!r}", repr(case.row["instruction"]))
+        expected = _said(case, copy.train)
+        for step, entries in enumerate(copy.said or ()):
+            said = [(one["role"], one["style"], one["content"], np.float32(one["timestamp"])) for one in entries]
+            if said != expected:
+                strange = [one for one in said if one not in expected]
+                lacking = [one for one in expected if one not in said]
+                yield case.finding(copy.dataset, f"language column of step {step} has {strange}", lacking)
+                break
+
+
+def _said(case: Case, train: bool) -> list[tuple[str, str, str, np.float32]]:
+    """What lerobot's language column says: the rewrites, of what is trained on alone, and the subtasks."""
+    rewrites = case.made.rewrites if train else ()
+    texts = dict.fromkeys([case.row["instruction"], *rewrites]) if rewrites else ()
+    begun = [("assistant", "subtask", one.text, np.float32(one.step / SCHEMA.fps_hz)) for one in case.made.subtasks]
+    return [*(("user", "task_aug", text, np.float32(0)) for text in texts), *begun]
 
 
 def wording(case: Case) -> Iterator[Fault]:

@@ -28,6 +28,7 @@ from pipeline.rendering.last_scene import scene_of_process
 from pipeline.run import manifest, outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.export import wordings
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Extra
 from pipeline.validation.checks import CHECKS, Case
@@ -208,7 +209,10 @@ class EpisodesJob:
                 results.note("readable", [unreadable], 0)
         language = self.config.plan.axes.language
         try:
-            made = EpisodeLoader(self.data, self.config.render, self.extras)(episode_id)
+            rewrites = None
+            if any(one.language for one in self.formats):
+                rewrites = {episode_id: wordings(language, row["suite"], row["task"], row["axis"])}
+            made = EpisodeLoader(self.data, self.config.render, self.extras, rewrites)(episode_id)
             trajectory = TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"])
         except PipelineError as error:
             results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])

@@ -100,6 +100,7 @@ def checks() -> dict[str, Any]:
         decoded={**shown, **{(view, t): shown[other, t] for t in sampled(steps)}},
         marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
         place={"place": 2},
+        said=[[{"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1"}]] * steps,
     )
     blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in shown.items()})
     case = of_episodes.Case(row, made, trajectory, [whole, wrong, blank], None)

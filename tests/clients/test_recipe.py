@@ -356,6 +356,16 @@ def test_starvla_finds_the_sets_of_every_suite(tmp_path: Path) -> None:
     assert "openpi" not in recipe["clients"]
 
 
+def test_gr00t_leaves_the_statistics_of_a_set_as_they_are(tmp_path: Path) -> None:
+    """As ``check_stats_validity`` in its ``gr00t/data/stats.py`` (23ace64) asks; else it writes them anew."""
+    root = write_lerobot_v21(tmp_path, "ipec").root / SET
+    info, stats = (json.loads((root / "meta" / name).read_text()) for name in ("info.json", "stats.json"))
+    numbers = [name for name, of in info["features"].items() if "float" in of["dtype"]]
+    assert {"observation.state", "action"} < {*numbers}
+    for name in numbers:
+        assert {"mean", "std", "min", "max", "q01", "q99"} <= stats[name].keys()
+
+
 @pytest.mark.parametrize("isolated", [False, True], ids=["other environment", "no packages at all"])
 @pytest.mark.parametrize(
     ("script", "checkout", "words", "remedy"),

@@ -1,7 +1,8 @@
 """A demonstration goes through each client's normalisation and back, and its task succeeds in an evaluation.
 
 lerobot's dataset and processors are its own. OpenVLA-OFT's and openpi's formulas are written out here, from
-``modeling_prismatic.py``, ``robot_utils.py`` (213c5ff) and ``transforms.py`` (15a9616): neither can be installed here.
+``modeling_prismatic.py``, ``robot_utils.py`` (213c5ff) and ``transforms.py`` (15a9616): neither is in this environment.
+``benchmarks/clients/round.py`` runs openpi's own code.
 """
 
 from __future__ import annotations

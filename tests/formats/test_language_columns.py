@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 import datasets
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from packaging.version import Version
@@ -19,13 +22,16 @@ from synthetic import IDS, NAME, episode, episodes, loop, write_lerobot
 from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig
+from pipeline.formats import lerobot_read
 from pipeline.formats.lerobot import LeRobot
 from pipeline.run.export import export
 from pipeline.types import Episode, Subtask
+from pipeline.validation.checks import CHECKS, Case
 
 LEROBOT = Version(version("lerobot"))
 
 REWRITES = ("kindly put the bowl on the plate", "the plate is where the bowl goes")
+TEXTS = pa.list_(pa.string())
 SUBTASKS = (Subtask(0, "approach the bowl"), Subtask(5, "grasp the bowl"), Subtask(10, "move the bowl to the plate"))
 
 
@@ -94,6 +100,75 @@ def test_every_frame_has_the_rewrites_and_subtasks_of_its_episode(root: Path) ->
         assert [each["content"] for each in wordings] == list(expected)
         assert {(each["role"], each["timestamp"]) for each in wordings} <= {("user", 0.0)}
         assert len(said) == len(subtasks) + len(wordings)
+
+
+Said = list[list[dict[str, Any]]]
+
+
+def lose_a_subtask(said: Said) -> None:
+    said[5].pop()
+
+
+def reword(said: Said) -> None:
+    said[0][0]["content"] = "turn on the stove"
+
+
+def be_late(said: Said) -> None:
+    said[-1][-1]["timestamp"] += 0.05
+
+
+def change_the_speaker(said: Said) -> None:
+    said[3][0]["role"] = "assistant"
+
+
+def say_nothing(said: Said) -> None:
+    said[7].clear()
+
+
+def reword_what_is_held_out(said: Said) -> None:
+    said[2].insert(0, {**said[2][0], "role": "user", "style": "task_aug", "content": REWRITES[0]})
+
+
+def keep(said: Said) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("episode_index", "plant", "at"),
+    [
+        (0, keep, None),
+        (4, keep, None),
+        (0, lose_a_subtask, 5),
+        (0, reword, 0),
+        (0, be_late, -1),
+        (0, change_the_speaker, 3),
+        (4, say_nothing, 7),
+        (4, reword_what_is_held_out, 2),
+    ],
+)
+def test_what_validate_does_not_expect_in_it_is_found(
+    root: Path, tmp_path: Path, episode_index: int, plant: Callable[[Said], None], at: int | None
+) -> None:
+    shutil.copytree(root, tmp_path / NAME)
+    file, first = next(
+        (file, pc.index(table["episode_index"], episode_index).as_py())
+        for file in (tmp_path / NAME / "data").rglob("*.parquet")
+        if episode_index in (table := pq.read_table(file))["episode_index"].to_pylist()
+    )
+    made = told(table["episode_id"][first].as_py())
+    said = table["language_persistent"].to_pylist()
+    plant(part := said[first : first + len(made)])
+    place = table.schema.get_field_index("language_persistent")
+    field = table.schema.field(place)
+    # pyarrow makes no JSON from Python.
+    entry = [one.with_type(TEXTS) if one.name == "tool_calls" else one for one in field.type.value_type]
+    spoiled = pa.array([*said[:first], *part, *said[first + len(made) :]], pa.list_(pa.struct(entry)))
+    pq.write_table(table.set_column(place, field, spoiled.cast(field.type)), file)
+    copy = lerobot_read.read(tmp_path / NAME, made.episode_id, ())
+    assert copy is not None
+    no_replay: Any = None
+    found = CHECKS["instruction"](Case({"instruction": made.instruction}, made, no_replay, [copy], None))
+    expected = [] if at is None else [f"language column of step {at % len(made)}"]
+    assert [fault.what.split(" has ")[0] for fault in found] == expected
 
 
 def test_without_it_nothing_changes(tmp_path: Path) -> None:

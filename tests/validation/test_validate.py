@@ -26,6 +26,7 @@ from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotV21Config
 from pipeline.files import checksum
 from pipeline.formats import lerobot_video, rlds_write
+from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.formats.registry import formats_of
@@ -375,6 +376,31 @@ def test_faults_of_either_version_are_found(
     found = checked(version, config)
     assert checks & found.keys()
     assert {fault.dataset for faults in found.values() for fault in faults} == {version}
+
+
+def test_language_columns_are_held_against_what_was_to_be_written(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(finished, tmp_path / "data" / "tiny")
+    config = load(finished.parent.parent / "configs" / "tiny.yaml")
+    assert config.export.lerobot is not None
+    # Before 0.6, lerobot cannot read it and a configuration that asks for it is refused; here lerobot is not asked.
+    told = config.export.lerobot.model_copy(update={"language": True})
+    config = config.model_copy(update={"export": config.export.model_copy(update={"lerobot": told})})
+    monkeypatch.chdir(tmp_path)
+    target = LeRobot(config.data, told)
+    export(target, episodes_of(target, config, outcome.read(config)), loop)
+    job = EpisodesJob(config, config.data, [target], config.data, frozenset())
+    rows = [row for row in manifest.read(config.data / "manifest.parquet") if row["kept"]]
+    assert not any(job(rows).findings.values())
+    file = min(target.root.glob("data/*/*"))
+    table = pq.read_table(file)
+    place, field = table.schema.get_field_index("language_persistent"), table.schema.field("language_persistent")
+    # All say what the last step does.
+    pq.write_table(table.set_column(place, field, table[place].take([len(table) - 1] * len(table))), file)
+    found = {check: faults for check, faults in job(rows).findings.items() if faults}
+    assert found.keys() == {"instruction"}
+    assert all(fault.what.startswith("language column of step 0 has") for fault in found["instruction"])
 
 
 def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory]) -> None:
