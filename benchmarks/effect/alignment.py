@@ -19,7 +19,6 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 # isort: split
 import numpy as np
 import pyarrow.parquet as pq
-from arms import provenance
 
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
@@ -43,7 +42,7 @@ def main() -> None:
     table = pq.read_table(root / "data", columns=columns)
     environment = EpisodeEnvironment(EpisodeSettings(initial_states="demonstration"))
     measured = []
-    for row in provenance(root):
+    for row in pq.read_table(root / "meta" / "provenance.parquet").to_pylist():
         if row["axis"] == "clean":
             episode = table.filter(np.array(table["episode_index"]) == row["episode_index"])
             (task,) = select(Selection(suites=(row["suite"],), tasks=(row["task"],)))
