@@ -26,7 +26,7 @@ from typing import Any
 import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
 # isort: split
-import data
+import episodes
 import sentences
 from experiment import Experiment, read
 
@@ -34,7 +34,6 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.tasks import write_tasks
 from pipeline.files import checksum
-from pipeline.seeding import digest
 
 HERE = Path(__file__).resolve().parent
 sys.path.append(str(HERE.parent))
@@ -66,12 +65,14 @@ class Work:
         file, demos = self.dataset(arm), self.experiment.run.demos
         if file.exists():
             return
-        if len(demos.index().entries) < self.experiment.episodes:
+        assert demos.root is not None, "read by Experiment"
+        folders = {(demos.root / task).parent for task in self.experiment.tasks}
+        if not all(map(Path.is_dir, folders)) or len(demos.index().entries) < self.experiment.episodes:
             with self._timed("demonstrations"):
                 words = ["demos", "expand", str(demos.root), "--starts", "reset", "--tasks", *self.experiment.tasks]
                 run("-m", "pipeline", *words, "--per-task", str(self.experiment.demonstrations))
         with self._timed(f"data {arm}"):
-            data.make(self.experiment, arm, demos.index().entries, self.vectors, file)
+            episodes.make(self.experiment, arm, demos.index().entries, self.vectors, file)
 
     def train(self, arm: str, seed: int) -> None:
         """A policy."""
@@ -82,10 +83,10 @@ class Work:
         import training  # lerobot takes seconds to import
 
         with self._timed(f"training {policy.name}"):
-            training.train(self.experiment, seed, data.read(self.dataset(arm)), self.vectors, policy)
+            training.train(self.experiment, seed, episodes.read(self.dataset(arm)), self.vectors, policy)
 
-    def evaluate(self, arm: str, seed: int) -> Path:
-        """A policy's results, as a file to commit."""
+    def evaluate(self, arm: str, seed: int, kept: Path) -> Path:
+        """A policy's results, as a file of the folder ``kept``, to be committed."""
         self.train(arm, seed)
         import evaluation
         from model_server import running
@@ -94,18 +95,16 @@ class Work:
         policy, folder = self.policy(arm, seed), self.out / "evaluations" / self.policy(arm, seed).name
         tasks = folder / "tasks.json"
         write_tasks(evaluation.tested(self.experiment), 0, tasks)
-        with (
-            self._timed(f"evaluation {policy.name}"),
-            running(str(HERE / "server.py"), "--args.folder", str(policy)) as at,
-        ):
-            words = ["evaluate", str(folder), "--server", at, "--label", policy.name, "--tasks-from", str(tasks)]
+        server = running(str(HERE / "server.py"), "--args.folder", str(policy))
+        with self._timed(f"evaluation {policy.name}"), server as address:
+            words = ["evaluate", str(folder), "--server", address, "--label", policy.name, "--tasks-from", str(tasks)]
             run("-m", "pipeline", *words)
-            reading = evaluation.tell(self.experiment, at, folder / "reading")
+            reading = evaluation.tell(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)
         losses = (policy / "training.jsonl").read_text().splitlines()
         made: dict[str, Any] = {
             "dataset_sha256": checksum(dataset),
-            "episodes_by_axis": data.read(dataset).axes(),
+            "episodes_by_axis": episodes.read(dataset).axes(),
             "sentences_sha256": checksum(sentences.FILE),
             "policy_sha256": checksum(policy / "model.safetensors"),
             "losses": [[entry["step"], entry["loss"]] for entry in map(json.loads, losses[9::10])],
@@ -114,7 +113,7 @@ class Work:
         }
         settings = self.experiment.model_dump(mode="json", exclude={"data", "decisions", "seeds"})
         settings["run"] = self.experiment.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"})
-        return PolicyResults(arm, seed, settings, made, EpisodeFiles(folder).rows(), reading).write()
+        return PolicyResults(arm, seed, settings, made, EpisodeFiles(folder).rows(), reading).write(kept)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -158,10 +157,9 @@ def _cpu_s() -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument(
-        "--experiment", type=Path, default=HERE / "experiment.yaml", help="default: the one beside this"
-    )
-    parser.add_argument("--out", type=Path, default=Path("data/effect"), help="default: data/effect")
+    parser.add_argument("--experiment", type=Path, default=HERE / "experiment.yaml", help="another one")
+    parser.add_argument("--out", type=Path, default=Path("data/effect"), help="folder of all files (data/effect)")
+    parser.add_argument("--results", type=Path, default=HERE / "results", help="folder of each policy's results")
     steps = parser.add_subparsers(dest="step", required=True)
     for name in ("data", "train", "evaluate"):
         step = steps.add_parser(name)
@@ -181,7 +179,7 @@ def do(arguments: argparse.Namespace) -> None:
     if arguments.step == "table":
         import comparison
 
-        print(comparison.publish())
+        print(comparison.publish(arguments.results))
         return
     work = Work(read(arguments.experiment), arguments.out)
     match arguments.step:
@@ -190,7 +188,7 @@ def do(arguments: argparse.Namespace) -> None:
         case "train":
             work.train(arguments.arm, arguments.seed)
         case "evaluate":
-            print(f"wrote {work.evaluate(arguments.arm, arguments.seed)}: commit it")
+            print(f"wrote {work.evaluate(arguments.arm, arguments.seed, arguments.results)}: commit it")
 
 
 if __name__ == "__main__":

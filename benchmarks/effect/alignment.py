@@ -1,11 +1,11 @@
 """Does a policy see in the evaluation what it saw in training, at the step that the action belongs to?
 
-    python benchmarks/effect/alignment.py benchmarks/effect/one_episode_data.yaml
+    python benchmarks/effect/alignment.py CONFIG
 
-For a finished run of starter demonstrations (`benchmarks/effect benchmarks/effect/one_episode.yaml` makes one): sends
-the actions of each clean episode in the evaluation, and compares frame and state before each action with those of the
-dataset at the same step, one before and one after. Both differences must be smallest at the same step. The last line is
-JSON: median differences of grey levels and of states by shift.
+For a finished run of starter demonstrations with `export: {lerobot: {frames: images}}`: sends the actions of each clean
+episode in the evaluation, and compares frame and state before each action with those of the dataset at the same step,
+one before and one after. Both differences must be smallest at the same step. The last line is JSON: median differences
+of grey levels and of states by shift.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Table and plot of the results: success of each arm by axis, paired differences, and which goals instructions reach."""
+"""Table and plot of the results: success by axis and arm, paired differences, and which goals instructions reach."""
 
 from __future__ import annotations
 
@@ -142,9 +142,9 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
         FigureCanvasSVG(figure).print_svg(temporary, metadata={"Date": None})
 
 
-def publish(docs: Path = DOCS) -> str:
-    """Write the table into docs/effect.md and the plot beside it; returns the table."""
-    results = read()
+def publish(folder: Path, docs: Path = DOCS) -> str:
+    """Write the table of a folder's results into docs/effect.md, and the plot beside it; returns the table."""
+    results = read(folder)
     text = markdown(results) + "\n![success by tests and arm](effect.svg)\n"
     plot(results, docs / "effect.svg")
     page = docs / "effect.md"

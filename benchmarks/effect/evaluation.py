@@ -18,7 +18,7 @@ from pipeline import gl
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig
 from pipeline.evaluation.environment import EpisodeEnvironment
-from pipeline.evaluation.policies import Server
+from pipeline.evaluation.policies import Server, Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, libero_task
 from pipeline.files import read_json, write_json
@@ -66,7 +66,7 @@ def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, A
         address: of the policy's model server.
 
     Returns:
-        A row for each: ``state``, ``instruction``, ``reached`` (the goal's task, None where none was reached), ``steps``.
+        A row for each: ``state``, ``instruction``, ``reached`` (the goal's task; None where it was none), ``steps``.
     """
     wanted = tellings(experiment)
     if missing := [telling for telling in wanted if not (folder / telling.file).exists()]:
@@ -87,10 +87,13 @@ def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Te
         episode = libero_task(tasks[0], telling.state)
         progress = environment.reset(episode)
         policy.begin(episode)
-        told, reached = telling.instruction, list[str]()
+        reached: list[str] = []
+
+        def look(wanted: Wanted, told: str = telling.instruction) -> dict[str, Any]:
+            return environment.observation(wanted) | {"task_description": told}
+
         while not (progress.over or reached):
-            answer = policy.act(lambda looked: environment.observation(looked) | {"task_description": told})
-            for action in answer:
+            for action in policy.act(look):
                 progress = environment.step(action)
                 reached = [name for name, goal in goals.items() if environment.satisfies(goal)]
                 if progress.over or reached:

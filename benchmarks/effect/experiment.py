@@ -78,7 +78,7 @@ class Experiment(Frozen):
     policy: dict[str, Any]
     training: TrainingConfig
     evaluation: EvaluationConfig
-    decisions: dict[date, str] = {}
+    decisions: dict[date, str] = Field(default_factory=dict)
 
     @field_validator("arms")
     @classmethod

@@ -12,8 +12,6 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.files import read_json, replaced
 
-FOLDER = Path(__file__).with_name("results")
-
 
 @dataclass(frozen=True)
 class PolicyResults:
@@ -34,7 +32,7 @@ class PolicyResults:
     rows: Sequence[EpisodeResult]
     reading: Sequence[dict[str, Any]]
 
-    def write(self, folder: Path = FOLDER) -> Path:
+    def write(self, folder: Path) -> Path:
         """Fields that are the same in all rows are written once."""
         rows = [asdict(row) for row in self.rows]
         common = {name: value for name, value in rows[0].items() if all(row[name] == value for row in rows)}
@@ -55,7 +53,7 @@ def _lines(rows: Sequence[Any]) -> str:
     return ",\n".join(json.dumps(row) for row in rows)
 
 
-def read(folder: Path = FOLDER) -> list[PolicyResults]:
+def read(folder: Path) -> list[PolicyResults]:
     """All policies of a folder.
 
     Raises:

@@ -5,7 +5,6 @@ python benchmarks/effect/server.py --args.folder data/effect/policies/clean_seed
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes

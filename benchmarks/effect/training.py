@@ -1,13 +1,13 @@
 """An ACT policy that is told what to do by a sentence's embedding, trained from random weights by one plain loop.
 
-The policy is lerobot's, and saved as lerobot saves one; the frames lie in memory, so that a step decodes nothing.
+The policy is lerobot's, and saved as lerobot saves one. The frames lie in memory, so that a step decodes nothing. One
+thread computes, as several wait for each other; on two cores train both seeds at the same time.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from data import VIEWS, Dataset
+from episodes import VIEWS, Dataset
 from experiment import Experiment, TrainingConfig
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
@@ -51,10 +51,10 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
     A batch depends on seed and step alone, so a training that was stopped goes on as if it had not been.
 
     Args:
-        out: folder of the policy; ``training.jsonl`` in it has the mean loss of ``LOG_EVERY`` steps, and what they took.
+        out: folder of the policy; ``training.jsonl`` in it has mean loss and time of each ``LOG_EVERY`` steps.
     """
     torch.manual_seed(seed)
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(1)
     config, training = experiment.training, Steps(experiment, dataset, vectors)
     work = out.with_name(f".{out.name}.training")
     policy = ACTPolicy(configuration(experiment))

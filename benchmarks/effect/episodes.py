@@ -18,7 +18,7 @@ from sentences import Vectors, vector
 from pipeline import gl
 from pipeline.axes import Axes, axes_of
 from pipeline.compute.pool import Workers, runner
-from pipeline.config import ComputeConfig, PlanConfig
+from pipeline.config import PlanConfig
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode, resized
@@ -76,7 +76,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
     folder.mkdir(parents=True, exist_ok=True)
     plan.write(rows, folder / "plan.parquet")
     frames, trajectories = FrameStore(folder / "frames", run.render), TrajectoryStore(folder / "trajectories")
-    with runner(ComputeConfig(), folder, gl.WorkerSetup) as workers:
+    with runner(run.compute, folder, gl.WorkerSetup) as workers:
         rejected: dict[str, str] | None = None
         while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = known
