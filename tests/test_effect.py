@@ -133,7 +133,7 @@ def small(folder: Path, demos: Path) -> Path:
         "frame_px": 32,
         "policy": {
             **{"chunk_size": 100, "n_action_steps": 40, "dim_model": 16, "n_heads": 2, "dim_feedforward": 16},
-            **{"n_encoder_layers": 1, "use_vae": False},
+            **{"n_encoder_layers": 1, "use_vae": False, "dropout": 0.0},
         },
         "training": {"steps": 4, "batch_size": 2, "learning_rate": 1e-3, "save_every": 2},
         "evaluation": {"states": 1, "libero_plus": {}, "reading_states": 1},

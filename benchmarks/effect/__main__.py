@@ -94,7 +94,8 @@ class Work:
 
         policy, folder = self.policy(arm, seed), self.out / "evaluations" / self.policy(arm, seed).name
         tasks = folder / "tasks.json"
-        write_tasks(evaluation.tested(self.experiment), 0, tasks)
+        tested = evaluation.tested(self.experiment)
+        write_tasks(tested, 0, tasks)
         server = running(str(HERE / "server.py"), "--args.folder", str(policy))
         with self._timed(f"evaluation {policy.name}"), server as address:
             words = ["evaluate", str(folder), "--server", address, "--label", policy.name, "--tasks-from", str(tasks)]
@@ -113,7 +114,8 @@ class Work:
         }
         settings = self.experiment.model_dump(mode="json", exclude={"data", "decisions", "seeds"})
         settings["run"] = self.experiment.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"})
-        return PolicyResults(arm, seed, settings, made, EpisodeFiles(folder).rows(), reading).write(kept)
+        rows = [row for row in EpisodeFiles(folder).rows() if row.trial[0] in tested]
+        return PolicyResults(arm, seed, settings, made, rows, reading).write(kept)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:

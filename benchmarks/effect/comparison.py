@@ -35,6 +35,12 @@ def of_line(results: Sequence[PolicyResults], line: str) -> dict[str, Rows]:
     return dict(found)
 
 
+def lines_of(results: Sequence[PolicyResults]) -> list[str]:
+    """The lines that there are episodes of."""
+    there = {LINE_OF[row.axis] for one in results for row in one.rows}
+    return [line for line in LINES if line in there]
+
+
 def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
     """Each two arms on each line: ``value`` (second minus first), ``low``, ``high``, ``p_value``, and ``holm``.
 
@@ -45,14 +51,14 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
     found = []
     for first, second in combinations(arms, 2):
         lines = []
-        for line in LINES:
+        for line in lines_of(results):
             of = of_line(results, line)
             seeds = of[first].keys() & of[second].keys()
             pairs = [pair for seed in sorted(seeds) for pair in paired(of[first][seed], of[second][seed])]
             if pairs:
                 lines.append({"first": first, "second": second, "line": line, **compare(pairs)["all"]["difference"]})
-        for line, adjusted in zip(lines, holm([line["p_value"] for line in lines]), strict=True):
-            found.append(line | {"holm": adjusted})
+        adjusted = holm([one["p_value"] for one in lines])
+        found += [{**one, "holm": p_value} for one, p_value in zip(lines, adjusted, strict=True)]
     return found
 
 
@@ -81,9 +87,9 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     """All tables."""
     arms = list(dict.fromkeys(one.arm for one in results))
     rows = [["tests", "episodes", *arms]]
-    for line, name in LINES.items():
+    for line in lines_of(results):
         of = of_line(results, line)
-        rows.append([name, str(len(next(iter(of[arms[0]].values())))), *(_rates(of[arm]) for arm in arms)])
+        rows.append([LINES[line], str(len(next(iter(of[arms[0]].values())))), *(_rates(of[arm]) for arm in arms)])
     text = "Success, in brackets of each seed:\n\n" + _table(rows)
     rows = [["tests", "arms", "difference (95 %)", "p", "by Holm"]]
     for one in differences(results):
@@ -118,14 +124,13 @@ def _short(task: str) -> str:
 def plot(results: Sequence[PolicyResults], file: Path) -> None:
     """Success by line and arm, with Wilson's 95 % interval, and each seed as a dot."""
     import matplotlib as mpl
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 3), layout="constrained")
     axes = figure.add_subplot()
     arms = list(dict.fromkeys(one.arm for one in results))
     for place, arm in enumerate(arms):
-        for number, line in enumerate(LINES):
+        for number, line in enumerate(lines_of(results)):
             seeds = of_line(results, line)[arm]
             rate = success_rate([*chain.from_iterable(seeds.values())])
             x, height = number + 0.8 * (place + 0.5) / len(arms) - 0.4, 100 * rate["rate"]
@@ -134,12 +139,13 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
             axes.errorbar(x, height, spread, color="black", linewidth=0.8)
             each = [100 * success_rate(rows)["rate"] for rows in seeds.values()]
             axes.plot([x] * len(each), each, "o", color="black", markersize=2.5)
-    axes.set_xticks(range(len(LINES)), LINES.values())
+    named = [LINES[line] for line in lines_of(results)]
+    axes.set_xticks(range(len(named)), named)
     axes.set_ylabel("success (%)")
     axes.set_ylim(0, 100)
     figure.legend(loc="outside upper center", ncols=len(arms), frameon=False)
     with mpl.rc_context({"svg.hashsalt": "effect", "svg.fonttype": "none"}), replaced(file) as temporary:
-        FigureCanvasSVG(figure).print_svg(temporary, metadata={"Date": None})
+        figure.savefig(temporary, format="svg", metadata={"Date": None})
 
 
 def publish(folder: Path, docs: Path = DOCS) -> str:

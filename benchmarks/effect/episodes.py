@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sentences import Vectors, vector
 
 from pipeline import gl
-from pipeline.axes import Axes, axes_of
+from pipeline.axes import axes_of
 from pipeline.compute.pool import Workers, runner
 from pipeline.config import PlanConfig
 from pipeline.errors import PipelineError
@@ -116,7 +116,7 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
     wanted, rows, begin = experiment.run.plan, [], 0
     for name in experiment.arms[arm]:
         end = begin + wanted.episodes[name] // len(by_task)
-        axes = Axes(**{axis: wanted.axes.drawn()[axis] for axis in axes_of(name)})
+        axes = wanted.axes.model_copy(update=dict.fromkeys(wanted.axes.drawn().keys() - axes_of(name)))
         config = PlanConfig(seed=wanted.seed, axes=axes, episodes={name: wanted.episodes[name]}, reserve=wanted.reserve)
         group = [demo for task in experiment.tasks for demo in by_task[task][begin:end]]
         rows += plan.make(group, config, experiment.run.replay, benchmark.load())
