@@ -153,6 +153,7 @@ def numbered() -> episodes.Dataset:
     return episodes.Dataset(images, draws.random((5, 8), np.float32), action, np.array([3, 2]), told)
 
 
+@pytest.mark.slow
 def test_a_batch_has_the_actions_that_follow_and_what_was_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from training import ACTION, SENTENCE, Steps
 
@@ -173,6 +174,7 @@ class StoppedError(Exception):
     """The training's process was killed."""
 
 
+@pytest.mark.slow
 def test_a_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import training
     from safetensors.torch import load_file
@@ -244,7 +246,7 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     robot = next(one for one in comparison.differences(found) if one["line"] == "robot")
     assert robot["value"] == pytest.approx((18 - 6) / 20)
     assert robot["resampled"] == "10 trials", "both seeds act in the same ten"
-    assert robot["holm"] == pytest.approx(5 * robot["p_value"]), "five lines alike"
+    assert robot["holm"] == pytest.approx(4 * robot["p_value"]), "camera and noise have more trials"
     text = comparison.markdown(found)
     assert "| robot | 10 | 30 % (40, 20) | 90 % (90, 90) |" in text
     assert "| camera, noise | 20 | 30 % (40, 20) | 90 % (90, 90) |" in text

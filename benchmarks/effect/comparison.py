@@ -97,7 +97,8 @@ def markdown(results: Sequence[PolicyResults]) -> str:
         p_value = "" if one["p_value"] is None else f"{one['p_value']:.2g}"
         pair = f"{one['second']} - {one['first']}"
         rows.append([LINES[one["line"]], pair, f"{100 * one['value']:+.0f}{bounds}", p_value, f"{one['holm']:.2g}"])
-    text += "\nPoints of success, of the same episodes:\n\n" + _table(rows)
+    if rows[1:]:
+        text += "\nPoints of success, of the same episodes:\n\n" + _table(rows)
     tasks = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
     for arm in arms:
         rows = [["told", *(_short(task) for task in tasks), "none"]]
