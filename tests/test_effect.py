@@ -92,6 +92,20 @@ def test_without_embeddings_nothing_begins(tmp_path: Path, shipped: Experiment) 
         sentences.write(["dance"], tmp_path / "bin" / "python", tmp_path / "sentences.npz")
 
 
+def test_a_task_without_embeddings_is_refused_before_any_work(tmp_path: Path) -> None:
+    run = yaml.safe_load((EFFECT / "data.yaml").read_text())
+    run["demos"]["tasks"][0] = "libero_goal/put_the_bowl_on_the_stove"
+    (tmp_path / "data.yaml").write_text(yaml.safe_dump(run))
+    file = tmp_path / "experiment.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(SHIPPED.read_text()) | {"data": "data.yaml"}))
+    link_testset(tmp_path)
+    command = [sys.executable, str(EFFECT), "--experiment", str(file), "data", "clean"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "no embedding of 'put the bowl on the stove'" in done.stderr
+    assert done.returncode == 1
+    assert not (tmp_path / "data" / "effect").exists()
+
+
 def demonstrations(experiment: Experiment, number: int) -> list[DemoEntry]:
     """Of each task so many, which nobody recorded."""
     starter = StarterSource().index([find_task(*name.split("/")) for name in experiment.tasks]).entries
@@ -227,7 +241,10 @@ def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
     rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in comparison.LINE_OF for number in range(10)]
     told = [("turn on the stove", "stove"), ("put the bowl on the plate", None), ("", "stove")]
     reading = [{"state": 0, "instruction": text, "reached": goal, "steps": 9} for text, goal in told]
-    settings = {"run": {"demos": {"tasks": ["libero_goal/stove", "libero_goal/put_the_bowl_on_the_plate"]}}}
+    settings = {
+        "arms": {"clean": [], "ours": ["robot"]},
+        "run": {"demos": {"tasks": ["libero_goal/stove", "libero_goal/put_the_bowl_on_the_plate"]}},
+    }
     return results.PolicyResults(arm, seed, settings, {}, rows, reading)
 
 

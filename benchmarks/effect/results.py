@@ -54,7 +54,7 @@ def _lines(rows: Sequence[Any]) -> str:
 
 
 def read(folder: Path) -> list[PolicyResults]:
-    """All policies of a folder.
+    """All policies of a folder, in the order of the experiment's arms.
 
     Raises:
         PipelineError: when there is none, or two are of different experiments.
@@ -74,4 +74,5 @@ def read(folder: Path) -> list[PolicyResults]:
             )
     if not found:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")
-    return found
+    arms = list(found[0].settings["arms"])
+    return sorted(found, key=lambda one: (arms.index(one.arm), one.seed))
