@@ -70,7 +70,7 @@ class Work:
         if not all(map(Path.is_dir, folders)) or len(demos.index().entries) < self.experiment.episodes:
             with self._timed("demonstrations"):
                 words = ["demos", "expand", str(demos.root), "--starts", "reset", "--tasks", *self.experiment.tasks]
-                run("-m", "pipeline", *words, "--per-task", str(self.experiment.demonstrations))
+                run("-m", "pipeline", *words, "--per-task", str(self.experiment.demonstrations + self.experiment.spare))
         with self._timed(f"data {arm}"):
             episodes.make(self.experiment, arm, demos.index().entries, self.vectors, file)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -89,7 +89,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
                     f"{len(kept)} of {experiment.episodes} episodes of {arm} are kept; missing are {dict(counts)}",
                     where=experiment.data,
                     expected="as many in all arms",
-                    remedy="raise plan.reserve there",
+                    remedy="raise plan.reserve there for perturbed episodes, or spare in the experiment for clean ones",
                 )
             render_plan(chosen, run, trajectories.root, frames.root, workers)
         _write(kept, EpisodeLoader(folder, run.render), experiment.frame_px, workers, file)
@@ -121,10 +121,11 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
         group = [demo for task in experiment.tasks for demo in by_task[task][begin:end]]
         rows += plan.make(group, config, experiment.run.replay, benchmark.load())
         begin = end
+    needed = experiment.demonstrations - begin
     clean = [
-        row
+        replace(row, wanted=row.rank < needed)
         for task in experiment.tasks
-        for row in plan.twins(by_task[task][begin : experiment.demonstrations], wanted.seed, experiment.run.replay)
+        for row in plan.twins(by_task[task][begin:], wanted.seed, experiment.run.replay)
     ]
     return rows + clean, [row for row in rows if row.role == "perturbed"] + clean
 

@@ -61,7 +61,8 @@ class Experiment(Frozen):
 
     Attributes:
         data: a run configuration, which says what the episodes of all arms are made from and perturbed by.
-        demonstrations: so many of each task are made by ``demos expand`` into the run's ``demos.root``.
+        demonstrations: of each task, each of which gives an arm one episode.
+        spare: so many more are made by ``demos expand``, for those whose clean replay fails.
         arms: name to what its episodes are perturbed by, names of the run's ``plan.episodes``. The first arm is the one
             that the others are compared with.
         frame_px: height and width of the frames that policies see.
@@ -72,6 +73,7 @@ class Experiment(Frozen):
 
     data: Path
     demonstrations: int = Field(ge=1)
+    spare: int = Field(default=0, ge=0)
     arms: dict[str, tuple[str, ...]] = Field(min_length=1)
     seeds: tuple[int, ...] = Field(min_length=1)
     frame_px: int = Field(ge=32, le=256)
@@ -123,7 +125,7 @@ class Experiment(Frozen):
     def dataset_name(self, arm: str) -> str:
         """Says what a dataset is made from, so that another configuration makes another."""
         run = self.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"}, by_alias=True)
-        return f"{arm}_{digest(run, self.demonstrations, self._names(arm), self.frame_px)[:8]}"
+        return f"{arm}_{digest(run, self.demonstrations, self.spare, self._names(arm), self.frame_px)[:8]}"
 
     def policy_name(self, arm: str, seed: int) -> str:
         """The same of a policy.
