@@ -20,6 +20,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,7 @@ class Work:
             "sentences_sha256": checksum(sentences.FILE),
             "policy_sha256": checksum(policy / "model.safetensors"),
             "losses": [[entry["step"], entry["loss"]] for entry in map(json.loads, losses[9::10])],
+            "packages": {name: version(name) for name in ("torch", "torchvision", "lerobot")},
             "seconds": self._seconds(),
             "cores": os.cpu_count(),
         }

@@ -20,7 +20,7 @@ class PolicyResults:
     Attributes:
         arm, seed: of its training.
         settings: of the experiment, and the tasks.
-        made: hashes of data, sentences and policy, the axes of the episodes, losses, and what each step took.
+        made: hashes of data, sentences and policy, axes of the episodes, losses, packages, and what each step took.
         rows: episodes of test tasks.
         reading: rows of ``evaluation.tell``.
     """
