@@ -65,7 +65,7 @@ def main() -> None:
 def embedded(python: Path, sentences: Sequence[str]) -> Floats:
     """(sentences, 384): embeddings of unit length."""
     made = subprocess.run([python, EMBEDDING], input=json.dumps(sentences).encode(), stdout=subprocess.PIPE, check=True)
-    vectors: Floats = np.load(io.BytesIO(made.stdout))
+    vectors: Floats = np.load(io.BytesIO(made.stdout))["vectors"]
     return vectors
 
 

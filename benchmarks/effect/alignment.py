@@ -1,11 +1,11 @@
 """Does a policy see in the evaluation what it saw in training, at the step that the action belongs to?
 
-    python benchmarks/effect/alignment.py benchmarks/effect/one_episode_data.yaml
+    python benchmarks/effect/alignment.py CONFIG
 
-For a finished run of starter demonstrations (`benchmarks/effect benchmarks/effect/one_episode.yaml` makes one): sends
-the actions of each clean episode in the evaluation, and compares frame and state before each action with those of the
-dataset at the same step, one before and one after. Both differences must be smallest at the same step. The last line is
-JSON: median differences of grey levels and of states by shift.
+For a finished run of starter demonstrations with `export: {lerobot: {frames: images}}`: sends the actions of each clean
+episode in the evaluation, and compares frame and state before each action with those of the dataset at the same step,
+one before and one after. Both differences must be smallest at the same step. The last line is JSON: median differences
+of grey levels and of states by shift.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 # isort: split
 import numpy as np
 import pyarrow.parquet as pq
-from arms import provenance
 
 from pipeline.config import load
 from pipeline.episode_schema import SCHEMA
@@ -43,7 +42,7 @@ def main() -> None:
     table = pq.read_table(root / "data", columns=columns)
     environment = EpisodeEnvironment(EpisodeSettings(initial_states="demonstration"))
     measured = []
-    for row in provenance(root):
+    for row in pq.read_table(root / "meta" / "provenance.parquet").to_pylist():
         if row["axis"] == "clean":
             episode = table.filter(np.array(table["episode_index"]) == row["episode_index"])
             (task,) = select(Selection(suites=(row["suite"],), tasks=(row["task"],)))

@@ -1,33 +1,26 @@
-"""The typed configuration of an experiment: data, arms, training, evaluation."""
+"""The typed configuration of the experiment: data, arms, training, evaluation."""
 
 from __future__ import annotations
 
+from datetime import date
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import yaml
-from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from pipeline.axes import axes_of
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
-from pipeline.evaluation.own_draws import OWN_AXES
 from pipeline.seeding import digest
 
-PLUS_AXES = Literal["camera", "robot", "noise", "pose"]
-"""The axes whose test tasks need no asset archive. ACT reads no text, so language is none of them."""
+PlusAxis = Literal["robot", "language", "pose", "camera", "noise"]
+"""The axes whose test tasks need no asset archive."""
 
-
-def _drawn(axis: str) -> str:
-    if axis not in OWN_AXES:
-        raise ValueError(f"expected one of {', '.join(OWN_AXES)}")
-    return axis
-
-
-OwnAxis = Annotated[str, AfterValidator(_drawn)]
-"""An axis that has held-out draws."""
+MOST_EPISODES = 350
+"""Of a policy's evaluation: 25 minutes of two cores."""
 
 
 class TrainingConfig(Frozen):
@@ -36,61 +29,58 @@ class TrainingConfig(Frozen):
     Attributes:
         steps: gradient steps, the same for all arms.
         batch_size: frames of a step.
-        learning_rate: AdamW's, which falls to a hundredth along a cosine; that of the policy's preset when left out.
-            Weights with a rate of their own, as ACT's ``optimizer_lr_backbone``, start from it and fall alike.
-        mixed_precision: accelerate's. On processors that multiply in bf16, a step takes two thirds of the time.
+        learning_rate: AdamW's, which falls to a hundredth along a cosine.
         save_every: steps between two checkpoints; what a kill costs at most.
-        at_once: policies trained at the same time, which share the cores: one thread wastes less than two.
     """
 
     steps: int = Field(ge=1)
     batch_size: int = Field(ge=1)
-    learning_rate: float | None = Field(default=None, gt=0)
-    mixed_precision: Literal["no", "bf16"] = "no"
+    learning_rate: float = Field(gt=0)
     save_every: int = Field(ge=1)
-    at_once: int = Field(default=1, ge=1)
 
 
 class EvaluationConfig(Frozen):
-    """What each policy is evaluated on, beside LIBERO's own initial states.
+    """What each policy is evaluated on.
 
     Attributes:
-        episodes: at least so many of each axis, as far as the test tasks go, and of LIBERO's initial states.
-        libero_plus: axes evaluated on LIBERO-Plus's test tasks.
-        held_out: axes evaluated on draws that keep clear of the plan's.
-        redrawn: axes evaluated on new draws of what the plan draws from, where it leaves too little to hold out.
-        initial_states: ``demonstration`` starts where the starter set's demonstration does.
+        states: LIBERO's initial states of each task, from the first.
+        libero_plus: axis to LIBERO-Plus's test tasks of each task.
+        reading_states: initial states of the first task, from the last, in which the policy is told each instruction.
     """
 
-    episodes: int = Field(ge=1)
-    libero_plus: tuple[PLUS_AXES, ...] = ()
-    held_out: tuple[OwnAxis, ...] = ()
-    redrawn: tuple[OwnAxis, ...] = ()
-    initial_states: Literal["libero", "demonstration"] = "libero"
+    states: int = Field(ge=1, le=50)
+    libero_plus: dict[PlusAxis, int]
+    reading_states: int = Field(ge=0, le=50)
+
+    def episodes(self, tasks: int) -> int:
+        return tasks * (self.states + sum(self.libero_plus.values())) + (tasks + 1) * self.reading_states
 
 
 class Experiment(Frozen):
-    """A whole experiment.
+    """The whole experiment.
 
     Attributes:
-        data: an ordinary run configuration, which makes the episodes of all arms.
-        demonstrations: so many of each task are made by ``demos expand`` into the run's ``demos.root`` first; none
-            when left out.
-        arms: name to what its episodes are perturbed by, axes or combinations of the run's ``plan.episodes``; clean
-            twins make up for the others. The first arm is the one that the others are compared with.
+        data: a run configuration, which says what the episodes of all arms are made from and perturbed by.
+        demonstrations: of each task, each of which gives an arm one episode.
+        spare: so many more are made by ``demos expand``, for those whose clean replay fails.
+        arms: name to what its episodes are perturbed by, names of the run's ``plan.episodes``. The first arm is the one
+            that the others are compared with.
         frame_px: height and width of the frames that policies see.
-        policy: options of lerobot's policy, among them its ``type``.
+        policy: options of lerobot's ACT.
         seeds: one policy of each arm is trained from each.
+        decisions: date to what was decided then, and on what.
     """
 
     data: Path
-    demonstrations: int | None = Field(default=None, ge=1)
+    demonstrations: int = Field(ge=1)
+    spare: int = Field(default=0, ge=0)
     arms: dict[str, tuple[str, ...]] = Field(min_length=1)
+    seeds: tuple[int, ...] = Field(min_length=1)
     frame_px: int = Field(ge=32, le=256)
     policy: dict[str, Any]
     training: TrainingConfig
-    seeds: tuple[int, ...] = Field(min_length=1)
     evaluation: EvaluationConfig
+    decisions: dict[date, str] = Field(default_factory=dict)
 
     @field_validator("arms")
     @classmethod
@@ -99,12 +89,23 @@ class Experiment(Frozen):
 
     @model_validator(mode="after")
     def _matches_run(self) -> Experiment:
-        if unknown := {name for names in self.arms.values() for name in names} - self.run.plan.episodes.keys():
-            raise ValueError(f"{self.data} has no episodes of {', '.join(sorted(unknown))}")
-        if self.demonstrations is not None and self.run.demos.root is None:
-            raise ValueError(f"demonstrations: {self.data} has no demos.root to make them in")
-        if self.run.export.lerobot is None or self.run.export.lerobot.frames != "images":
-            raise ValueError(f"{self.data} does not export lerobot with images; write frames: images there")
+        planned = self.run.plan.episodes
+        if self.run.demos.root is None:
+            raise ValueError(f"{self.data} has no demos.root to make the demonstrations in")
+        for arm, names in self.arms.items():
+            if unknown := [name for name in names if name not in planned]:
+                expected = ", ".join(planned)
+                raise ValueError(f"{self.data} plans no episodes of {unknown[0]!r} for {arm}, but of {expected}")
+            if uneven := [name for name in names if planned[name] % len(self.tasks)]:
+                raise ValueError(f"{planned[uneven[0]]} episodes of {uneven[0]!r} are not as many of each task")
+            perturbed = sum(planned[name] for name in names)
+            if 3 * perturbed > 2 * self.episodes:
+                raise ValueError(
+                    f"{arm} has {perturbed} perturbed of {self.episodes} episodes; a third must stay clean: lower "
+                    f"plan.episodes in {self.data}, or raise demonstrations"
+                )
+        if (wanted := self.evaluation.episodes(len(self.tasks))) > MOST_EPISODES:
+            raise ValueError(f"{wanted} episodes of evaluation, expected at most {MOST_EPISODES}")
         return self
 
     @cached_property
@@ -112,33 +113,39 @@ class Experiment(Frozen):
         return load(self.data)
 
     @property
-    def lerobot(self) -> Path:
-        """Root of the run's LeRobot dataset."""
-        assert self.run.export.lerobot is not None
-        return self.run.data / "lerobot" / self.run.export.lerobot.name
-
-    @property
     def tasks(self) -> tuple[str, ...]:
         """``<suite>/<task>`` of each."""
         return self.run.demos.tasks
 
+    @property
+    def episodes(self) -> int:
+        """Of each arm."""
+        return self.demonstrations * len(self.tasks)
+
     def dataset_name(self, arm: str) -> str:
         """Says what a dataset is made from, so that another configuration makes another."""
-        made_from = (
-            self.run.model_dump(mode="json", exclude={"compute", "folder"}, by_alias=True),
-            self.demonstrations,
-            self.arms[arm],
-        )
-        return f"{arm}_{digest(*made_from, self.frame_px)[:8]}"
+        run = self.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"}, by_alias=True)
+        return f"{arm}_{digest(run, self.demonstrations, self.spare, self._names(arm), self.frame_px)[:8]}"
 
     def policy_name(self, arm: str, seed: int) -> str:
-        """The same of a policy."""
-        training = self.training.model_dump(exclude={"save_every", "at_once"})
+        """The same of a policy.
+
+        Raises:
+            PipelineError: when the experiment has no such seed.
+        """
+        if seed not in self.seeds:
+            raise PipelineError(f"no seed {seed}", where="seeds", expected=" or ".join(map(str, self.seeds)))
+        training = self.training.model_dump(exclude={"save_every"})
         return f"{arm}_seed{seed}_{digest(self.dataset_name(arm), self.policy, training, seed)[:8]}"
+
+    def _names(self, arm: str) -> tuple[str, ...]:
+        if arm not in self.arms:
+            raise PipelineError(f"no arm {arm!r}", where="arms", expected=" or ".join(self.arms))
+        return self.arms[arm]
 
 
 def read(path: Path) -> Experiment:
-    """Read and validate an experiment.
+    """Read and validate the experiment.
 
     Raises:
         PipelineError: naming the file and every field that is wrong.

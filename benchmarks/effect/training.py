@@ -1,122 +1,197 @@
-"""Policies, by lerobot's own training, from weights made here and never from the hub."""
+"""An ACT policy that is told what to do by a sentence's embedding, trained from random weights by one plain loop.
+
+The policy is lerobot's, and saved as lerobot saves one. The frames lie in memory, so that a step decodes nothing. One
+thread computes, as several wait for each other; on two cores train both seeds at the same time.
+"""
 
 from __future__ import annotations
 
 import json
-import os
-import sys
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+import math
+import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import torch
+from episodes import VIEWS, Dataset
 from experiment import Experiment, TrainingConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.act.configuration_act import ACTConfig
+from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_pre_post_processors
+from numpy.typing import NDArray
+from sentences import SIZE, Vectors, vector
+from torchvision.ops.misc import FrozenBatchNorm2d
 
-from pipeline.files import put_in_place, remove, replaced
+from pipeline.files import remove, replaced
+from pipeline.seeding import rng
+
+IMAGES = {view: f"observation.images.{view}" for view in VIEWS}
+STATE, SENTENCE, ACTION = "observation.state", "observation.environment_state", "action"
+
+WARMUP_STEPS = 200
+"""Steps in which the learning rate rises."""
+
+GRADIENT_NORM, WEIGHT_DECAY = 10.0, 1e-4
+"""As lerobot trains ACT."""
 
 CALIBRATION_FRAMES = 64
 """Frames that the backbone's normalisation is set by."""
 
-WARMUP_STEPS = 200
-"""Steps in which the learning rate rises, where the experiment sets one."""
+LOG_EVERY = 50
 
-Command = Callable[[list[str]], None]
-"""Runs a command to its end."""
+Batch = dict[str, torch.Tensor]
 
 
-def train(datasets: Mapping[Path, Path], experiment: Experiment, seed: int, command: Command) -> None:
-    """Train policies, each on a dataset of its own, or go on from their last checkpoints.
+def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors, out: Path) -> None:
+    """Train a policy, or go on from its last checkpoint; ``out`` is there once it is trained.
+
+    A batch depends on seed and step alone, so a training that was stopped goes on as if it had not been.
 
     Args:
-        datasets: folder of each policy, as lerobot saves it, to the root of its LeRobot dataset. A folder is there once
-            its policy is trained.
+        out: folder of the policy; ``training.jsonl`` in it has mean loss and time of each ``LOG_EVERY`` steps.
     """
-    for out, dataset in datasets.items():
-        start = _work(out) / "start"
-        if not start.exists():
-            with replaced(start) as unfinished:
-                initialise(dataset, unfinished, experiment.policy, seed)
-    training = experiment.training
-    with ThreadPoolExecutor(training.at_once) as pool:
-        jobs = [pool.submit(_train, dataset, out, training, seed, command) for out, dataset in datasets.items()]
-        for job in jobs:
-            job.result()
-
-
-def _work(out: Path) -> Path:
-    return out.with_name(f".{out.name}.training")
-
-
-def _train(dataset: Path, out: Path, training: TrainingConfig, seed: int, command: Command) -> None:
-    """Train one policy, which has its weights already."""
-    outputs = _work(out) / "lerobot"
-    environment: dict[str, str] = {"ACCELERATE_MIXED_PRECISION": training.mixed_precision}
-    if training.at_once > 1:
-        environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // training.at_once))
-    program = ["env", *(f"{name}={value}" for name, value in environment.items())]
-    program += [sys.executable, str(Path(__file__).with_name("lerobot_train.py"))]
-    last = _last_checkpoint(outputs)
-    if last is None:
-        remove(outputs)
-        options: dict[str, Any] = {
-            "policy.path": _work(out) / "start",
-            "dataset.repo_id": dataset.name,
-            "dataset.root": dataset,
-            "output_dir": outputs,
-            "seed": seed,
-            "steps": training.steps,
-            "batch_size": training.batch_size,
-            "save_freq": training.save_every,
-            "log_freq": min(100, training.steps),
-            "eval_freq": 0,
-            # The process that trains reads frames too where there are few cores.
-            "num_workers": max(0, min(4, (os.cpu_count() or 1) - 2)),
-        }
-        if training.learning_rate is not None:
-            options |= _schedule(training.learning_rate, training.steps)
-        command([*program, *(f"--{name}={value}" for name, value in options.items())])
-    elif _step(last) < training.steps:
-        config = last / "pretrained_model" / "train_config.json"
-        command([*program, f"--config_path={config}", "--resume=true", f"--steps={training.steps}"])
-    last = _last_checkpoint(outputs)
-    assert last is not None, "lerobot saves after the last step"
-    put_in_place(last / "pretrained_model", out)
-    remove(_work(out))
-
-
-def initialise(dataset: Path, out: Path, options: dict[str, Any], seed: int) -> None:
-    """Save a policy with random weights and the processors of a dataset.
-
-    lerobot freezes the batch normalisation of ACT's backbone, as it counts on weights from ImageNet. With random
-    weights the frozen layers would normalise nothing, and activations would grow from block to block. So their means
-    and variances are set by frames of the dataset, layer by layer (data-dependent initialisation, Kraehenbuehl et al.,
-    2016, arXiv:1511.06856).
-    """
-    import torch
-    from lerobot.configs.default import DatasetConfig
-    from lerobot.configs.train import TrainPipelineConfig
-    from lerobot.datasets.factory import make_dataset
-    from lerobot.policies.factory import make_policy, make_policy_config, make_pre_post_processors
-    from torchvision.ops.misc import FrozenBatchNorm2d
-
     torch.manual_seed(seed)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    named = {name: value for name, value in options.items() if name != "type"}
-    config = make_policy_config(options["type"], device=device, push_to_hub=False, **named)
-    frames = make_dataset(TrainPipelineConfig(DatasetConfig(dataset.name, root=str(dataset)), policy=config))
-    policy = make_policy(config, ds_meta=frames.meta)
-    before, after = make_pre_post_processors(config, dataset_stats=frames.meta.stats)
+    torch.set_num_threads(1)
+    config, training = experiment.training, Steps(experiment, dataset, vectors)
+    work = out.with_name(f".{out.name}.training")
+    policy = ACTPolicy(configuration(experiment))
+    before, after = make_pre_post_processors(policy.config, dataset_stats=training.statistics())
+    calibrate(policy, before(training.batch(rng("effect", "calibration", seed), CALIBRATION_FRAMES)))
+    optimizer = torch.optim.AdamW(policy.parameters(), config.learning_rate, weight_decay=WEIGHT_DECAY, fused=True)
+    step, log = 0, []
+    if (work / "last.pt").exists():
+        saved = torch.load(work / "last.pt", weights_only=True)
+        policy.load_state_dict(saved["policy"])
+        optimizer.load_state_dict(saved["optimizer"])
+        step, log = saved["step"], saved["log"]
+    policy.train()
+    losses: list[float] = []
+    wall, cpu = time.perf_counter(), time.process_time()
+    while step < config.steps:
+        for group in optimizer.param_groups:
+            group["lr"] = learning_rate(step, config)
+        batch = before(training.batch(rng("effect", "batch", seed, step), config.batch_size))
+        with torch.autocast("cpu", torch.bfloat16):
+            loss, _ = policy(batch)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(policy.parameters(), GRADIENT_NORM)
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(loss.item())
+        step += 1
+        if step % LOG_EVERY == 0 or step == config.steps:
+            taken = {"seconds": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
+            wall, cpu = time.perf_counter(), time.process_time()
+            entry = {"step": step, "loss": float(np.mean(losses))} | taken
+            log.append({name: round(value, 4) for name, value in entry.items()})
+            losses = []
+            print(json.dumps(log[-1]), flush=True)
+        if step % config.save_every == 0 or step == config.steps:
+            with replaced(work / "last.pt") as temporary:
+                torch.save(
+                    {"policy": policy.state_dict(), "optimizer": optimizer.state_dict(), "step": step, "log": log},
+                    temporary,
+                )
+    with replaced(out) as folder:
+        for part in (policy, before, after):
+            part.save_pretrained(folder)
+        (folder / "training.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in log))
+    remove(work)
+
+
+def configuration(experiment: Experiment) -> ACTConfig:
+    """Of the experiment's policy."""
+    picture = (3, experiment.frame_px, experiment.frame_px)
+    return ACTConfig(
+        input_features={
+            **{key: PolicyFeature(FeatureType.VISUAL, picture) for key in IMAGES.values()},
+            STATE: PolicyFeature(FeatureType.STATE, (8,)),
+            SENTENCE: PolicyFeature(FeatureType.ENV, (SIZE,)),
+        },
+        output_features={ACTION: PolicyFeature(FeatureType.ACTION, (7,))},
+        pretrained_backbone_weights=None,
+        device="cpu",
+        push_to_hub=False,
+        **experiment.policy,
+    )
+
+
+def learning_rate(step: int, config: TrainingConfig) -> float:
+    """A rise of ``WARMUP_STEPS``, at most a tenth of all, then a cosine down to a hundredth."""
+    warmup = min(WARMUP_STEPS, config.steps // 10)
+    if step < warmup:
+        return config.learning_rate * (step + 1) / warmup
+    share = (step - warmup) / max(1, config.steps - warmup)
+    return config.learning_rate * (0.01 + 0.99 * (1 + math.cos(math.pi * share)) / 2)
+
+
+class Steps:
+    """A dataset as batches: each frame with the actions that follow, the last one repeated at an episode's end."""
+
+    def __init__(self, experiment: Experiment, dataset: Dataset, vectors: Vectors):
+        self._dataset = dataset
+        self._chunk = np.arange(configuration(experiment).chunk_size)
+        self._ends = np.repeat(np.cumsum(dataset.lengths), dataset.lengths)
+        self._sentences = np.stack([vector(row["instruction"], vectors) for row in dataset.episodes])
+        self._episode = np.repeat(np.arange(len(dataset.lengths)), dataset.lengths)
+
+    def batch(self, draws: np.random.Generator, size: int) -> Batch:
+        """Frames drawn with replacement, before normalisation."""
+        frames = draws.integers(len(self._ends), size=size)
+        following = frames[:, None] + self._chunk
+        last = self._ends[frames, None] - 1
+        return {
+            **{key: pixels(self._dataset.images[view][frames]) for view, key in IMAGES.items()},
+            STATE: torch.from_numpy(self._dataset.state[frames]),
+            SENTENCE: torch.from_numpy(self._sentences[self._episode[frames]]),
+            ACTION: torch.from_numpy(self._dataset.action[np.minimum(following, last)]),
+            "action_is_pad": torch.from_numpy(following > last),
+        }
+
+    def statistics(self) -> dict[str, Mapping[str, torch.Tensor]]:
+        """Mean and standard deviation of each feature but the sentence, of images by channel."""
+        found = {key: _of_channels(self._dataset.images[view]) for view, key in IMAGES.items()}
+        for key, values in ((STATE, self._dataset.state), (ACTION, self._dataset.action)):
+            found[key] = {
+                "mean": torch.from_numpy(values.mean(axis=0)),
+                "std": torch.from_numpy(values.std(axis=0)),
+            }
+        return found
+
+
+def pixels(frames: NDArray[np.uint8]) -> torch.Tensor:
+    """(n, 3, P, P) in [0, 1] of (n, P, P, 3)."""
+    return torch.from_numpy(frames).permute(0, 3, 1, 2).float() / 255
+
+
+def _of_channels(frames: NDArray[np.uint8]) -> Mapping[str, torch.Tensor]:
+    counts = np.stack([np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)])
+    levels, share = np.arange(256) / 255, counts / counts.sum(axis=1, keepdims=True)
+    mean = share @ levels
+    std = np.sqrt(share @ levels**2 - mean**2)
+    return {"mean": _by_channel(mean), "std": _by_channel(std)}
+
+
+def _by_channel(values: NDArray[np.float64]) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float32).reshape(3, 1, 1)
+
+
+def calibrate(policy: ACTPolicy, batch: Mapping[str, Any]) -> None:
+    """Set the backbone's normalisation by frames of the dataset.
+
+    lerobot freezes it, as it counts on weights from ImageNet. With random weights the frozen layers would normalise
+    nothing, and activations would grow from block to block. So means and variances are set layer by layer
+    (data-dependent initialisation, Kraehenbuehl et al., 2016, arXiv:1511.06856).
+    """
     layers = [layer for layer in policy.modules() if isinstance(layer, FrozenBatchNorm2d)]
-    if layers:
-        hooks = [layer.register_forward_pre_hook(_measure) for layer in layers]
-        chosen = torch.randperm(len(frames))[:CALIBRATION_FRAMES].tolist()
-        batch = before(torch.utils.data.default_collate([frames[index] for index in chosen]))
-        with torch.no_grad():
-            policy.model.backbone(torch.cat([batch[key] for key in config.image_features]))
-        for hook in hooks:
-            hook.remove()
-    for part in (policy, before, after):
-        part.save_pretrained(out)
+    hooks = [layer.register_forward_pre_hook(_measure) for layer in layers]
+    with torch.no_grad():
+        policy.model.backbone(torch.cat([batch[key] for key in IMAGES.values()]))
+    for hook in hooks:
+        hook.remove()
 
 
 def _measure(layer: Any, inputs: tuple[Any, ...]) -> None:
@@ -124,27 +199,3 @@ def _measure(layer: Any, inputs: tuple[Any, ...]) -> None:
     (features,) = inputs
     layer.running_mean.copy_(features.mean(dim=(0, 2, 3)))
     layer.running_var.copy_(features.var(dim=(0, 2, 3)))
-
-
-def _schedule(learning_rate: float, steps: int) -> dict[str, Any]:
-    return {
-        "use_policy_training_preset": "false",
-        "optimizer.type": "adamw",
-        "optimizer.lr": learning_rate,
-        "optimizer.weight_decay": 1e-4,
-        "scheduler.type": "cosine_decay_with_warmup",
-        "scheduler.num_warmup_steps": min(WARMUP_STEPS, steps // 10),
-        "scheduler.num_decay_steps": steps,
-        "scheduler.peak_lr": learning_rate,
-        "scheduler.decay_lr": learning_rate / 100,
-    }
-
-
-def _last_checkpoint(outputs: Path) -> Path | None:
-    """The last that is complete: lerobot points to a checkpoint once all of it is written."""
-    last = outputs / "checkpoints" / "last"
-    return last if last.exists() else None
-
-
-def _step(checkpoint: Path) -> int:
-    return int(json.loads((checkpoint / "training_state" / "training_step.json").read_text())["step"])

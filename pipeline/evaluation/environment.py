@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -177,6 +177,10 @@ class EpisodeEnvironment:
     def controller(self) -> Any:
         """robosuite's controller of the arm."""
         return self._simulator.controller
+
+    def satisfies(self, goal: Iterable[Sequence[str]]) -> bool:
+        """Whether all facts of a BDDL goal hold, such as that of another task in the same scene."""
+        return self._opened.satisfies(goal)
 
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import Any
 
@@ -260,6 +260,10 @@ class Environment:
     def succeeded(self) -> bool:
         """LIBERO's success check, the conjunction of the BDDL goal's predicates."""
         return bool(self._env.check_success())
+
+    def satisfies(self, goal: Iterable[Sequence[str]]) -> bool:
+        """Whether all facts of a goal hold, such as that of another task in the same scene."""
+        return all(self._env.env._eval_predicate(list(fact)) for fact in goal)
 
     def close(self) -> None:
         self._env.close()

@@ -76,19 +76,17 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     """
     store = TrajectoryStore(out / ".replays")
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
-    result = Expansion()
+    faults: dict[str, str] = {}
     while True:
-        verdicts = Replays(demos, REPLAY, store.root, workers).of(rows)
-        outcome = plan.select(rows, verdicts)
+        verdicts = Replays(demos, REPLAY, store.root, workers).of(rows, faults)
+        outcome = plan.select(rows, verdicts, faults)
         kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
-        faults = _faults(kept, rows, store)
-        if not faults:
+        if not (found := _faults(kept, rows, store)):
             break
-        result.dropped.update(faults.values())
-        rows = [row for row in rows if row.episode_id not in faults]
+        faults |= found
     unwanted = {"kept", "reserve_not_needed"}
     reasons = [outcome[row.episode_id].reason for row in rows if row.role == "perturbed"]
-    result.dropped.update(reason for reason in reasons if reason not in unwanted)
+    result = Expansion(dropped=Counter(reason for reason in reasons if reason not in unwanted))
     tasks = {f"{entry.task.suite}/{entry.task.name}": entry.task for entry in demos.index().entries}
     by_task: dict[str, list[plan.Row]] = defaultdict(list)
     for row in kept:

@@ -6,6 +6,7 @@ Most tests are of ``--starts wide``; what resets have in common with it is teste
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import h5py
@@ -146,3 +147,14 @@ def test_starts_that_there_are_not_are_refused(
     with pytest.raises(SystemExit):
         main()
     assert "--starts: invalid choice: 'far' (choose from" in capsys.readouterr().err
+
+
+def test_a_reserve_takes_the_place_of_one_that_starts_like_another(
+    at_resets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three candidates for two demonstrations, all start alike here, so the third is tried as well."""
+    for name, value in {"APART_RAD": 10.0, "APART_M": 10.0, "RESERVE": 0.5}.items():
+        monkeypatch.setattr(f"pipeline.run.expand.{name}", value)
+    shutil.copytree(at_resets.parents[1] / ".replays", tmp_path / ".replays")
+    made = expand(tmp_path, TASKS, resets(TASKS, 2, 1), 2, loop)
+    assert (made.written, made.dropped) == (1, {"duplicate": 2})

@@ -1,0 +1,160 @@
+"""Table and plot of the results: success by axis and arm, paired differences, and which goals instructions reach."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from itertools import chain, combinations
+from pathlib import Path
+from typing import Any
+
+from results import PolicyResults, read
+
+from pipeline.evaluation.results import EpisodeResult
+from pipeline.evaluation.statistics import compare, paired, success_rate
+from pipeline.files import replaced
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+SECTION = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end of the table -->)", re.DOTALL)
+"""The part of docs/effect.md that ``publish`` writes."""
+
+LINES = {"clean": "LIBERO's own", "robot": "robot", "language": "language", "pose": "pose", "camera": "camera, noise"}
+LINE_OF = {axis: axis for axis in LINES} | {"noise": "camera"}
+COLOURS = ("#6b7d94", "#e59a00", "#1f9e82", "#9467d6")
+
+Rows = Mapping[int, Sequence[EpisodeResult]]
+"""Seed to the episodes of an arm's policy."""
+
+
+def of_line(results: Sequence[PolicyResults], line: str) -> dict[str, Rows]:
+    """Arm to its episodes of one line of the table."""
+    found: dict[str, dict[int, list[EpisodeResult]]] = defaultdict(dict)
+    for one in results:
+        found[one.arm][one.seed] = [row for row in one.rows if LINE_OF[row.axis] == line]
+    return dict(found)
+
+
+def lines_of(results: Sequence[PolicyResults]) -> list[str]:
+    """The lines that there are episodes of."""
+    there = {LINE_OF[row.axis] for one in results for row in one.rows}
+    return [line for line in LINES if line in there]
+
+
+def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
+    """Each two arms on each line: ``value`` (second minus first), ``low``, ``high``, ``p_value``, and ``holm``.
+
+    Episodes are paired by seed, test tasks are drawn anew within the tasks of the scene, each with all seeds. ``holm``
+    is the p-value by Holm (1979) over the lines of the two arms.
+    """
+    arms = list(dict.fromkeys(one.arm for one in results))
+    found = []
+    for first, second in combinations(arms, 2):
+        lines = []
+        for line in lines_of(results):
+            of = of_line(results, line)
+            seeds = of[first].keys() & of[second].keys()
+            pairs = [pair for seed in sorted(seeds) for pair in paired(of[first][seed], of[second][seed])]
+            if pairs:
+                lines.append({"first": first, "second": second, "line": line, **compare(pairs)["all"]["difference"]})
+        adjusted = holm([one["p_value"] for one in lines])
+        found += [{**one, "holm": p_value} for one, p_value in zip(lines, adjusted, strict=True)]
+    return found
+
+
+def holm(p_values: Sequence[float | None]) -> list[float]:
+    """Adjusted p-values: the smallest times their number, the next times one less, never falling (Holm, 1979).
+
+    None, of outcomes that never differ, counts as 1.
+    """
+    known = [1.0 if p is None else p for p in p_values]
+    adjusted, most = [1.0] * len(known), 0.0
+    for rank, place in enumerate(sorted(range(len(known)), key=known.__getitem__)):
+        most = max(most, min(1.0, (len(known) - rank) * known[place]))
+        adjusted[place] = most
+    return adjusted
+
+
+def reading(results: Sequence[PolicyResults], arm: str) -> dict[str, Counter[str | None]]:
+    """Instruction to how often each goal was reached, all seeds together."""
+    counts: dict[str, Counter[str | None]] = defaultdict(Counter)
+    for row in chain.from_iterable(one.reading for one in results if one.arm == arm):
+        counts[row["instruction"]][row["reached"]] += 1
+    return dict(counts)
+
+
+def markdown(results: Sequence[PolicyResults]) -> str:
+    """All tables."""
+    arms = list(dict.fromkeys(one.arm for one in results))
+    rows = [["tests", "episodes", *arms]]
+    for line in lines_of(results):
+        of = of_line(results, line)
+        rows.append([LINES[line], str(len(next(iter(of[arms[0]].values())))), *(_rates(of[arm]) for arm in arms)])
+    text = "Success, in brackets of each seed:\n\n" + _table(rows)
+    rows = [["tests", "arms", "difference (95 %)", "p", "by Holm"]]
+    for one in differences(results):
+        bounds = "" if one["low"] is None else f" ({100 * one['low']:+.0f} to {100 * one['high']:+.0f})"
+        p_value = "" if one["p_value"] is None else f"{one['p_value']:.2g}"
+        pair = f"{one['second']} - {one['first']}"
+        rows.append([LINES[one["line"]], pair, f"{100 * one['value']:+.0f}{bounds}", p_value, f"{one['holm']:.2g}"])
+    if rows[1:]:
+        text += "\nPoints of success, of the same episodes:\n\n" + _table(rows)
+    tasks = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
+    for arm in arms:
+        rows = [["told", *(_short(task) for task in tasks), "none"]]
+        for told, counts in reading(results, arm).items():
+            rows.append([told or "nothing", *(str(counts[goal]) for goal in (*tasks, None))])
+        text += f"\nGoals that `{arm}` reaches by what it is told:\n\n" + _table(rows)
+    return text
+
+
+def _rates(seeds: Rows) -> str:
+    rate = success_rate([*chain.from_iterable(seeds.values())])
+    each = ", ".join(f"{100 * success_rate(rows)['rate']:.0f}" for rows in seeds.values())
+    return f"{100 * rate['rate']:.0f} % ({each})"
+
+
+def _table(rows: Sequence[Sequence[str]]) -> str:
+    return "".join("| " + " | ".join(row) + " |\n" for row in [rows[0], ["---"] * len(rows[0]), *rows[1:]])
+
+
+def _short(task: str) -> str:
+    return task.replace("put_the_", "").replace("_", " ")
+
+
+def plot(results: Sequence[PolicyResults], file: Path) -> None:
+    """Success by line and arm, with Wilson's 95 % interval, and each seed as a dot."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 3), layout="constrained")
+    axes = figure.add_subplot()
+    arms = list(dict.fromkeys(one.arm for one in results))
+    for place, arm in enumerate(arms):
+        for number, line in enumerate(lines_of(results)):
+            seeds = of_line(results, line)[arm]
+            rate = success_rate([*chain.from_iterable(seeds.values())])
+            x, height = number + 0.8 * (place + 0.5) / len(arms) - 0.4, 100 * rate["rate"]
+            spread = [[height - 100 * rate["low"]], [100 * rate["high"] - height]]
+            axes.bar(x, height, 0.7 / len(arms), color=COLOURS[place], label=arm if number == 0 else None)
+            axes.errorbar(x, height, spread, color="black", linewidth=0.8)
+            each = [100 * success_rate(rows)["rate"] for rows in seeds.values()]
+            axes.plot([x] * len(each), each, "o", color="black", markersize=2.5)
+    named = [LINES[line] for line in lines_of(results)]
+    axes.set_xticks(range(len(named)), named)
+    axes.set_ylabel("success (%)")
+    axes.set_ylim(0, 100)
+    figure.legend(loc="outside upper center", ncols=len(arms), frameon=False)
+    with mpl.rc_context({"svg.hashsalt": "effect", "svg.fonttype": "none"}), replaced(file) as temporary:
+        figure.savefig(temporary, format="svg", metadata={"Date": None})
+
+
+def publish(folder: Path, docs: Path = DOCS) -> str:
+    """Write the table of a folder's results into docs/effect.md, and the plot beside it; returns the table."""
+    results = read(folder)
+    text = markdown(results) + "\n![success by tests and arm](effect.svg)\n"
+    plot(results, docs / "effect.svg")
+    page = docs / "effect.md"
+    with replaced(page) as temporary:
+        temporary.write_text(SECTION.sub(lambda _: text, page.read_text()))
+    return text

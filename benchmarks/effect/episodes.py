@@ -1,0 +1,169 @@
+"""The episodes that an arm is trained on, from demonstrations to small frames in one file."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from experiment import Experiment
+from numpy.typing import NDArray
+from sentences import Vectors, vector
+
+from pipeline import gl
+from pipeline.axes import axes_of
+from pipeline.compute.pool import Workers, runner
+from pipeline.config import PlanConfig
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.images.jpeg import decode, resized
+from pipeline.libero.demonstrations import DemoEntry
+from pipeline.planning import leakage, plan
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.outcome import rejections
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
+from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.testset import benchmark
+
+VIEWS = ("image", "wrist_image")
+COLUMNS = ("episode_id", "demo_id", "task", "axis", "component", "level", "instruction")
+"""What is kept of each episode's row of the plan."""
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """All steps of an arm's episodes, one episode after the other.
+
+    Attributes:
+        images: view to (N, P, P, 3) uint8 RGB.
+        state: (N, 8), action: (N, 7) float32.
+        lengths: (E,) steps of each episode.
+        episodes: E rows of ``COLUMNS``.
+    """
+
+    images: dict[str, NDArray[np.uint8]]
+    state: NDArray[np.float32]
+    action: NDArray[np.float32]
+    lengths: NDArray[np.int64]
+    episodes: list[dict[str, Any]]
+
+    def axes(self) -> dict[str, int]:
+        """Axis or combination to its number of episodes."""
+        return dict(sorted(Counter(row["axis"] for row in self.episodes).items()))
+
+
+def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: Vectors, file: Path) -> None:
+    """Plan, replay and render an arm's episodes and nothing else, and write them.
+
+    Stopped at any time, it goes on: replays and frames are kept beside the file.
+
+    Raises:
+        PipelineError: before anything is replayed, when there are too few demonstrations, a draw is too near to a test
+            task, or a sentence has no embedding; before anything is rendered, when fewer episodes than wanted are kept.
+    """
+    rows, chosen = planned(experiment, arm, demos)
+    for row in chosen:
+        vector(row.instruction, vectors)
+    leakage.refuse_overlap(leakage.check(rows, benchmark.load()))
+    folder, run = file.with_suffix(""), experiment.run
+    folder.mkdir(parents=True, exist_ok=True)
+    plan.write(rows, folder / "plan.parquet")
+    frames, trajectories = FrameStore(folder / "frames", run.render), TrajectoryStore(folder / "trajectories")
+    with runner(run.compute, folder, gl.WorkerSetup) as workers:
+        rejected: dict[str, str] | None = None
+        while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
+            rejected = known
+            Replays(run.demos, run.replay, trajectories.root, workers, run.filter).of(rows, rejected)
+            outcome = plan.select(chosen, verdicts_of(trajectories.rows(), run.filter), rejected)
+            kept = [row for row in chosen if outcome[row.episode_id].kept]
+            if len(kept) < experiment.episodes:
+                counts = Counter(row.axis for row in chosen if row.wanted) - Counter(row.axis for row in kept)
+                raise PipelineError(
+                    f"{len(kept)} of {experiment.episodes} episodes of {arm} are kept; missing are {dict(counts)}",
+                    where=experiment.data,
+                    expected="as many in all arms",
+                    remedy="raise plan.reserve there for perturbed episodes, or spare in the experiment for clean ones",
+                )
+            render_plan(chosen, run, trajectories.root, frames.root, workers)
+        _write(kept, EpisodeLoader(folder, run.render), experiment.frame_px, workers, file)
+
+
+def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tuple[list[plan.Row], list[plan.Row]]:
+    """The plan of an arm, in which each demonstration gives one episode; and the rows of it that the arm may show.
+
+    The other rows are the clean twins of demonstrations that the arm has perturbed episodes of.
+
+    Raises:
+        PipelineError: when a task has fewer demonstrations than wanted.
+    """
+    by_task: dict[str, list[DemoEntry]] = defaultdict(list)
+    for demo in demos:
+        by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
+    for task in experiment.tasks:
+        if len(by_task[task]) < experiment.demonstrations:
+            raise PipelineError(
+                f"{len(by_task[task])} demonstrations of {task}, not {experiment.demonstrations}",
+                where=experiment.run.demos.root,
+                remedy="choose another task, or lower demonstrations in the experiment",
+            )
+    wanted, rows, begin = experiment.run.plan, [], 0
+    for name in experiment.arms[arm]:
+        end = begin + wanted.episodes[name] // len(by_task)
+        axes = wanted.axes.model_copy(update=dict.fromkeys(wanted.axes.drawn().keys() - axes_of(name)))
+        config = PlanConfig(seed=wanted.seed, axes=axes, episodes={name: wanted.episodes[name]}, reserve=wanted.reserve)
+        group = [demo for task in experiment.tasks for demo in by_task[task][begin:end]]
+        rows += plan.make(group, config, experiment.run.replay, benchmark.load())
+        begin = end
+    needed = experiment.demonstrations - begin
+    clean = [
+        replace(row, wanted=row.rank < needed)
+        for task in experiment.tasks
+        for row in plan.twins(by_task[task][begin:], wanted.seed, experiment.run.replay)
+    ]
+    return rows + clean, [row for row in rows if row.role == "perturbed"] + clean
+
+
+def _write(rows: Sequence[plan.Row], load: EpisodeLoader, frame_px: int, workers: Workers, file: Path) -> None:
+    small = workers(partial(_small, load, frame_px), [row.episode_id for row in rows], "frames made small")
+    columns = {name: np.concatenate([one[name] for one in small]) for name in small[0]}
+    with replaced(file) as temporary, temporary.open("wb") as out:
+        np.savez(
+            out,
+            **columns,
+            lengths=np.array([len(one["action"]) for one in small]),
+            episodes=np.array(json.dumps([{name: getattr(row, name) for name in COLUMNS} for row in rows])),
+        )
+
+
+def _small(load: EpisodeLoader, frame_px: int, episode_id: str) -> dict[str, NDArray[Any]]:
+    """An episode's frames, states and actions."""
+    episode = load(episode_id)
+    images = {
+        view: np.stack([resized(decode(frame), frame_px, frame_px) for frame in episode.frames[view]]) for view in VIEWS
+    }
+    return {**images, "state": episode.state, "action": episode.action}
+
+
+def read(file: Path) -> Dataset:
+    """What ``make`` wrote; an arm of 200 episodes of 90 steps takes 1 GB of memory.
+
+    Raises:
+        PipelineError: when it is not there.
+    """
+    if not file.is_file():
+        raise PipelineError("the arm has no data yet", where=file, remedy="make it first: the step `data`")
+    with np.load(file) as arrays:
+        return Dataset(
+            {view: arrays[view] for view in VIEWS},
+            arrays["state"],
+            arrays["action"],
+            arrays["lengths"],
+            json.loads(str(arrays["episodes"])),
+        )

