@@ -180,7 +180,7 @@ class EpisodeEnvironment:
 
     def satisfies(self, goal: Iterable[Sequence[str]]) -> bool:
         """Whether all facts of a BDDL goal hold, such as that of another task in the same scene."""
-        return self._opened.satisfies(goal)
+        return self._simulator.satisfies(goal)
 
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
