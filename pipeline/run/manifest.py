@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.identity import VERSIONS, versions
+from pipeline.identity import DISTRIBUTION, VERSIONS, versions
 from pipeline.planning import plan
 from pipeline.run.outcome import Outcome
 from pipeline.tables import column, columns_of, read_table, write_table
@@ -159,7 +159,7 @@ def settings(path: Path) -> Settings:
 def made_with(row: Mapping[str, Any]) -> dict[str, str]:
     """Package to the version that a row was made with."""
     return {
-        column.removesuffix("_version").replace("_", "-"): version
-        for column, version in row.items()
-        if column.endswith("_version")
+        DISTRIBUTION if name == "pipeline" else name: row[column]
+        for name in VERSIONS
+        if (column := version_column(name)) in row
     }
