@@ -70,6 +70,8 @@ PACKAGES: dict[Step, tuple[str, ...]] = {
     "pictures": ("robouse",),
 }
 
+DISTRIBUTION = "perturbed-demos"
+"""This project among installed packages: on PyPI, ``pipeline`` is the name of another."""
 
 REMAKE = "REMAKE"
 """Variable of the environment that allows to make finished files anew: ``REMAKE=1 dvc repro``."""
@@ -89,7 +91,7 @@ VERSIONS = {
 @cache
 def versions() -> dict[str, str]:
     """Package name to version, for the packages of ``VERSIONS``."""
-    return {name: version(name) for name in VERSIONS}
+    return {name: version(DISTRIBUTION if name == "pipeline" else name) for name in VERSIONS}
 
 
 def made_with(step: Step) -> dict[str, str]:

@@ -37,6 +37,8 @@ if [[ $* == "-m venv "* ]]; then
     cp "$0" $3/bin/python
 elif [[ $* == *"print(*sys.version_info"* ]]; then
     echo {version}
+elif [[ $* == *libpython3.11* ]]; then
+    exit 0  # there, whatever Python these tests run on
 elif [[ $1 == -c ]]; then
     exec {executable} "$@"
 else

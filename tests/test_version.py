@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from conftest import BOWL, REPOSITORY, copy_of
 
+from pipeline.identity import DISTRIBUTION
 from pipeline.run import manifest
 
 NEXT = "1000.0.0"
@@ -35,11 +36,11 @@ for stage in ("manifest", "validate"):
 @pytest.fixture
 def updated(tmp_path: Path) -> dict[str, str]:
     """The environment of processes in which this project has the next version."""
-    installed = Path(str(metadata.distribution("pipeline")._path))  # type: ignore[attr-defined]
-    folder = tmp_path / "site" / f"pipeline-{NEXT}.dist-info"
+    installed = Path(str(metadata.distribution(DISTRIBUTION)._path))  # type: ignore[attr-defined]
+    folder = tmp_path / "site" / f"{DISTRIBUTION.replace('-', '_')}-{NEXT}.dist-info"
     shutil.copytree(installed, folder)
     text = (installed / "METADATA").read_text()
-    (folder / "METADATA").write_text(text.replace(f"Version: {metadata.version('pipeline')}", f"Version: {NEXT}", 1))
+    (folder / "METADATA").write_text(text.replace(f"Version: {metadata.version(DISTRIBUTION)}", f"Version: {NEXT}", 1))
     return {**os.environ, "PYTHONPATH": str(folder.parent)}
 
 
@@ -63,6 +64,6 @@ def test_a_finished_run_is_valid_and_regenerates_under_the_next_version(
     assert done.returncode == 0, done.stderr
     found = json.loads((tmp_path / "found.json").read_text())
     assert (found["identical"], found["reason"], found["differs"]) == (True, "kept", {})
-    assert found["versions"] == {"pipeline": {"manifest": metadata.version("pipeline"), "here": NEXT}}
+    assert found["versions"] == {"pipeline": {"manifest": metadata.version(DISTRIBUTION), "here": NEXT}}
     rebuilt = manifest.read(tmp_path / "data" / "tiny" / "manifest.parquet")
     assert {row["pipeline_version"] for row in rebuilt} == {NEXT}

@@ -77,7 +77,7 @@ def test_the_wheel_holds_every_file_of_the_library_and_nothing_else(installed: P
 
     expected = files(REPOSITORY / "pipeline") | {f"schemas/{name}" for name in files(REPOSITORY / "schemas")}
     assert files(installed / "pipeline") == expected
-    assert sorted(path.name.partition("-")[0] for path in installed.iterdir()) == ["pipeline", "pipeline"]
+    assert sorted(path.name.partition("-")[0] for path in installed.iterdir()) == ["perturbed_demos", "pipeline"]
 
 
 def test_the_wheel_brings_a_command_of_its_own_name(installed: Path) -> None:

@@ -22,6 +22,7 @@ from packaging.requirements import Requirement
 
 from pipeline.errors import PipelineError
 from pipeline.files import schema_file
+from pipeline.identity import DISTRIBUTION
 from pipeline.machine_code import SETTINGS, in_shell, machine_code
 from pipeline.seeding import digest
 
@@ -97,7 +98,7 @@ def setup() -> dict[str, str]:
     # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
-        for name in (PACKAGE, *(Requirement(line).name for line in requires(PACKAGE) or [])):
+        for name in (DISTRIBUTION, *(Requirement(line).name for line in requires(DISTRIBUTION) or [])):
             versions[name] = version(name)
     except PackageNotFoundError as error:
         versions[str(error.name)] = "not installed"

@@ -173,7 +173,12 @@ class Evaluation:
                 policy=self.policy.name(self.identity),
                 identity=self.identity,
                 settings={**self.settings.model_dump(), **wanted._asdict()},
-                versions={**self.versions(task), **_installed(("pipeline", "vla-eval")), "OpenGL": gl.choose().device},
+                versions={
+                    **self.versions(task),
+                    **_installed(("vla-eval",)),
+                    "pipeline": identity.versions()["pipeline"],
+                    "OpenGL": gl.choose().device,
+                },
             )
         )
 

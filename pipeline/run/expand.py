@@ -21,7 +21,7 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.catalogue.scene_files import portable
 from pipeline.compute.pool import Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
-from pipeline.identity import refuse_unasked
+from pipeline.identity import DISTRIBUTION, refuse_unasked
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.reference import Reference
@@ -201,7 +201,7 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
         attrs={
             hdf5.EXPANDED_FROM: row.demo_id,
             "expanded_from_sha256": row.demo_sha256,
-            "expanded_by": f"perturbed-libero {version('pipeline')}",
+            "expanded_by": f"{DISTRIBUTION} {version(DISTRIBUTION)}",
             "perturbations": row.perturbations,
             "resolved": trajectory.resolved,
             "replay_mode": trajectory.mode,

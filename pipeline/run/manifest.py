@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.identity import VERSIONS, versions
+from pipeline.identity import DISTRIBUTION, VERSIONS, versions
 from pipeline.planning import plan
 from pipeline.run.outcome import Outcome
 from pipeline.tables import column, columns_of, read_table, write_table
@@ -156,4 +156,4 @@ def settings(path: Path) -> Settings:
 
 def made_with(row: Mapping[str, Any]) -> dict[str, str]:
     """Package to the version that a row was made with."""
-    return {name: row[version_column(name)] for name in VERSIONS}
+    return {DISTRIBUTION if name == "pipeline" else name: row[version_column(name)] for name in VERSIONS}

@@ -24,6 +24,7 @@ from pipeline import gl
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
 from pipeline.config import ComputeConfig, Config, DemosConfig
 from pipeline.errors import PipelineError
+from pipeline.identity import DISTRIBUTION
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.planning import plan
@@ -126,9 +127,9 @@ def _time(config: Config) -> Diagnosis:
 def _packages() -> Iterator[Diagnosis]:
     """What pyproject.toml asks for. Both OpenCV packages own one folder: their pins keep them equal."""
     try:
-        pythons, lines = metadata("pipeline")["Requires-Python"], requires("pipeline") or []
+        pythons, lines = metadata(DISTRIBUTION)["Requires-Python"], requires(DISTRIBUTION) or []
     except PackageNotFoundError:
-        yield Diagnosis("pipeline", "fail", "not installed", REINSTALL)
+        yield Diagnosis(DISTRIBUTION, "fail", "not installed", REINSTALL)
         return
     if SpecifierSet(pythons).contains(python_version()):
         yield Diagnosis("Python", "ok", python_version())

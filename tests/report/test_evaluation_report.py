@@ -227,6 +227,7 @@ def test_policies_of_different_episodes_are_said_to_be(subset: list[EvaluationTa
     assert "The policies did not run the same episodes" in words[: words.index("Beside published models")]
 
 
+@pytest.mark.slow  # as setup.sh installs the browser for all tests only
 @pytest.mark.parametrize("width_px", [360, 1200])
 def test_a_browser_shows_it(written: Path, width_px: int) -> None:
     shown = screenshot(written, width_px, 3000)
