@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -46,12 +46,12 @@ _DRIVER = "MUJOCO_GL=osmesa, which renders in software; and report this message 
 
 
 def calls() -> Any:
-    """PyOpenGL's functions, which raise ``GLError``, and constants; the current context is one of MuJoCo's."""
-    # PyOpenGL chooses its platform when it is imported: by now, a context is there.
-    from OpenGL import GL
+    """PyOpenGL's functions and constants for the current context, which is one of MuJoCo's.
 
+    A function raises PipelineError where OpenGL reports an error of it.
+    """
     check(OTHERS)
-    return GL
+    return _functions()
 
 
 def check(call: str) -> None:
@@ -99,6 +99,37 @@ def making_context() -> Iterator[None]:
             raise _reported(ERRORS.get(code, hex(code)), "mjr_makeContext")
         logging.getLogger(__name__).warning("%s", warning)
     check("mjr_setBuffer")
+
+
+@functools.cache
+def _functions() -> Any:
+    return _Functions()
+
+
+class _Functions:
+    """What PyOpenGL has, looked up when it is first asked for, and by then a context is there: it chooses its platform
+    when it is imported."""
+
+    def __getattr__(self, name: str) -> Any:
+        from OpenGL import GL
+
+        found = getattr(GL, name)
+        if name.startswith("gl"):
+            found = _stopping(name, found)
+        setattr(self, name, found)
+        return found
+
+
+def _stopping(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    from OpenGL.error import GLError
+
+    def call(*arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except GLError as error:
+            raise _reported(ERRORS.get(error.err, str(error.err)), name) from error
+
+    return call
 
 
 def _reported(error: str, call: str) -> PipelineError:

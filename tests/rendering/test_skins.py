@@ -13,6 +13,7 @@ from arenas import both_ways
 from numpy.typing import NDArray
 
 from pipeline import gl, seeding
+from pipeline.rendering import opengl
 from pipeline.rendering.opengl import calls
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.software.faces import Faces
@@ -275,16 +276,15 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
 def test_display_lists_may_be_numbered_downwards(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mesa 22 counts on, Mesa 25 fills gaps, so that a later block may have lower numbers."""
     gl.prepare()
-    from OpenGL import GL
-
-    lowest, upwards = 0, GL.glGenLists
+    functions, lowest = opengl._functions(), 0
+    upwards = functions.glGenLists
 
     def downwards(count: int) -> int:
         nonlocal lowest
         lowest = (lowest or upwards(1000) + 1000) - count
         return lowest
 
-    monkeypatch.setattr(GL, "glGenLists", downwards)
+    monkeypatch.setattr(functions, "glGenLists", downwards)
     opened = Renderer(scene(shadows=False))
     with both_ways(opened) as (ours, plain):
         mujoco.mj_forward(opened.model, opened.data)

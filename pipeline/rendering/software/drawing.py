@@ -48,7 +48,7 @@ class SoftwareDrawing(PlainDrawing):
     """Renders models that are ``possible``.
 
     Raises:
-        PipelineError, OpenGL.error.GLError: when OpenGL does not do what is asked of it.
+        PipelineError: when OpenGL does not do what is asked of it.
     """
 
     def __init__(self, model: mujoco.MjModel):
