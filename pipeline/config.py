@@ -94,8 +94,9 @@ class PlanConfig(Frozen):
     @model_validator(mode="after")
     def _axes_match_episodes(self) -> PlanConfig:
         named, drawn = {*self.axes.drawn()}, {axis for name in self.episodes for axis in axes_of(name)}
-        if named != drawn:
-            raise ValueError(f"axes and episodes must name the same axes, got {sorted(named)} and {sorted(drawn)}")
+        for axis in sorted(named ^ drawn):
+            section, other = ("axes", "episodes") if axis in named else ("episodes", "axes")
+            raise ValueError(f"axes and episodes must name the same axes: {axis} is in {section}, but not in {other}")
         for name in self.episodes:
             self.drawn_from(name)
         return self
@@ -227,7 +228,8 @@ class Config(Frozen):
         try:
             chosen = select_tasks(demos.tasks)
         except PipelineError as error:
-            raise ValueError(f"tasks: {error.what}, expected {error.expected}") from error
+            of_file = f"{error.where}: " if error.where else ""
+            raise ValueError(f"tasks: {of_file}{error.what}, expected {error.expected}") from error
         if demos.root is None and (own := next((task for task in chosen if task.suite not in SUITES), None)):
             raise ValueError(f"the starter set has no demonstration of {own.suite}/{own.name}: set root")
         return demos

@@ -27,6 +27,8 @@ def run(config: Config) -> None:
         machine.record(config.data, machine.trial().digests)
         machine.keep_speed(config.data, machine.trial().speed)
         finished.of_doctor(config, gl.choose().device).keep()
+    elif machine.known_speed(config.data) is None:
+        machine.keep_speed(config.data, machine.trial().speed)
 
 
 if __name__ == "__main__":

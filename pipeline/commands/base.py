@@ -62,6 +62,13 @@ def positive(text: str) -> int:
     return number
 
 
+def _positive_number(text: str) -> float:
+    number = float(text)
+    if not number > 0:
+        raise argparse.ArgumentTypeError(f"{number} is not above 0")
+    return number
+
+
 def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **options: str) -> None:
     """Add an option for each of some fields of a model: with its type and its choices, and its docstring as help.
 
@@ -80,7 +87,8 @@ def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **optio
             how["choices"] = get_args(kind)
         else:
             kind = next(iter(get_args(kind)), kind)
-            how |= {"type": positive if field.metadata else kind, "metavar": option.strip("-").upper()}
+            above_0 = positive if kind is int else _positive_number
+            how |= {"type": above_0 if field.metadata else kind, "metavar": option.strip("-").upper()}
         told = f" (default: {default})" if default not in (None, "", ()) else ""
         command.add_argument(option, help=f"{field.description}{told}".replace("\n", " ").replace("``", ""), **how)
 

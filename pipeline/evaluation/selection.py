@@ -48,8 +48,9 @@ class Selection(Frozen, use_attribute_docstrings=True):
     """Which tasks to evaluate on; what is left out does not restrict."""
 
     source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
-    """of the tasks: as in ``EvaluationTask``; ``pairs`` are, for every two axes, LIBERO's task, the held-out draw of
-    either axis, and both draws together, on the same initial states"""
+    """LIBERO's tasks; LIBERO-Plus's test tasks; held-out draws of this project's axes (``own``); LIBERO's tasks asked
+    for another object of their scene (``goals``); for every two axes LIBERO's task, the held-out draw of either, and
+    both draws together, on the same initial states (``pairs``)"""
     file: Path | None = None
     """in place of a source, a list of tasks that ``analyse construct`` wrote"""
     suites: tuple[str, ...] = TESTED_SUITES

@@ -107,6 +107,10 @@ class StarterSource:
 
     def of(self, task: Task) -> Demo:
         """The task's one demonstration."""
+        if task.suite not in SUITES:
+            raise PipelineError(
+                f"the starter set has no demonstration of {task.suite}/{task.name}", expected="a LIBERO task"
+            )
         group = "libero-90" if task.suite == "libero_90" else "libero"
         name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
         folder = package_folder("robouse") / "bundled_tasks" / group / name

@@ -84,9 +84,9 @@ class LanguageModel:
         question = {"model": self.model, "messages": [{"role": "user", "content": prompt}]}
         key = os.environ.get("OPENAI_API_KEY", "").strip()
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        client, body = _client(), b""
-        deadline = time.monotonic() + self.timeout_s
+        body, deadline = b"", time.monotonic() + self.timeout_s
         try:
+            client = _client()
             # Follows no redirect, which would show the key to whoever it leads to.
             with client.stream("POST", self._url, json=question, headers=headers, timeout=self.timeout_s) as response:
                 for piece in response.iter_bytes():
@@ -96,6 +96,10 @@ class LanguageModel:
                     # The timeout is for each piece.
                     if time.monotonic() > deadline:
                         raise TimeoutError(f"no whole answer within {self.timeout_s:g} s")
+        except (httpx.InvalidURL, ImportError, ValueError) as error:  # the last two are of a proxy in the environment
+            raise PipelineError(
+                f"cannot ask ({error})", where=self._url, expected="an http or https address"
+            ) from error
         except (OSError, httpx.HTTPError) as error:
             raise _BusyError(str(error) or type(error).__name__) from error
         if response.is_success:

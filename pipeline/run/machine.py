@@ -26,7 +26,7 @@ from pipeline.libero.tasks import find_task
 FILE = "machine.json"
 """File of a run's folder that says what it began with, and what trials came to."""
 
-SPEED = ".work/speed.json"
+SPEED = ".finished/speed.json"
 """File of a run's folder that says how fast the machine was, by which ``status`` knows the time that is left."""
 
 STORES = {"ten steps": ("trajectories", "frames"), "one frame": ("frames",)}
@@ -74,11 +74,11 @@ def trial() -> Trial:
     renderer = Renderer(trajectory.model_xml)
     renderer.restore(trajectory.states[-1], trajectory.site_alpha[-1])
     frame = renderer.frame("agentview")
+    renderer.close()
     plain = Renderer(renderer.model, PlainDrawing(renderer.model))
     plain.restore(trajectory.states[-1], trajectory.site_alpha[-1])
     frame_s = _seconds(lambda: plain.frame("agentview"), on_gpu=not gl.choose().software)
     plain.close()
-    renderer.close()
     digests = {
         "OpenGL device": gl.choose().device,
         "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],

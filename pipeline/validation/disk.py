@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.axes import AXES, PhysicsPerturbation, RenderPerturbation, axes_of
 from pipeline.config import Config, DemosConfig, PlanConfig
 from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.types import Extra, Task
@@ -98,13 +99,24 @@ def _own(plan: PlanConfig) -> _Own:
 
 
 def lengths(demos: DemosConfig) -> dict[Task, list[int]]:
-    """Steps of each demonstration, by task; where LIBERO's file is not there yet, as the starter set's one."""
+    """Steps of each demonstration, by task; where no file is there yet, those of LIBERO's as long as the starter's.
+
+    Raises:
+        PipelineError: when only own tasks are asked for, and none has a demonstration.
+    """
     starter = StarterSource()
     if demos.root is None:
         return {entry.task: [entry.steps] for entry in starter.index(select_tasks(demos.tasks)).entries}
-    source, found = HDF5Source(demos.root), {}
-    for task in select_tasks(demos.tasks):
-        found[task] = source.lengths(task)[: demos.per_task]
-        if not found[task] and task.suite in SUITES:
-            found[task] = [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED)
+    source = HDF5Source(demos.root)
+    found = {task: source.lengths(task)[: demos.per_task] for task in select_tasks(demos.tasks)}
+    if not any(found.values()):
+        of_libero = [task for task in found if task.suite in SUITES]
+        found = {task: [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED) for task in of_libero}
+    if not any(found.values()):
+        raise PipelineError(
+            "none of your own tasks has a demonstration",
+            where=demos.root,
+            expected="<suite>/<task>_demo.hdf5 there",
+            remedy="see `python -m pipeline demos check`",
+        )
     return {task: steps for task, steps in found.items() if steps}

@@ -210,9 +210,10 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     """Whether each task has a file that opens, with as many demonstrations as are asked for."""
     source = HDF5Source(root)
     counts = {f"{task.suite}/{task.name}": len(source.lengths(task)) for task in select_tasks(demos.tasks)}
-    remedy = "set demos.root to the folder that holds the suites, or use the starter set"
+    remedy = "set demos.root to the folder that holds the suites and demos.tasks to the tasks that it has"
     if not any(counts.values()):
-        return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 under {root} has any", remedy)
+        wanted_tasks = ", ".join(demos.tasks)
+        return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 of {wanted_tasks} under {root} has any", remedy)
     wanted = demos.per_task or 1
     detail = f"{sum(counts.values())} in {len(counts)} tasks under {root}"
     if few := [name for name, count in counts.items() if count < wanted]:

@@ -223,12 +223,14 @@ def _stored(clone: Path) -> Iterator[Path]:
 
 
 def contents(clone: Path) -> dict[str, str]:
-    """Every file of a clone, but for DVC's own records."""
+    """Every file of a clone, but for DVC's own records and the machine's speed."""
     files = (file for file in clone.rglob("*") if file.is_file() and not file.is_symlink())
     return {
         path: hashlib.sha256(file.read_bytes()).hexdigest()
         for file in files
-        if not (path := file.relative_to(clone).as_posix()).startswith((".dvc/", ".git/")) and "__pycache__" not in path
+        if not (path := file.relative_to(clone).as_posix()).startswith((".dvc/", ".git/"))
+        and "__pycache__" not in path
+        and file.name != "speed.json"
     }
 
 

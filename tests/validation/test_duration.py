@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
+from pathlib import Path
+
 import pytest
-from conftest import REPOSITORY
+from conftest import BOWL, REPOSITORY
 
 from pipeline.config import Config, load
+from pipeline.errors import PipelineError
 from pipeline.run.machine import Speed
 from pipeline.validation.duration import REFERENCE, in_words, needed_s
 
@@ -38,6 +42,18 @@ def test_it_follows_the_machine() -> None:
     assert gpu["render"] < 0.15 * here["render"], "what is left of a frame is its JPEG"
     assert {stage: gpu[stage] == here[stage] for stage in here} == {stage: stage != "render" for stage in here}
     assert slow["replay"] == pytest.approx(2 * here["replay"])
+
+
+def test_own_tasks_without_demonstrations_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    own = tmp_path / "tasks" / "mine"
+    own.mkdir(parents=True)
+    shutil.copy(BOWL.bddl_file, own / "bowl.bddl")
+    config = Config.model_validate(
+        {"name": "estimate", "demos": {"root": "demos", "tasks": ["mine/*"]}, "plan": {"episodes": {"camera": 1}}}
+    )
+    with pytest.raises(PipelineError, match="none of your own tasks has a demonstration"):
+        needed_s(config, REFERENCE)
 
 
 def test_it_is_told_by_worker() -> None:
