@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def status(arguments: argparse.Namespace) -> None:
-    """say how many episodes are wanted and kept, what would run and why, disk and time that it takes; changes nothing"""
+    """say how many episodes are wanted and kept, what would run and why, its disk and time; changes nothing"""
     from rich.console import Console
 
     from pipeline.validation import status
