@@ -14,6 +14,9 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
+
+# isort: split
 import h5py
 import numpy as np
 from pythons import contents

@@ -36,7 +36,7 @@ from pipeline.types import Floats
 def analyse(*arguments: str) -> int:
     """Run the command ``analyse``; its exit code."""
     parsed = parser().parse_args(["analyse", *arguments])
-    return int(parsed.run(parsed))
+    return int(parsed.run(parsed) or 0)
 
 
 def some_pairs(**fields: Any) -> list[EvaluationTask]:
