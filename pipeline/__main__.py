@@ -51,7 +51,9 @@ def main() -> int:
     def run() -> int:
         arguments = parser().parse_args()
         try:
-            return int(arguments.run(arguments) or 0)
+            status = int(arguments.run(arguments) or 0)
+            sys.stdout.flush()  # here, where a reader that is gone can be told, rather than when Python ends
+            return status
         except BrokenPipeError:
             # Who reads the output, such as `head`, has enough. Nothing must be written to it when Python ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

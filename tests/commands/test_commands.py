@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -81,10 +82,15 @@ def test_a_run_that_nothing_names_is_asked_for(
     assert "try: name one, such as configs/starter.yaml" in told
 
 
-def test_a_reader_that_has_enough_is_no_error() -> None:
-    command = f"{sys.executable} -m pipeline tasks | head -n 1"
-    done = subprocess.run(["bash", "-c", command], cwd=REPOSITORY, capture_output=True, text=True, check=False)
-    assert (done.stdout.count("\n"), done.stderr) == (1, "")
+@pytest.mark.parametrize(("pattern", "reader", "lines"), [("*", "head -n 1", 1), ("libero_goal/*", "true", 0)])
+def test_a_reader_that_has_enough_is_no_error(pattern: str, reader: str, lines: int) -> None:
+    """Also one that is gone before the little that there is to say was written, which Python keeps until it ends."""
+    piped = f"{sys.executable} -m pipeline tasks '{pattern}' | {reader}"
+    buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    done = subprocess.run(
+        ["bash", "-c", piped], cwd=REPOSITORY, env=buffered, capture_output=True, text=True, check=False
+    )
+    assert (done.stdout.count("\n"), done.stderr) == (lines, "")
 
 
 def test_run_refuses_what_dvc_would_not_find(tmp_path: Path) -> None:
