@@ -25,9 +25,8 @@ def run(config: Config) -> None:
         )
     if not tried:
         machine.record(config.data, machine.trial().digests)
-        machine.keep_speed(config.data, machine.trial().speed)
         finished.of_doctor(config, gl.choose().device).keep()
-    elif machine.known_speed(config.data) is None:
+    if not tried or machine.known_speed(config.data) is None:
         machine.keep_speed(config.data, machine.trial().speed)
 
 

@@ -22,11 +22,12 @@ from pipeline.files import read_json, write_json
 from pipeline.identity import fingerprint, made_with
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
+from pipeline.run.finished import FOLDER
 
 FILE = "machine.json"
 """File of a run's folder that says what it began with, and what trials came to."""
 
-SPEED = ".finished/speed.json"
+SPEED = f"{FOLDER}/speed.json"
 """File of a run's folder that says how fast the machine was, by which ``status`` knows the time that is left."""
 
 STORES = {"ten steps": ("trajectories", "frames"), "one frame": ("frames",)}

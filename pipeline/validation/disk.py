@@ -7,6 +7,7 @@ The sizes are rounded up from four runs of one demonstration of 90 steps (``benc
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,11 +47,9 @@ def needed_mb(config: Config) -> dict[str, float]:
 
     Every planned episode counts as kept, and so does the clean twin of every demonstration.
     """
-    tasks, views, extras = list(lengths(config.demos).values()), len(SCHEMA.views), config.render.extras
-    twins, planned = sum(map(len, tasks)), sum(config.plan.episodes.values())
-    mean_steps = float(np.mean([np.mean(task) for task in tasks]))
-    twin_steps = sum(map(sum, tasks))
-    steps, episodes = twin_steps + planned * mean_steps, twins + planned
+    amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
+    twins, planned, twin_steps, mean_steps = amounts
+    steps, episodes = amounts.steps, twins + planned
     own = _own(config.plan)
     frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
     map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
@@ -76,6 +75,27 @@ def free_gb(folder: Path) -> float:
     """What is free where a folder is, or would be made."""
     there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
     return shutil.disk_usage(there).free / 1e9
+
+
+class Amounts(NamedTuple):
+    """How many twins and planned episodes a run has, the steps of all twins, and those of a planned episode: the mean,
+    as episodes are spread evenly over the tasks."""
+
+    twins: int
+    planned: int
+    twin_steps: int
+    mean_steps: float
+
+    @classmethod
+    def of(cls, tasks: Mapping[Task, list[int]], plan: PlanConfig) -> Amounts:
+        """By the steps of each demonstration of each task (see ``lengths``)."""
+        found = list(tasks.values())
+        mean_steps = float(np.mean([np.mean(task) for task in found]))
+        return cls(sum(map(len, found)), sum(plan.episodes.values()), sum(map(sum, found)), mean_steps)
+
+    @property
+    def steps(self) -> float:
+        return self.twin_steps + self.planned * self.mean_steps
 
 
 class _Own(NamedTuple):

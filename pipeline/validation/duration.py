@@ -18,7 +18,7 @@ from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.run.machine import Speed
 from pipeline.types import Task
-from pipeline.validation.disk import lengths
+from pipeline.validation.disk import Amounts, lengths
 
 REFERENCE = Speed(step_s=0.0033, frame_s=0.093)
 """Of the machine of the figures below, by ``machine.trial``: one step again and again, and a frame without savings."""
@@ -53,27 +53,24 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
         config: of the run.
         speed: of the machine.
     """
-    tasks, plan = lengths(config.demos), config.plan
-    frame_s = _frame_s(tasks, speed)
-    twin_steps = sum(map(sum, tasks.values()))
-    mean_steps = twin_steps / sum(map(len, tasks.values()))
-    trajectories, frames_s = sum(map(len, tasks.values())), twin_steps * sum(view_s + ENCODE_S for view_s in frame_s)
-    for name, episodes in plan.episodes.items():
+    tasks = lengths(config.demos)
+    amounts, frame_s = Amounts.of(tasks, config.plan), _frame_s(tasks, speed)
+    trajectories, frames_s = amounts.twins, amounts.twin_steps * sum(view_s + ENCODE_S for view_s in frame_s)
+    for name, episodes in config.plan.episodes.items():
         kinds = [AXES[axis].draws[0] for axis in axes_of(name)]
         trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         for view, view_s in zip(SCHEMA.views, frame_s, strict=True):
             here = [kind for kind in kinds if view in kind.views]
             rendered = any(issubclass(kind, PhysicsPerturbation | RenderPerturbation) for kind in here)
             shadows_s = SHADOWS_S * SHADOWS * ("light" in axes_of(name)) * speed.frame_s / REFERENCE.frame_s
-            frames_s += episodes * mean_steps * (rendered * (view_s + shadows_s) + ENCODE_S * bool(here))
-    steps = twin_steps + sum(plan.episodes.values()) * mean_steps
+            frames_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + ENCODE_S * bool(here))
     processor = speed.step_s / REFERENCE.step_s
     formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
     return {
-        "replay": processor * trajectories * (SCENE_S + TRIES * mean_steps * STEP_S),
+        "replay": processor * trajectories * (SCENE_S + TRIES * amounts.mean_steps * STEP_S),
         "render": frames_s,
-        "export": processor * steps * sum(formats[name] for name in config.export.formats),
-        "validate": processor * steps * VALIDATE_S * len(config.export.formats),
+        "export": processor * amounts.steps * sum(formats[name] for name in config.export.formats),
+        "validate": processor * amounts.steps * VALIDATE_S * len(config.export.formats),
         "rest": processor * FIXED_S,
     }
 
@@ -93,13 +90,9 @@ def workers_of(compute: ComputeConfig) -> int:
 
 
 def _time(seconds: float) -> str:
-    return (
-        f"{seconds / 3600:.1f} h"
-        if seconds >= 5400
-        else f"{seconds / 60:.0f} min"
-        if seconds >= 90
-        else f"{seconds:.0f} s"
-    )
+    if seconds >= 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
 
 
 def _frame_s(tasks: Mapping[Task, list[int]], speed: Speed) -> list[float]:
