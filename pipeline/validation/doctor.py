@@ -90,7 +90,7 @@ def run(config: Config, *, tried: bool = False) -> int:
     # What is made already needs no more room, but for LeRobot's second copy while it is merged.
     findings = check(config, max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3))
     if all(finding.status != "fail" for finding in findings):
-        findings += [*([] if tried else [_same(config.data)]), _finished(config), _time(config)]
+        findings += [*([] if tried else [_same(config.data)]), _finished(config), _time(config, tried)]
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
@@ -118,9 +118,9 @@ def _finished(config: Config) -> Diagnosis:
     return Diagnosis("finished work", "warn", f"outdated: {told}", "go on where it was made, or `REMAKE=1 dvc repro`")
 
 
-def _time(config: Config) -> Diagnosis:
-    """Of the whole run, by the speed that the run's folder has or a trial finds."""
-    speed = machine.known_speed(config.data) or machine.trial().speed
+def _time(config: Config, tried: bool) -> Diagnosis:
+    """Of the whole run, by the speed that a trial finds, or found on this machine as it is."""
+    speed = (machine.known_speed(config.data) if tried else None) or machine.trial().speed
     return Diagnosis("time", "ok", in_words(needed_s(config, speed), workers_of(config.compute)))
 
 
