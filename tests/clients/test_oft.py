@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from pipeline import seeding
-from pipeline.clients import oft, oft_check
+from pipeline.clients import oft
 from pipeline.compute.pool import loop
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
@@ -130,7 +130,7 @@ def test_normalising_clips_at_the_percentiles_and_flattens_constants() -> None:
 
 
 def test_check_finds_nothing_wrong(data: Path) -> None:
-    found = oft_check.check_run(data)[NAME]
+    found = oft.check_run(data)[NAME]
     assert found.pop("clipped_share") < 0.1
     assert found == {
         "episodes": 3,
@@ -173,7 +173,7 @@ FAULTS: dict[str, Callable[[Episode], Episode]] = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_check_catches_a_bad_episode(fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rlds_write, "check", lambda *_: None)
-    found = oft_check.check_run(write(tmp_path, partial(spoilt, FAULTS[fault])))[NAME]
+    found = oft.check_run(write(tmp_path, partial(spoilt, FAULTS[fault])))[NAME]
     assert found["violations"][0].startswith(fault)
     assert (found["episodes"], found["passed_by"]) == (3, 1)
 
@@ -184,7 +184,7 @@ def turned(name: str) -> Episode:
 
 
 def test_check_catches_a_gripper_of_the_wrong_sign(tmp_path: Path) -> None:
-    (violation,) = oft_check.check_run(write(tmp_path, turned))[NAME]["violations"]
+    (violation,) = oft.check_run(write(tmp_path, turned))[NAME]["violations"]
     assert "the command's sign is wrong" in violation
 
 
@@ -192,10 +192,10 @@ def test_check_catches_statistics_of_something_else(data: Path, statistics: dict
     (folder,) = oft.datasets(data / "rlds")
     off = json.loads(json.dumps(statistics))
     off["proprio"]["q99"][3] += 1e-6
-    found = oft_check.check(folder, {NAME: off})
+    found = oft.check(folder, {NAME: off})
     assert found["statistics_difference"] == pytest.approx(1e-6)
     assert len(found["violations"]) == 1
-    assert oft_check.check(folder, {NAME: statistics | {"num_trajectories": 4}})["statistics_difference"] == 1
+    assert oft.check(folder, {NAME: statistics | {"num_trajectories": 4}})["statistics_difference"] == 1
 
 
 def test_damage_is_found(data: Path, tmp_path: Path) -> None:
@@ -211,10 +211,10 @@ def test_damage_is_found(data: Path, tmp_path: Path) -> None:
 
 def test_errors_say_what_is_missing(data: Path, tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="no RLDS dataset"):
-        oft_check.check_run(tmp_path)
+        oft.check_run(tmp_path)
     (tmp_path / "rlds").symlink_to(data / "rlds")
     with pytest.raises(PipelineError, match=r"dataset_statistics\.json: not there"):
-        oft_check.check_run(tmp_path)
+        oft.check_run(tmp_path)
     (tmp_path / "dataset_statistics.json").write_text("{}")
-    (found,) = oft_check.check_run(tmp_path).values()
+    (found,) = oft.check_run(tmp_path).values()
     assert found["violations"] == ["dataset_statistics.json has nothing on it"]

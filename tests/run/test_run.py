@@ -24,7 +24,7 @@ from synthetic import records
 
 from pipeline.axes import from_json
 from pipeline.axes.language import BANK_FILE
-from pipeline.clients import oft_check
+from pipeline.clients import oft
 from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import LeRobotConfig
@@ -180,7 +180,7 @@ def test_statistics_and_sheets(finished: Path, rows: list[dict[str, Any]]) -> No
 
 
 def test_openvla_oft_would_train_on_all_of_it(finished: Path, rows: list[dict[str, Any]]) -> None:
-    found = oft_check.check_run(finished)
+    found = oft.check_run(finished)
     assert [dataset["violations"] for dataset in found.values()] == [[], []]
     kept = [row for row in rows if row["kept"]]
     assert sum(dataset["chunks"] for dataset in found.values()) == sum(row["steps"] - 7 for row in kept)
