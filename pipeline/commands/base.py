@@ -17,34 +17,45 @@ if TYPE_CHECKING:
 
 PARAMS = Path("params.yaml")
 
-Fill = Callable[[argparse.ArgumentParser], None]
+Fill = Callable[[argparse.ArgumentParser], object]
 
 
 class LazyParser(argparse.ArgumentParser):
     """Gets its arguments when it is first asked to parse, as what they may be can take long to import."""
 
     summary: str = ""
-    fill: Fill | None = None
+    fills: tuple[Fill, ...] = ()
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        fill, self.fill = self.fill, None
-        if fill is not None:
+        fills, self.fills = self.fills, ()
+        for fill in fills:
             fill(self)
         return super().parse_known_args(args, namespace)
 
 
-def add(commands: Any, run: Callable[[argparse.Namespace], int | None], fill: Fill) -> None:
+def argument(*names: str, **how: Any) -> Fill:
+    """An argument of a command, as ``add_argument`` takes it."""
+    return lambda command: command.add_argument(*names, **how)
+
+
+def value(name: str, metavar: str, told: str, kind: Callable[[str], object] = Path, **how: Any) -> Fill:
+    """An argument that has a value, by default a path; ``told`` is its help."""
+    return argument(name, metavar=metavar, help=told, type=kind, **how)
+
+
+def add(commands: Any, run: Callable[[argparse.Namespace], int | None], *fills: Fill) -> None:
     """Add a command of a function's name, whose docstring says what it does, in its first line and in more.
 
     Args:
         run: does it; returns the exit status, or nothing for 0.
+        fills: add its arguments, once they are needed.
     """
     described, _, details = (inspect.getdoc(run) or "").partition("\n\n")
     description = f"{described[:1].upper()}{described[1:]}.\n\n{details}".strip()
     formatter = argparse.RawDescriptionHelpFormatter
     command = commands.add_parser(run.__name__, help=described, description=description, formatter_class=formatter)
     command.set_defaults(run=run)
-    command.summary, command.fill = described, fill
+    command.summary, command.fills = described, fills
 
 
 def add_group(commands: Any, name: str, summary: str) -> Any:
@@ -93,15 +104,9 @@ def add_fields(command: argparse.ArgumentParser, model: type[BaseModel], **optio
         command.add_argument(option, help=f"{field.description}{told}".replace("\n", " ").replace("``", ""), **how)
 
 
-def add_config(command: argparse.ArgumentParser) -> None:
-    """The run that a command is about, its last argument."""
-    command.add_argument(
-        "config",
-        type=Path,
-        nargs="?",
-        metavar="CONFIG",
-        help="file of the run's configuration, such as configs/starter.yaml (default: the one that params.yaml names)",
-    )
+_CONFIG = "file of the run's configuration, such as configs/starter.yaml (default: the one that params.yaml names)"
+add_config = value("config", "CONFIG", _CONFIG, nargs="?")
+"""The run that a command is about, its last argument."""
 
 
 def config_file(arguments: argparse.Namespace) -> Path:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.commands.base import add, add_config, loaded, positive
+from pipeline.commands.base import add, add_config, loaded, positive, value
 
 TITLE = "before a run"
 
@@ -17,11 +17,20 @@ EVERY = "all"
 
 def add_commands(commands: Any) -> None:
     add(commands, doctor, add_config)
-    add(commands, axes, lambda command: None)
-    add(commands, tasks, _tasks_arguments)
-    add(commands, preview, _preview_arguments)
+    add(commands, axes)
+    add(commands, tasks, value("patterns", "PATTERN", "as in demos.tasks, such as 'libero_goal/*'", str, nargs="*"))
+    shown = value("--out", "FILE", "picture to write (default: sheet.png)", default=Path("sheet.png"))
+    add(commands, preview, _preview_arguments, add_config, shown)
     add(commands, sources, add_config)
-    add(commands, rewrite, _rewrite_arguments)
+    add(
+        commands,
+        rewrite,
+        value("bddl_file", "BDDL_FILE", "the task, <suite>/<task>.bddl"),
+        value("--out", "OUT", "bank to extend or to begin, such as bank.yaml", required=True),
+        value("--per-class", "N", "rewrites of each class wanted (default: 9)", positive, default=9),
+        value("--endpoint", "URL", "where /chat/completions is: http://localhost:8000/v1", str, required=True),
+        value("--model", "NAME", "name of the model at the endpoint", str, required=True),
+    )
 
 
 def doctor(arguments: argparse.Namespace) -> int:
@@ -47,17 +56,11 @@ def axes(arguments: argparse.Namespace) -> None:
     print("Ranges and levels: docs/configuration.md and docs/axes.md. `preview TASK AXIS` shows what an axis does.")
 
 
-def _tasks_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "patterns", nargs="*", default=["*"], metavar="PATTERN", help="as in demos.tasks, such as 'libero_goal/*'"
-    )
-
-
 def tasks(arguments: argparse.Namespace) -> None:
     """list LIBERO's tasks, as demos.tasks names them, with their instructions"""
     from pipeline.libero.tasks import select_tasks
 
-    for task in select_tasks(arguments.patterns):
+    for task in select_tasks(arguments.patterns or ["*"]):
         print(f"{task.suite}/{task.name}\t{task.instruction}")
 
 
@@ -67,8 +70,6 @@ def _preview_arguments(command: argparse.ArgumentParser) -> None:
     axes = (*AXES, EVERY)
     command.add_argument("task", metavar="TASK", help="a pattern of <suite>/<task>, such as 'libero_goal/turn_on*'")
     command.add_argument("axis", choices=axes, metavar="AXIS", help=f"any of {', '.join(axes)}")
-    add_config(command)
-    command.add_argument("--out", type=Path, default=Path("sheet.png"), help="picture to write (default: sheet.png)")
 
 
 def preview(arguments: argparse.Namespace) -> None:
@@ -107,21 +108,6 @@ def sources(arguments: argparse.Namespace) -> None:
     drawn = loaded(arguments).plan.axes.drawn()
     offered = [(drawn.get(name) or axis()).offered() for name, axis in AXES.items()]
     print(json.dumps({kind: number for of_axis in offered for kind, number in of_axis.items()}))
-
-
-def _rewrite_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("bddl_file", type=Path, metavar="BDDL_FILE", help="the task, <suite>/<task>.bddl")
-    command.add_argument("--out", type=Path, required=True, help="bank to extend or to begin, such as bank.yaml")
-    command.add_argument(
-        "--per-class", type=positive, default=9, metavar="N", help="rewrites of each class wanted (default: 9)"
-    )
-    command.add_argument(
-        "--endpoint",
-        required=True,
-        metavar="URL",
-        help="what /chat/completions is appended to: http://localhost:8000/v1",
-    )
-    command.add_argument("--model", required=True, metavar="NAME", help="name of the model at the endpoint")
 
 
 def rewrite(arguments: argparse.Namespace) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
-from pipeline.commands.base import add, add_group, positive
+from pipeline.commands.base import add, add_group, argument, positive, value
 
 TITLE = "get demonstrations"
 
@@ -17,17 +16,36 @@ def add_commands(commands: Any) -> None:
     verbs = add_group(
         commands, "demos", "fetch, expand, check: get LIBERO's, make more from few, look at a folder of them"
     )
-    add(verbs, fetch, _fetch_arguments)
-    add(verbs, expand, _expand_arguments)
-    add(verbs, check, _check_arguments)
+    out = value("out", "DIR", "folder to use as demos.root afterwards")
+    add(verbs, fetch, out, _suites, value("--endpoint", "URL", "address of a mirror of the hub", str))
+    add(
+        verbs,
+        expand,
+        out,
+        value("--per-task", "N", "demonstrations of each task (default: 10)", positive, default=10),
+        value("--tasks", "PATTERN", "patterns of <suite>/<task> (default: the four suites)", str, nargs="+"),
+        argument(
+            "--starts",
+            choices=("wide", "reset"),
+            default="wide",
+            help="wide: arm and target further away than in LIBERO's own (default); reset: each start is a reset of "
+            "LIBERO's environment",
+        ),
+        argument("--seed", type=int, default=0, help="of every draw (default: 0)"),
+    )
+    replays = "so many demonstrations of each file are replayed (default: 2; 0 for none)"
+    add(
+        verbs,
+        check,
+        value("folder", "DIR", "folder with <suite>/<task>_demo.hdf5"),
+        value("--replay", "N", replays, int, default=2),
+    )
 
 
-def _fetch_arguments(command: argparse.ArgumentParser) -> None:
+def _suites(command: argparse.ArgumentParser) -> None:
     from pipeline.libero.tasks import SUITES
 
-    command.add_argument("out", type=Path, metavar="DIR", help="folder to use as demos.root afterwards")
     command.add_argument("suites", nargs="+", choices=SUITES, metavar="SUITE", help=f"any of {', '.join(SUITES)}")
-    command.add_argument("--endpoint", metavar="URL", help="address of a mirror of the hub")
 
 
 def fetch(arguments: argparse.Namespace) -> None:
@@ -36,30 +54,6 @@ def fetch(arguments: argparse.Namespace) -> None:
 
     files = fetch(arguments.out, arguments.suites, arguments.endpoint)
     print(f"{len(files)} files are in {arguments.out}: write `demos: {{root: {arguments.out}}}` into a configuration")
-
-
-def _expand_arguments(command: argparse.ArgumentParser) -> None:
-    from pipeline.config import DemosConfig
-
-    command.add_argument("out", type=Path, metavar="DIR", help="folder to use as demos.root afterwards")
-    command.add_argument(
-        "--per-task", type=positive, default=10, metavar="N", help="demonstrations of each task (default: 10)"
-    )
-    command.add_argument(
-        "--tasks",
-        nargs="+",
-        default=DemosConfig().tasks,
-        metavar="PATTERN",
-        help="patterns of <suite>/<task> (default: the four suites)",
-    )
-    command.add_argument(
-        "--starts",
-        choices=("wide", "reset"),
-        default="wide",
-        help="wide: arm and target further away than in LIBERO's own (default); reset: each start is a reset of "
-        "LIBERO's environment",
-    )
-    command.add_argument("--seed", type=int, default=0, help="of every draw (default: 0)")
 
 
 def expand(arguments: argparse.Namespace) -> None:
@@ -74,7 +68,7 @@ def expand(arguments: argparse.Namespace) -> None:
     from pipeline.run.expand import candidates, expand, resets
     from pipeline.testset import benchmark
 
-    demos = DemosConfig(tasks=tuple(arguments.tasks))
+    demos = DemosConfig(tasks=tuple(arguments.tasks)) if arguments.tasks else DemosConfig()
     if arguments.starts == "reset":
         rows = resets(demos, arguments.per_task, arguments.seed)
     else:
@@ -86,17 +80,6 @@ def expand(arguments: argparse.Namespace) -> None:
         "configuration"
     )
     print(json.dumps({"written": made.written, "dropped": dict(made.dropped.most_common()), "short": made.short}))
-
-
-def _check_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folder", type=Path, metavar="DIR", help="folder with <suite>/<task>_demo.hdf5")
-    command.add_argument(
-        "--replay",
-        type=int,
-        default=2,
-        metavar="N",
-        help="so many demonstrations of each file are replayed (default: 2; 0 for none)",
-    )
 
 
 def check(arguments: argparse.Namespace) -> int:

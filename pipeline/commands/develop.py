@@ -14,7 +14,7 @@ SCHEMAS = Path(__file__).parents[2] / "schemas"
 
 
 def add_commands(commands: Any) -> None:
-    add(commands, schema, lambda command: None)
+    add(commands, schema)
 
 
 def schemas() -> dict[str, dict[str, Any]]:

@@ -7,11 +7,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-from pipeline.commands.base import add, add_config, add_fields, add_group, owned, plan_of, positive
+from pipeline.commands.base import add, add_config, add_fields, add_group, argument, owned, plan_of, positive, value
 from pipeline.errors import PipelineError
 from pipeline.files import write_json
 
 TITLE = "evaluate policies"
+REPORT = Path("report.html")
 
 
 def add_commands(commands: Any) -> None:
@@ -19,12 +20,34 @@ def add_commands(commands: Any) -> None:
     kinds = add_group(
         commands, "analyse", "report, coverage, gap, construct, grade, leakage: what results and runs show"
     )
-    add(kinds, report, _report_arguments)
+    results = value("results", "DIR", "folder of the results")
+    add(
+        kinds,
+        report,
+        value("folders", "DIR", "folder of results", nargs="+"),
+        argument(
+            "--across",
+            nargs="+",
+            choices=("prompt", "step_limit"),
+            default=(),
+            help="compare results that differ in this, which is refused otherwise",
+        ),
+        value("--out", "FILE", f"page to write, with a JSON file beside it (default: {REPORT})", default=REPORT),
+    )
     add(kinds, coverage, add_config)
-    add(kinds, gap, _gap_arguments)
-    add(kinds, construct, _construct_arguments)
-    add(kinds, grade, _grade_arguments)
-    add(kinds, leakage, _leakage_arguments)
+    add(kinds, gap, results)
+    add(
+        kinds,
+        construct,
+        value("--out", "FILE", "list of tasks to write", required=True),
+        value("--size", "N", "tasks of the benchmark (default: 10,000)", int),
+        value("--results", "DIR", "results of candidates", nargs="+", default=()),
+        value("--trained-on", "CONFIG", "leave out what overlaps with the plan of this run", plan_of, dest="plan"),
+        argument("--seed", type=int, default=0, help="of all draws (default: 0)"),
+    )
+    graded = value("--out", "FILE", "list of tasks with their difficulty", required=True)
+    add(kinds, grade, value("results", "DIR", "results of one model each", nargs="+"), graded)
+    add(kinds, leakage, results, add_config)
 
 
 def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
@@ -48,21 +71,14 @@ def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
     named = {"suites": "--suite", "axes": "--axis", "components": "--component", "levels": "--level", "tasks": "--task"}
     add_fields(command, Selection, source="--source", file="--tasks-from", **named, subset="--subset")
     add_fields(command, Selection, episodes="--episodes", seed="--seed")
-    command.add_argument(
-        "--trained-on",
-        dest="plan",
-        type=plan_of,
-        metavar="CONFIG",
-        help="draw held-out draws anew that overlap with the plan of this run, whose data the policy was trained on",
-    )
+    anew = "draw held-out draws anew that overlap with the plan of this run, whose data the policy was trained on"
+    value("--trained-on", "CONFIG", anew, plan_of, dest="plan")(command)
     add_fields(command, EpisodeSettings, prompt="--prompt", step_limits="--step-limits", black="--black")
     add_fields(command, EpisodeSettings, initial_states="--initial-states", look_every="--look-every")
     add_fields(command, PolicyConfig, label="--label", timeout_s="--timeout")
-    command.add_argument(
-        "--assets", dest="archive", type=Path, metavar="DIR", help="folder of LIBERO-Plus's unpacked asset archive"
-    )
+    value("--assets", "DIR", "folder of LIBERO-Plus's unpacked asset archive", dest="archive")(command)
     command.add_argument("--videos", choices=("none", "failures", "all"), help="which episodes to film (default: none)")
-    command.add_argument("--workers", type=positive, default=0, metavar="N", help="processes (default: one a core)")
+    value("--workers", "N", "processes (default: one a core)", positive, default=0)(command)
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
@@ -94,24 +110,6 @@ def evaluate(arguments: argparse.Namespace) -> None:
     with runner(compute, arguments.out, gl.WorkerSetup) as run:
         found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
-
-
-def _report_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("folders", type=Path, nargs="+", metavar="DIR", help="folder of results")
-    command.add_argument(
-        "--across",
-        nargs="+",
-        choices=("prompt", "step_limit"),
-        default=(),
-        help="compare results that differ in this, which is refused otherwise",
-    )
-    command.add_argument(
-        "--out",
-        type=Path,
-        default=Path("report.html"),
-        metavar="FILE",
-        help="page to write, with a JSON file of the same name beside it (default: report.html)",
-    )
 
 
 def report(arguments: argparse.Namespace) -> None:
@@ -148,10 +146,6 @@ def coverage(arguments: argparse.Namespace) -> None:
     print(json.dumps({f"{one.axis}: {one.what}": {"tests": one.tested, "run": one.ours} for one in measures}))
 
 
-def _gap_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
-
-
 def gap(arguments: argparse.Namespace) -> None:
     """compositional gap of the pairs that were run with --source pairs: gap.json and gap.png in their folder"""
     from pipeline.evaluation import composition
@@ -164,20 +158,6 @@ def gap(arguments: argparse.Namespace) -> None:
     print(json.dumps(figures))
 
 
-def _construct_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks to write")
-    command.add_argument("--size", type=int, metavar="N", help="tasks of the benchmark (default: 10,000)")
-    command.add_argument("--results", type=Path, nargs="+", default=(), metavar="DIR", help="results of candidates")
-    command.add_argument(
-        "--trained-on",
-        dest="plan",
-        type=plan_of,
-        metavar="CONFIG",
-        help="leave out what overlaps with the plan of this run",
-    )
-    command.add_argument("--seed", type=int, default=0, help="of all draws (default: 0)")
-
-
 def construct(arguments: argparse.Namespace) -> None:
     """draw 14,000 candidates of held-out draws, filter and balance them to a benchmark
 
@@ -188,20 +168,12 @@ def construct(arguments: argparse.Namespace) -> None:
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.tasks import write_tasks
 
-    chosen, counts = selection.construct(
-        selection.candidates(arguments.seed),
-        arguments.seed,
-        arguments.size or selection.SIZE,
-        [row for row, _ in stored(arguments.results)],
-        own_draws.planned(arguments.plan) if arguments.plan else None,
-    )
+    rows = [row for row, _ in stored(arguments.results)]
+    plan = own_draws.planned(arguments.plan) if arguments.plan else None
+    drawn, size = selection.candidates(arguments.seed), arguments.size or selection.SIZE
+    chosen, counts = selection.construct(drawn, arguments.seed, size, rows, plan)
     write_tasks(chosen, arguments.seed, arguments.out)
     print(json.dumps(counts))
-
-
-def _grade_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("results", type=Path, nargs="+", metavar="DIR", help="results of one model each")
-    command.add_argument("--out", type=Path, required=True, metavar="FILE", help="list of tasks with their difficulty")
 
 
 def grade(arguments: argparse.Namespace) -> None:
@@ -218,11 +190,6 @@ def grade(arguments: argparse.Namespace) -> None:
     write_tasks(graded, seed, arguments.out)
     by_level = {level: sum(task["difficulty"] == level for task in graded) for level in range(1, 6)}
     print(json.dumps({"models": len(results), "tasks": len(graded), "by_difficulty": by_level}))
-
-
-def _leakage_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("results", type=Path, metavar="DIR", help="folder of the results")
-    add_config(command)
 
 
 def leakage(arguments: argparse.Namespace) -> int:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from pathlib import Path
 from typing import Any
 
-from pipeline.commands.base import add, add_config, owned
+from pipeline.commands.base import add, add_config, argument, owned, value
 from pipeline.errors import PipelineError
 
 TITLE = "a finished run"
@@ -15,9 +14,27 @@ TITLE = "a finished run"
 
 def add_commands(commands: Any) -> None:
     add(commands, check, add_config)
-    add(commands, audit, _audit_arguments)
-    add(commands, regenerate, _regenerate_arguments)
-    add(commands, push, _push_arguments)
+    dataset = value("dataset", "DATASET", "folder of an RLDS or LeRobot set, whoever made it")
+    labels = "labels of episodes that lost theirs and kept their episode_id"
+    add(commands, audit, dataset, value("--manifest", "FILE", labels))
+    add(
+        commands,
+        regenerate,
+        value("episode_id", "EPISODE_ID", "as in the manifest and in the datasets", str),
+        add_config,
+        value("--out", "DIR", "new folder for what is rebuilt", required=True),
+        value("--manifest", "FILE", "of a dataset from elsewhere, in place of a configuration"),
+        value("--demos", "DIR", "with --manifest: the HDF5 demonstrations that it was made from"),
+    )
+    add(
+        commands,
+        push,
+        _format,
+        value("repository", "REPOSITORY", "owner/name on the hub", str),
+        add_config,
+        argument("--really", action="store_true", help="send it"),
+        argument("--private", action="store_true", help="make a new repository private"),
+    )
 
 
 def check(arguments: argparse.Namespace) -> int:
@@ -27,9 +44,9 @@ def check(arguments: argparse.Namespace) -> int:
     line is JSON. Ends with 1 where something is off: delete a damaged file, and the run makes it anew. (The stage
     validate, which is a part of every run, compares the content of the datasets with each other and with the plan.)
     """
-    from pipeline.clients import oft_check
+    from pipeline.clients import oft
     from pipeline.compute.pool import runner
-    from pipeline.validation.verify import verify
+    from pipeline.validation.validate import verify
 
     config = owned(arguments)
     with runner(config.compute, config.data) as run:
@@ -38,21 +55,12 @@ def check(arguments: argparse.Namespace) -> int:
     trained: dict[str, Any] = {}
     # OpenVLA-OFT's reader stops at what is damaged.
     if config.export.rlds and not stored["rlds"]["damaged"]:
-        trained = oft_check.check_run(config.data)
+        trained = oft.check_run(config.data)
     misleading = [f"{name}: {what}" for name, found in trained.items() for what in found["violations"]]
     for what in (*damaged, *misleading):
         print(what)
     print(json.dumps({**stored, "openvla_oft": trained}))
     return int(bool(damaged or misleading))
-
-
-def _audit_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "dataset", type=Path, metavar="DATASET", help="folder of an RLDS or LeRobot set, whoever made it"
-    )
-    command.add_argument(
-        "--manifest", type=Path, metavar="FILE", help="labels of episodes that lost theirs and kept their episode_id"
-    )
 
 
 def audit(arguments: argparse.Namespace) -> int:
@@ -78,18 +86,6 @@ def audit(arguments: argparse.Namespace) -> int:
     return int(any(finding.overlaps for finding in found.axes.values()))
 
 
-def _regenerate_arguments(command: argparse.ArgumentParser) -> None:
-    command.add_argument("episode_id", metavar="EPISODE_ID", help="as in the manifest and in the datasets")
-    add_config(command)
-    command.add_argument("--out", type=Path, required=True, metavar="DIR", help="new folder for what is rebuilt")
-    command.add_argument(
-        "--manifest", type=Path, metavar="FILE", help="of a dataset from elsewhere, in place of a configuration"
-    )
-    command.add_argument(
-        "--demos", type=Path, metavar="DIR", help="with --manifest: the HDF5 demonstrations that it was made from"
-    )
-
-
 def regenerate(arguments: argparse.Namespace) -> int:
     """rebuild one episode from the manifest and its demonstration, and say whether it is the dataset's, byte for byte
 
@@ -108,15 +104,11 @@ def regenerate(arguments: argparse.Namespace) -> int:
     return int(found["identical"] is False or found["reason"] != "kept")
 
 
-def _push_arguments(command: argparse.ArgumentParser) -> None:
+def _format(command: argparse.ArgumentParser) -> None:
     from pipeline.formats.registry import FORMATS
 
     names = [kind.name for kind in FORMATS]
     command.add_argument("format", choices=names, metavar="FORMAT", help=" or ".join(names))
-    command.add_argument("repository", metavar="REPOSITORY", help="owner/name on the hub")
-    add_config(command)
-    command.add_argument("--really", action="store_true", help="send it")
-    command.add_argument("--private", action="store_true", help="make a new repository private")
 
 
 def push(arguments: argparse.Namespace) -> None:
