@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 from pipeline.config import load
-from pipeline.validation.disk import needed_mb
+from pipeline.validation.needs import needed_mb
 
 STAGES = ("inputs", "plan", "leakage", "replay", "render", "export_rlds", "export_lerobot", "manifest", "validate")
 EVERY_S = 0.3

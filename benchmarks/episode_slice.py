@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from pipeline.config import Config, DemosConfig
 from pipeline.libero.tasks import select_tasks
-from pipeline.validation.disk import PUBLISHED
+from pipeline.validation.needs import PUBLISHED
 
 
 def sliced(config: Config, tasks: Sequence[str] | None) -> Config:

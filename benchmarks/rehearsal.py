@@ -38,7 +38,7 @@ from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.types import Task
-from pipeline.validation.disk import PUBLISHED
+from pipeline.validation.needs import PUBLISHED
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 STAND_INS = REPOSITORY / "benchmarks" / "rehearsal_stand_ins.py"

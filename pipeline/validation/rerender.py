@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pipeline import gl
@@ -18,8 +19,8 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import decode, encode
 from pipeline.rendering.last_scene import LastScene
-from pipeline.types import Frame, Trajectory
-from pipeline.validation.checks import Case, psnr_db
+from pipeline.types import Frame
+from pipeline.validation.checks import Case
 
 PSNR_DB = 25.0
 """Least PSNR of a frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""
@@ -46,8 +47,8 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
     """
     exact = case.row["gl_device"] == gl.choose().device
     for step in dict.fromkeys((0, len(case.made) // 2)):
-        fresh = _raw(case.trajectory, case.row["perturbations"], opened, step)
-        former = _raw(case.trajectory, case.row["perturbations"], opened, step - BEFORE) if step > BEFORE else {}
+        fresh = _raw(case, opened, step)
+        former = _raw(case, opened, step - BEFORE) if step > BEFORE else {}
         for view in SCHEMA.views:
             name = f"{view} of step {step}"
             stored = case.made.frames[view][step]
@@ -61,15 +62,13 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
                     yield case.finding(dataset, what, right)
                 elif exact and dataset == "frames":
                     what = f"{name} is another file than a fresh rendering, {reached_db:.1f} dB apart"
-                    yield case.finding(
-                        dataset, what, f"the same file, as both were rendered by {case.row['gl_device']}"
-                    )
+                    expected = f"the same file, as both were rendered by {case.row['gl_device']}"
+                    yield case.finding(dataset, what, expected)
 
 
 def _nearest(
     frame: Frame, right: str, view: str, fresh: Mapping[str, Frame], former: Frame | None
 ) -> tuple[str, float]:
-    """What a stored frame shows, of all that it could, and the PSNR to it in dB."""
     could_be = {
         right: _turned(fresh[view]),
         f"{view} not turned": fresh[view],
@@ -80,7 +79,7 @@ def _nearest(
     }
     if former is not None:
         could_be[f"{view} of {BEFORE} steps before"] = _turned(former)
-    reached = {name: psnr_db(frame, np.ascontiguousarray(one)) for name, one in could_be.items()}
+    reached = {name: float(cv2.PSNR(frame, np.ascontiguousarray(one))) for name, one in could_be.items()}
     nearest = max(reached, key=reached.__getitem__)
     return nearest, reached[nearest]
 
@@ -89,11 +88,11 @@ def _turned(raw: Frame) -> Frame:
     return np.ascontiguousarray(np.rot90(raw, SCHEMA.image_rotation_deg // 90))
 
 
-def _raw(trajectory: Trajectory, perturbations: str, opened: LastScene, step: int) -> dict[str, Frame]:
+def _raw(case: Case, opened: LastScene, step: int) -> dict[str, Frame]:
     """View to its frame before a step, in the orientation of LIBERO's raw observations."""
-    renderer, changes = opened.renderer(trajectory.model_xml), from_json(perturbations)
+    renderer, changes = opened.renderer(case.trajectory.model_xml), from_json(case.row["perturbations"])
     with renderer.perturbed(of_layer(changes, RenderPerturbation)):
-        renderer.restore(trajectory.states[step], trajectory.site_alpha[step])
+        renderer.restore(case.trajectory.states[step], case.trajectory.site_alpha[step])
         frames = {view: renderer.frame(spec.camera) for view, spec in SCHEMA.views.items()}
     for noise in of_layer(changes, PixelPerturbation):
         frames |= {view: noise.apply(frames[view], step) for view in noise.views}

@@ -18,8 +18,7 @@ from pipeline.run.outcome import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
-from pipeline.validation.disk import free_gb, needed_mb
-from pipeline.validation.duration import in_words, needed_s, workers_of
+from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
 
 
 def told(config: Config) -> Iterator[str | Table]:
@@ -37,28 +36,23 @@ def told(config: Config) -> Iterator[str | Table]:
     yield "would run:" if steps else "nothing would run: all of this configuration is made"
     yield from (f"  {step}: {why}" for step, why in steps.items())
     yield _disk(config)
-    yield from _time_left(config, rows, verdicts, frames, set(steps))
+    yield from _time_left(config, rows, verdicts, frames) if steps else ()
 
 
 def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]) -> Table:
     table = Table("axis", "wanted", "planned", "reach their goal", "rendered", title="episodes")
     for column in table.columns[1:]:
         column.justify = "right"
-    total: Counter[str] = Counter()
+    every = []
     for axis in ("clean", *config.plan.episodes):
         of_axis = [row for row in rows if row.axis == axis]
         kept = [row for row in of_axis if judged[row.episode_id].kept]
         planned = sum(row.wanted for row in of_axis)
-        cells = {
-            "wanted": config.plan.episodes.get(axis, planned),
-            "planned": planned,
-            "kept": len(kept),
-            "rendered": sum(outcome.rendered(row, frames) for row in kept),
-        }
-        total.update(cells)
-        table.add_row(axis.replace("+", "+ "), *map(str, cells.values()))
+        wanted, rendered = config.plan.episodes.get(axis, planned), sum(outcome.rendered(row, frames) for row in kept)
+        every.append((wanted, planned, len(kept), rendered))
+        table.add_row(axis.replace("+", "+ "), *map(str, every[-1]))
     table.add_section()
-    table.add_row("all", *(str(total[name]) for name in ("wanted", "planned", "kept", "rendered")))
+    table.add_row("all", *map(str, map(sum, zip(*every, strict=True))))
     return table
 
 
@@ -69,7 +63,6 @@ def _steps(
     frames: Mapping[str, Shown],
     rejected: Mapping[str, str],
 ) -> Iterator[tuple[str, str]]:
-    """Each stage that would make something, and why."""
     changed = _changed(config)
     of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
     if not rows or of_plan:
@@ -91,7 +84,6 @@ def _steps(
 
 
 def _follow(config: Config) -> Iterator[tuple[str, str]]:
-    """The stages after the frames."""
     run = outcome.read(config)
     sets = (config.data, config.export, config.render.extras)
     stale = False
@@ -115,7 +107,6 @@ def _follow(config: Config) -> Iterator[tuple[str, str]]:
 
 
 def _changed(config: Config) -> list[str]:
-    """The fields of the configuration that are not what the run was last called with."""
     try:
         before = read_json(config.data / "settings.json")
     except PipelineError:
@@ -132,21 +123,16 @@ def _differences(before: Any, now: Any, field: str = "") -> Iterator[str]:
 
 
 def _of(made_anew: Counter[str], what: str) -> str:
-    """Why finished work does not count, where some does not."""
     reasons = "; ".join(f"{number} {reason}" for reason, number in made_anew.items() if reason.startswith(what))
     return f" (would be made anew: {reasons})" if reasons else ""
 
 
 def _time_left(
-    config: Config,
-    rows: list[plan.Row],
-    verdicts: Mapping[str, Verdict],
-    frames: Mapping[str, Shown],
-    steps: set[str],
+    config: Config, rows: list[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, Shown]
 ) -> Iterator[str]:
     """By the speed that the stage ``doctor`` found, and the share of the wanted rows that is not made."""
     speed = machine.known_speed(config.data)
-    if speed is None or not rows or not steps:
+    if speed is None or not rows:
         return
     wanted = [row for row in rows if row.wanted]
     left = {

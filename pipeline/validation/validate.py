@@ -1,4 +1,5 @@
-"""Reopen the datasets and the manifest of a finished run, as their readers would, and say what is off.
+"""Reopen the datasets and the manifest of a finished run, as their readers would, and say what is off (``validate``);
+compare all that it stored with the checksums that it was stored with (``verify``).
 
 The datasets are compared with the stores that they were made from; those in turn are held against fresh renderings.
 """
@@ -12,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.clients import oft, oft_check
+from pipeline.clients import oft
 from pipeline.compute.pool import Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
@@ -20,7 +21,7 @@ from pipeline.files import read_json, scratch
 from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
-from pipeline.formats.registry import failures_of, formats_of
+from pipeline.formats.registry import failures_of, formats_of, recorded
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
 from pipeline.planning import plan
@@ -29,6 +30,8 @@ from pipeline.run import manifest, outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import wordings
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.store import Store
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Extra
 from pipeline.validation.checks import CHECKS, Case
@@ -145,8 +148,7 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
 
 
 def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> list[Fault]:
-    """What would mislead OpenVLA-OFT."""
-    found, name = oft_check.check(folder, statistics), folder.parent.name
+    found, name = oft.check(folder, statistics), folder.parent.name
     return [Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in found["violations"]]
 
 
@@ -226,3 +228,40 @@ class EpisodesJob:
             results.note(name, check(case))
         if episode_id in self.witnesses:
             results.note("rendered", rendered(case, self.config.render, scene_of_process()))
+
+
+def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
+    """Read every stored file of a run: trajectories, frames and the datasets.
+
+    Returns:
+        JSON-serialisable: what was read to how many files were ``checked``, and which are ``damaged``, each with what
+        to do about it.
+    """
+    results: dict[str, dict[str, Any]] = {}
+    stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
+    for name, store in zip(("trajectories", "frames"), stores, strict=True):
+        results[name] = _result(workers(partial(_damaged, store), store.names(), name))
+    for one in recorded(config.data, config.export, config.render.extras):
+        name = one.folder.relative_to(config.data).as_posix()
+        try:
+            files = one.written()
+        except PipelineError as error:
+            results[name] = {"checked": 0, "damaged": [str(error)]}
+            continue
+        faults = workers(Written.faults, files, one.title)
+        results[name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
+    return results
+
+
+def _damaged(store: Store, file: str) -> list[str]:
+    try:
+        with store.opened(file) as opened:
+            opened.check_all()
+    except PipelineError as error:
+        return [str(error)]
+    return []
+
+
+def _result(findings: Iterable[Sequence[str]]) -> dict[str, Any]:
+    listed = list(findings)
+    return {"checked": len(listed), "damaged": [finding for found in listed for finding in found]}

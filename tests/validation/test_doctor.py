@@ -25,8 +25,7 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Extra
 from pipeline.validation import doctor
-from pipeline.validation.disk import needed_mb
-from pipeline.validation.duration import REFERENCE
+from pipeline.validation.needs import REFERENCE, needed_mb
 
 REAL_TRIAL = machine.trial
 

@@ -11,7 +11,7 @@ from conftest import BOWL, REPOSITORY
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.run.machine import Speed
-from pipeline.validation.duration import REFERENCE, in_words, needed_s
+from pipeline.validation.needs import REFERENCE, in_words, needed_s
 
 STARTER = load(REPOSITORY / "configs" / "starter.yaml")
 

@@ -1,0 +1,224 @@
+"""Disk and time that a run takes: from the lengths of its demonstrations, and from what a step was measured to take.
+
+Every planned episode counts as kept, and so does the clean twin of every demonstration; each is as long as its
+demonstration.
+
+Sizes are rounded up from four runs of one demonstration of 90 steps (``benchmarks/disk.py``, see ``docs/cost.md``).
+Times are CPU times of one core of the machine that ``REFERENCE`` describes: of frames 0.8 of what
+``benchmarks/frame_cost.py`` gave beside other work, so that they sum up to the stage of ``configs/starter.yaml``; the
+others are of the stages of that run and of one of 988 episodes. No larger run was compared yet.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.axes import AXES, Perturbation, PhysicsPerturbation, RenderPerturbation, axes_of
+from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig
+from pipeline.episode_schema import SCHEMA
+from pipeline.errors import PipelineError
+from pipeline.libero import bddl
+from pipeline.libero.bddl import Arena
+from pipeline.libero.demonstrations import HDF5Source, StarterSource
+from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.run.machine import Speed
+from pipeline.types import Extra, Task
+
+JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
+"""A frame, by quality."""
+MAP_KB: dict[Extra, float] = {"depth": 31.0, "segmentation": 3.0}
+"""A view of one step."""
+POSES_KB, MOTION_KB = 0.7, 0.5
+"""One step: object poses; state, action and what else is beside the frames."""
+VIDEO_KB = 15.0
+"""One step in LeRobot, both views as video."""
+IN_TEXT = 1.2
+"""How much larger LeRobot's columns of base64 are than the PNG files in them."""
+TRAJECTORY_KB, STATE_KB = 100.0, 1.2
+"""A trajectory, and each step of it."""
+EPISODE_KB = 50.0
+"""An episode in a dataset, however short."""
+RUN_MB = 100.0
+"""A run's sheets, report and tables."""
+
+PUBLISHED = 50
+"""Demonstrations of a task in LIBERO's files."""
+
+REFERENCE = Speed(step_s=0.0033, frame_s=0.093)
+"""Of the machine of the figures below, by ``machine.trial``: one step again and again, and a frame without savings."""
+
+FRAME_S: dict[Arena, tuple[float, float]] = {
+    "tabletop": (0.032, 0.041),
+    "floor": (0.022, 0.034),
+    "kitchen": (0.041, 0.033),
+    "living_room": (0.024, 0.047),
+    "study": (0.028, 0.035),
+}
+"""A frame of the agent view and of the wrist view, with savings."""
+SHADOWS_S, SHADOWS = 0.13, 0.4
+"""What shadows add to a frame, and the share of the light episodes that have them."""
+ENCODE_S = 0.004
+"""Of a frame: the JPEG, and the noise where there is some. A GPU does not make it quicker."""
+SCENE_S, STEP_S, TRIES = 2.2, 0.007, 1.4
+"""A trajectory besides its control steps; a step; how often steps are run, as tracking follows a replay that missed."""
+RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.003, 0.0013
+"""A step of an episode in the exports and in ``validate``."""
+FIXED_S = 100.0
+"""Starting the stages, previews, sheets and report: on the clock, however many workers there are."""
+
+
+def needed_mb(config: Config) -> dict[str, float]:
+    """Folder of a run to the megabytes that it takes.
+
+    Every planned episode counts as kept, and so does the clean twin of every demonstration.
+    """
+    amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
+    twins, planned, twin_steps, mean_steps = amounts
+    steps, episodes, export = amounts.steps, twins + planned, config.export
+    # What planned episodes have that their twins do not: trajectories, and views of frames and of maps.
+    trajectories = frames = maps = 0.0
+    for _, number, kinds in _planned(config.plan):
+        physics = [kind for kind in kinds if issubclass(kind, PhysicsPerturbation)]
+        cameras = [kind for kind in kinds if issubclass(kind, RenderPerturbation) and kind.sees_otherwise]
+        trajectories += number * (1 + config.plan.reserve) * bool(physics)
+        frames += number * len({view for kind in kinds for view in kind.views})
+        maps += number * len({view for kind in (*physics, *cameras) for view in kind.views})
+    frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
+    map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
+    poses_kb = POSES_KB if "object_poses" in extras else 0.0
+
+    def lerobot_kb(video: bool) -> float:
+        shown_kb = VIDEO_KB if video else views * frame_kb + MOTION_KB
+        return steps * (shown_kb + IN_TEXT * views * map_kb + poses_kb) + episodes * EPISODE_KB
+
+    needed_kb = {
+        "trajectories": (twins + trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
+        "frames": (views * twin_steps + frames * mean_steps) * frame_kb
+        + (views * twin_steps + maps * mean_steps) * map_kb
+        + steps * (poses_kb + MOTION_KB),
+    }
+    if export.rlds is not None:
+        needed_kb["rlds"] = steps * (views * (frame_kb + map_kb) + poses_kb + MOTION_KB) + episodes * EPISODE_KB
+    if export.lerobot is not None:
+        needed_kb["lerobot"] = lerobot_kb(export.lerobot.frames == "video")
+    if export.lerobot_v21 is not None:
+        needed_kb["lerobot_v21"] = lerobot_kb(export.lerobot_v21.convention == "ipec")
+    return {folder: kb / 1e3 for folder, kb in needed_kb.items()} | {"sheets": RUN_MB}
+
+
+def needed_s(config: Config, speed: Speed) -> dict[str, float]:
+    """Stage to the seconds that one core takes for it; under ``rest``, seconds that more cores do not make fewer.
+
+    Every planned episode counts as kept, and so does the clean twin of every demonstration. Savings are taken to gain
+    as much as on the reference machine.
+
+    Args:
+        config: of the run.
+        speed: of the machine.
+    """
+    tasks = lengths(config.demos)
+    amounts = Amounts.of(tasks, config.plan)
+    # To render a frame of each view: the mean over all demonstrations.
+    arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
+    drawn_s = np.average([FRAME_S[arena] for arena in arenas], axis=0, weights=weights)
+    frame_s = [float(s) * speed.frame_s / REFERENCE.frame_s for s in drawn_s]
+    trajectories, frames_s = amounts.twins, amounts.twin_steps * sum(view_s + ENCODE_S for view_s in frame_s)
+    for axes, episodes, kinds in _planned(config.plan):
+        trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
+        for view, view_s in zip(SCHEMA.views, frame_s, strict=True):
+            here = [kind for kind in kinds if view in kind.views]
+            rendered = any(issubclass(kind, PhysicsPerturbation | RenderPerturbation) for kind in here)
+            shadows_s = SHADOWS_S * SHADOWS * ("light" in axes) * speed.frame_s / REFERENCE.frame_s
+            frames_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + ENCODE_S * bool(here))
+    processor = speed.step_s / REFERENCE.step_s
+    formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
+    return {
+        "replay": processor * trajectories * (SCENE_S + TRIES * amounts.mean_steps * STEP_S),
+        "render": frames_s,
+        "export": processor * amounts.steps * sum(formats[name] for name in config.export.formats),
+        "validate": processor * amounts.steps * VALIDATE_S * len(config.export.formats),
+        "rest": processor * FIXED_S,
+    }
+
+
+def in_words(stages_s: Mapping[str, float], workers: int) -> str:
+    """Some stages' time on the clock, with so many cores."""
+    times_s = {stage: s if stage == "rest" else s / workers for stage, s in stages_s.items()}
+    parts = ", ".join(f"{stage} {_time(s)}" for stage, s in times_s.items())
+    return f"about {_time(sum(times_s.values()))} with {workers} worker{'s' * (workers > 1)}: {parts}"
+
+
+def workers_of(compute: ComputeConfig) -> int:
+    """Processes that work at the same time; as many as this machine has cores, where a cluster elsewhere decides."""
+    from dask.system import CPU_COUNT
+
+    return 1 if compute.cluster == "loop" else compute.workers or CPU_COUNT
+
+
+def _time(seconds: float) -> str:
+    if seconds >= 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
+def free_gb(folder: Path) -> float:
+    """What is free where a folder is, or would be made."""
+    there = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
+    return shutil.disk_usage(there).free / 1e9
+
+
+class Amounts(NamedTuple):
+    """How many twins and planned episodes a run has, the steps of all twins, and those of a planned episode: the mean,
+    as episodes are spread evenly over the tasks."""
+
+    twins: int
+    planned: int
+    twin_steps: int
+    mean_steps: float
+
+    @classmethod
+    def of(cls, tasks: Mapping[Task, list[int]], plan: PlanConfig) -> Amounts:
+        """By the steps of each demonstration of each task (see ``lengths``)."""
+        found = list(tasks.values())
+        mean_steps = float(np.mean([np.mean(task) for task in found]))
+        return cls(sum(map(len, found)), sum(plan.episodes.values()), sum(map(sum, found)), mean_steps)
+
+    @property
+    def steps(self) -> float:
+        return self.twin_steps + self.planned * self.mean_steps
+
+
+def _planned(plan: PlanConfig) -> Iterator[tuple[list[str], int, list[type[Perturbation]]]]:
+    """The axes that each wanted combination has, how many episodes are wanted of it, and the kinds of its draws."""
+    for name, episodes in plan.episodes.items():
+        axes = list(axes_of(name))
+        yield axes, episodes, [AXES[axis].draws[0] for axis in axes]
+
+
+def lengths(demos: DemosConfig) -> dict[Task, list[int]]:
+    """Steps of each demonstration, by task; where no file is there yet, those of LIBERO's as long as the starter's.
+
+    Raises:
+        PipelineError: when only own tasks are asked for, and none has a demonstration.
+    """
+    starter = StarterSource()
+    if demos.root is None:
+        return {entry.task: [entry.steps] for entry in starter.index(select_tasks(demos.tasks)).entries}
+    source = HDF5Source(demos.root)
+    found = {task: source.lengths(task)[: demos.per_task] for task in select_tasks(demos.tasks)}
+    if not any(found.values()):
+        of_libero = [task for task in found if task.suite in SUITES]
+        found = {task: [len(starter.of(task).actions)] * (demos.per_task or PUBLISHED) for task in of_libero}
+    if not any(found.values()):
+        raise PipelineError(
+            "none of your own tasks has a demonstration",
+            where=demos.root,
+            expected="<suite>/<task>_demo.hdf5 there",
+            remedy="see `python -m pipeline demos check`",
+        )
+    return {task: steps for task, steps in found.items() if steps}
