@@ -160,13 +160,13 @@ def compare(environment: EpisodeEnvironment, task: EvaluationTask, folder: Path)
         else change
         for change in environment.perturbations
     )
-    environment._picture.show(environment._simulator.model, perturbations)
+    environment._picture.show(environment.simulator.model, perturbations)
     state_error, grey, differing = 0.0, dict.fromkeys(views, 0), dict.fromkeys(views, 0)
     for step, state in enumerate(states):
         if step:
             environment.step(ACTIONS[step - 1])
         # Keeps NaN, which is no small error.
-        state_error = float(np.maximum(state_error, np.abs(environment._simulator.state - state).max()))
+        state_error = float(np.maximum(state_error, np.abs(environment.simulator.state - state).max()))
         for view, frames in views.items():
             error = np.abs(environment.image(view).astype(int) - to_policy(frames[step]))
             grey[view], differing[view] = max(grey[view], int(error.max())), differing[view] + int((error > 0).sum())

@@ -95,7 +95,7 @@ def _tell(tasks: Sequence[Task], address: str, folder: Path, wanted: Sequence[Te
         while not (progress.over or reached):
             for action in policy.act(look):
                 progress = environment.step(action)
-                reached = [name for name, goal in goals.items() if environment.satisfies(goal)]
+                reached = [name for name, goal in goals.items() if environment.simulator.satisfies(goal)]
                 if progress.over or reached:
                     break
         policy.end(progress.success)

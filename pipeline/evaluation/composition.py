@@ -30,7 +30,7 @@ from scipy.stats import chi2_contingency
 
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
+from pipeline.evaluation.results import REFUSED, Stored, one_setting, refuse_different
 from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
 from pipeline.types import Floats
@@ -108,10 +108,6 @@ def _probabilities(sums: Floats) -> tuple[Floats, Floats]:
     return np.asarray(both / whole, float), np.asarray((one + both) * (other + both) / whole**2, float)
 
 
-Start = tuple[str, str, int]
-"""Suite, LIBERO task and number of the initial state, which the combinations of a trial share."""
-
-
 def pairs(found: Iterable[Stored]) -> list[Pair]:
     """Every pair of axes that the results have, of the trials of which all four combinations were run.
 
@@ -122,18 +118,18 @@ def pairs(found: Iterable[Stored]) -> list[Pair]:
     one_setting(of_pairs)
     refuse_different(of_pairs)
     listed = [row for row, _ in of_pairs]
-    drawn = {(row.axis, row.level, _start(row)): row.success for row in listed}
+    # The combinations of a trial share suite, LIBERO task and number of the initial state.
+    drawn = {(row.axis, row.level, (row.suite, row.base, row.number)): row.success for row in listed}
     axes = _in_order(axis for joined, _, _ in drawn if joined != "clean" for axis in joined.split("+"))
     counted = [pair for one, other in combinations(axes, 2) if (pair := _pair(one, other, drawn)) is not None]
     if not counted:
         raise PipelineError(
-            "no trial has all four combinations of two axes",
-            remedy="python -m pipeline evaluate DIR --source pairs",
+            "no trial has all four combinations of two axes", remedy="python -m pipeline evaluate DIR --source pairs"
         )
     return counted
 
 
-def _pair(one: str, other: str, drawn: Mapping[tuple[str, int, Start], bool]) -> Pair | None:
+def _pair(one: str, other: str, drawn: Mapping[tuple[str, int, tuple[str, str, int]], bool]) -> Pair | None:
     """Two axes' trials counted; None where there is none. What has one initial state, at whichever level, is drawn
     together."""
     starts, outcomes = [], []
@@ -151,10 +147,6 @@ def _pair(one: str, other: str, drawn: Mapping[tuple[str, int, Start], bool]) ->
 
 def _finite(numbers: Mapping[str, float]) -> dict[str, float | None]:
     return {name: number if np.isfinite(number) else None for name, number in numbers.items()}
-
-
-def _start(row: EpisodeResult) -> Start:
-    return row.suite, row.base, row.number
 
 
 def _in_order(axes: Iterable[str]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import libero_plus, own_draws
 from pipeline.evaluation.policies import VIEWS, Wanted, checked_actions
 from pipeline.evaluation.results import REFUSED
-from pipeline.evaluation.simulator import Observed, Picture, Simulator
+from pipeline.evaluation.simulator import Picture, Simulator
 from pipeline.evaluation.tasks import EvaluationTask, Prompt, find_replacement, libero_states
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import recorded_start
@@ -129,9 +129,9 @@ class EpisodeEnvironment:
         starts = {"libero_plus": self._start_test_task, "goals": self._start_goal}
         try:
             starts.get(task.source, self._start_libero)()
-            self.progress = Progress(0, "running")
+            self.progress = Progress(reason="running")
         except RefusedError:
-            self.progress = Progress(0, REFUSED)
+            self.progress = Progress(reason=REFUSED)
         return self.progress
 
     def step(self, action: ArrayLike) -> Progress:
@@ -153,12 +153,11 @@ class EpisodeEnvironment:
         steps = self.progress.steps + 1
         self._seen = {}
         try:
-            self._simulator.step(given)
+            self.simulator.step(given)
+            limited = "step_limit" if steps >= self.step_limit else "running"
+            self.progress = Progress(steps, "success" if self.simulator.succeeded() else limited)
         except RefusedError as error:
             self.progress = Progress(steps, error.reason)
-            return self.progress
-        limited = "step_limit" if steps >= self.step_limit else "running"
-        self.progress = Progress(steps, "success" if self._simulator.succeeded() else limited)
         return self.progress
 
     @property
@@ -168,27 +167,13 @@ class EpisodeEnvironment:
             return libero_plus.instruction(self._test, self.settings.prompt)
         return "" if self.settings.prompt == "blank" else self._base.instruction
 
-    @property
-    def observed(self) -> Observed:
-        """What LIBERO observed of the last control step."""
-        return self._simulator.observed
-
-    @property
-    def controller(self) -> Any:
-        """robosuite's controller of the arm."""
-        return self._simulator.controller
-
-    def satisfies(self, goal: Iterable[Sequence[str]]) -> bool:
-        """Whether all facts of a BDDL goal hold, such as that of another task in the same scene."""
-        return self._simulator.satisfies(goal)
-
     def image(self, view: str) -> Frame:
         """(256, 256, 3) uint8 RGB of ``agentview`` or ``wrist``, turned by 180 degrees as policies expect it."""
         if view not in self._seen:
             if self.settings.black in (view, "all"):
                 self._seen[view] = np.zeros(SCHEMA.frame.shape, np.uint8)
             else:
-                self._seen[view] = self._picture.frame(VIEWS[view], self.observed, self.progress.steps)
+                self._seen[view] = self._picture.frame(VIEWS[view], self.simulator.observed, self.progress.steps)
         return self._seen[view]
 
     def observation(self, wanted: Wanted) -> dict[str, Any]:
@@ -198,7 +183,7 @@ class EpisodeEnvironment:
         images = {view: self.image(view) for view in views}
         seen: dict[str, Any] = {"images": images, "task_description": self.instruction}
         if wanted.state:
-            seen["states"] = self.observed.state.copy()
+            seen["states"] = self.simulator.observed.state.copy()
             angle_rad = float(np.linalg.norm(seen["states"][3:6]))
             if wanted.shortest_rotation and angle_rad > np.pi:
                 seen["states"][3:6] *= (angle_rad - 2 * np.pi) / angle_rad
@@ -207,7 +192,7 @@ class EpisodeEnvironment:
     def close(self) -> None:
         self._picture.close()
         if self._key:
-            self._simulator.close()
+            self.simulator.close()
         self._key = ()
 
     def _start_test_task(self) -> None:
@@ -215,7 +200,9 @@ class EpisodeEnvironment:
         posture = libero_plus.postures_rad()[int(test.parameters["id"])] if test.axis == "robot" else None
         state = libero_states(self._base)[0]
         if test.axis in ("light", "background"):
-            self._build(self._base, test.name, libero_plus.scene(test, self._assets(test)))
+            assets = self._assets(test)
+            files = SceneFiles(*(str(assets / path) for path in libero_plus.scene_files(test)))
+            self._build(self._base, test.name, files)
         elif test.axis in ("pose", "layout"):
             if test.axis == "layout":
                 libero_plus.register_objects(test, self._assets(test))
@@ -228,14 +215,12 @@ class EpisodeEnvironment:
         self._start(self.settings.fixture_seed, state, posture)
 
     def _start_goal(self) -> None:
-        """Start LIBERO's own task with another goal."""
         replacement = find_replacement(self._base, self.task.name)
         self._build_from(replacement.bddl_text(self._base), f"{replacement.old} {replacement.new}")
         self._base = replace(self._base, instruction=replacement.instruction)
         self._start(*self._initial_state())
 
     def _start_libero(self) -> None:
-        """Start LIBERO's own task, or held-out draws on it."""
         self._build(self._base)
         seed, demo, recorded = self.settings.fixture_seed, StarterSource().of(self._base), True
         if self.settings.initial_states == "libero":
@@ -243,7 +228,7 @@ class EpisodeEnvironment:
             demo, recorded = replace(demo, init_state=state), False
 
         def nominal() -> Scene:
-            scene = recorded_start(demo, self._simulator.place_fixtures(seed))
+            scene = recorded_start(demo, self.simulator.place_fixtures(seed))
             # A recording had the gripper open; LIBERO's reset, after which its own states are put in, leaves it without
             # a command.
             return scene if recorded else replace(scene, gripper=0.0)
@@ -257,16 +242,15 @@ class EpisodeEnvironment:
             return
         scene = scene or nominal()
         self.resolved = scene.resolved
-        self._simulator.start_scene(scene)
+        self.simulator.start_scene(scene)
         self._picture.show(scene.model_xml, self.perturbations)
 
     def _start(self, seed: int, state: Floats, posture_rad: tuple[float, ...] | None = None) -> None:
         """Start from a state in the model of LIBERO's own reset."""
-        self._simulator.start(seed, state, posture_rad)
-        self._picture.show(self._simulator.model, self.perturbations)
+        self.simulator.start(seed, state, posture_rad)
+        self._picture.show(self.simulator.model, self.perturbations)
 
     def _initial_state(self) -> tuple[int, Floats]:
-        """The seed of LIBERO's reset and its initial state for the task's number."""
         states = libero_states(self._base)
         number = self.task.number % len(states)
         return self.settings.fixture_seed + number, states[number]
@@ -276,7 +260,6 @@ class EpisodeEnvironment:
         return benchmark.load().find(self.task.suite, self.task.name)
 
     def _assets(self, test: TestTask) -> Path:
-        """The folder that has the files of a light, background or layout task."""
         assets = libero_plus.assets_of(test, self._archive)
         if assets is None:
             raise PipelineError(
@@ -288,16 +271,14 @@ class EpisodeEnvironment:
         return assets
 
     def _build_from(self, bddl_text: str, scene: str) -> None:
-        """Have the simulator of a scene of the task that another BDDL file defines."""
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / self._base.bddl_file.name
             file.write_text(bddl_text)
             self._build(replace(self._base, bddl_file=file), scene)
 
     def _build(self, task: Task, scene: str = "", files: SceneFiles | None = None) -> None:
-        """Have the simulator of a task, or of another scene of it."""
         key = (task.suite, task.name, scene)
         if key != self._key:
             self.close()
-            self._simulator: Simulator = Simulator(task, files)
+            self.simulator: Simulator = Simulator(task, files)
             self._key = key

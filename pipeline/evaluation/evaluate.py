@@ -9,7 +9,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -90,25 +89,20 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     }
     write_json(evaluation.folder / "summary.json", found)
     if faults:
-        raise without_result(faults)
+        raise _without_result(faults)
     return found
 
 
 def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
-    for task in missing:
+    for task in sorted(missing, key=lambda task: (task.axis == "robot", task.number, task.name)):
         own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
         moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
     spread = len(missing) if workers == 1 else max(1, len(missing) // (workers * JOBS_A_WORKER))
     size = min(spread, EPISODES_A_JOB)
-    jobs = []
-    for scene in scenes.values():
-        ordered = iter(sorted(scene, key=lambda task: (task.axis == "robot", task.number, task.name)))
-        while job := tuple(islice(ordered, size)):
-            jobs.append(job)
-    return jobs
+    return [tuple(scene[at : at + size]) for scene in scenes.values() for at in range(0, len(scene), size)]
 
 
 def check_settings(selection: Selection, settings: EpisodeSettings) -> None:
@@ -172,7 +166,7 @@ class EvaluationJob:
                 faults.append(f"{error.what} ({task})")
                 _failures.append(faults[-1])
                 if len(_failures) == FAILURES_IN_A_ROW:
-                    stopped = without_result(_failures)
+                    stopped = _without_result(_failures)
                     _failures.clear()
                     raise stopped from error
             else:
@@ -209,7 +203,6 @@ class EvaluationJob:
 
 @lru_cache(maxsize=1)
 def _environment(settings: EpisodeSettings, archive: Path | None) -> EpisodeEnvironment:
-    """This process's environment."""
     environment = EpisodeEnvironment(settings, archive)
     if threading.current_thread() is threading.main_thread():
         # Python ends in reverse order, and the first context of OpenGL has registered what ends it.
@@ -242,8 +235,7 @@ _failures: list[str] = []
 """Of this process's policy, since the last episode that it finished."""
 
 
-def without_result(faults: Sequence[str]) -> PipelineError:
-    """The policy failed in some episodes; the first few are named."""
+def _without_result(faults: Sequence[str]) -> PipelineError:
     more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
     return PipelineError(
         f"{len(faults)} episodes have no result: {'; '.join([*faults[:FAULTS_NAMED], *more])}",

@@ -88,8 +88,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
             PipelineError: when there is no episode left in any environment.
         """
         super().reset(seed=seed)
-        if self._round * self._stride >= len(self._tasks):
-            count = len(self._tasks)
+        if self._round * self._stride >= (count := len(self._tasks)):
             raise PipelineError(
                 f"more episodes are asked for than the {count} that were selected",
                 where="eval.n_episodes",
@@ -127,7 +126,8 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
     def _look(self) -> Observation:
         """LIBERO's views as they are rendered, upside down, which lerobot's processor turns."""
         self._environment.looks += 1
-        observed, controller = self._environment.observed, self._environment.controller
+        simulator = self._environment.simulator
+        observed = simulator.observed
         turned = {name: resized(self._environment.image(view), *self._size_px) for name, view in CAMERAS.items()}
         w, *xyz = observed.hand_wxyz
         return {
@@ -136,7 +136,7 @@ class PerturbedLiberoEnv(gym.Env[Observation, np.ndarray[Any, Any]]):
                 "eef": {
                     "pos": observed.state[:3].astype(np.float64),
                     "quat": np.array([*xyz, w]),
-                    "mat": controller.ee_ori_mat.copy(),
+                    "mat": simulator.controller.ee_ori_mat.copy(),
                 },
                 "gripper": {"qpos": observed.state[6:].astype(np.float64), "qvel": observed.velocity[7:]},
                 "joints": {"pos": observed.joint_state.astype(np.float64), "vel": observed.velocity[:7]},

@@ -79,11 +79,10 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         super().__init__()
         del seed
         self._selection = Selection.model_validate(selection or {})
-        given = {"seed": self._selection.seed, "look_every": look_every, **(settings or {})}
-        if env_seed is not None:
-            given = {"fixture_seed": env_seed, **given}
+        given = {"seed": self._selection.seed, "look_every": look_every}
+        given |= {} if env_seed is None else {"fixture_seed": env_seed}
         self._archive = None if assets is None else Path(assets)
-        episodes = EpisodeSettings.model_validate(given)
+        episodes = EpisodeSettings.model_validate(given | (settings or {}))
         self._environment = EpisodeEnvironment(episodes, self._archive)
         check_settings(self._selection, episodes)
         self._evaluation: Evaluation | None = None
@@ -107,7 +106,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         if progress.over:
             self._save()
             raise PipelineError("the scene refuses what was drawn", where=task["name"], remedy="leave this task out")
-        self._next_look.begin()
+        self._next_look.left = 0
         return self._look()
 
     def step(self, action: dict[str, Any]) -> StepResult:
@@ -118,7 +117,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             if progress.over:
                 break
         self._next_look.answered(given)
-        if self._next_look.due and not progress.over:
+        if self._next_look.left == 0 and not progress.over:
             self._look()
         return StepResult(self._last, float(progress.success), progress.over, {"success": progress.success})
 

@@ -94,10 +94,13 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
         settings = EpisodeSettings.model_validate({**given, "runner": "lerobot-eval"})
         archive = None if self.assets is None else Path(self.assets)
         evaluation = self._evaluation(settings, archive)
+        size_px = self.observation_height, self.observation_width
         tasks: dict[str, list[EvaluationTask]] = defaultdict(list)
         for suite in (self.task or "").split(","):
             # Those of one scene after the other, so that it is built once.
-            selection = self._selection(suite.strip())
+            named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
+            chosen = {"suites": (suite.strip(),), **{name: getattr(self, name) for name in named}}
+            selection = Selection.model_validate(chosen)
             check_settings(selection, settings)
             tasks[suite.strip()] = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
         if evaluation is not None:
@@ -109,27 +112,18 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
             made = [
                 # An environment that is done waits until the others are.
                 freeze_after_episode_end(
-                    partial(PerturbedLiberoEnv, of_suite, settings, first, n_envs, self._size_px, evaluation, archive)
+                    partial(PerturbedLiberoEnv, of_suite, settings, first, n_envs, size_px, evaluation, archive)
                 )
                 for first in range(n_envs)
             ]
-            later = gym.vector.AutoresetMode.NEXT_STEP
+            together: Any = gym.vector.SyncVectorEnv
             if use_async_envs and n_envs > 1:
-                found[suite] = {0: gym.vector.AsyncVectorEnv(made, context="forkserver", autoreset_mode=later)}
-            else:
-                found[suite] = {0: gym.vector.SyncVectorEnv(made, autoreset_mode=later)}
+                together = partial(gym.vector.AsyncVectorEnv, context="forkserver")
+            found[suite] = {0: together(made, autoreset_mode=gym.vector.AutoresetMode.NEXT_STEP)}
         return found
-
-    @property
-    def _size_px(self) -> tuple[int, int]:
-        return self.observation_height, self.observation_width
 
     def _theirs(self) -> Any:
         return LiberoEnv(observation_height=self.observation_height, observation_width=self.observation_width)
-
-    def _selection(self, suite: str) -> Selection:
-        named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
-        return Selection.model_validate({"suites": (suite,), **{name: getattr(self, name) for name in named}})
 
     def _evaluation(self, settings: EpisodeSettings, archive: Path | None) -> Evaluation | None:
         """Where rows go, under the identity of the policy that lerobot is told to load."""

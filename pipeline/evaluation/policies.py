@@ -96,19 +96,12 @@ class NextLook:
 
     def __init__(self, every: int):
         self._every = every
-        self.begin()
-
-    def begin(self) -> None:
-        """An episode begins."""
-        self._left = 0
-
-    @property
-    def due(self) -> bool:
-        return self._left == 0
+        self.left = 0
+        """Actions that are taken before the next look, which is due at 0, as when an episode begins."""
 
     def answered(self, actions: Any) -> None:
         """Args: actions: (n, 7) or (7,), all of which are taken before the next question."""
-        self._left = (self._left or self._every) - 1 if np.ndim(actions) == 1 else 0
+        self.left = (self.left or self._every) - 1 if np.ndim(actions) == 1 else 0
 
 
 class Server:
@@ -138,13 +131,13 @@ class Server:
         self._seen: dict[str, Any] = {}
 
     def begin(self, task: EvaluationTask) -> None:
-        self._next_look.begin()
+        self._next_look.left = 0
         if not self._connection.is_connected:
             self._connect()
         self._run(self._connection.start_episode({"task": task.for_harness()}), self._connection.timeout)
 
     def act(self, look: Look) -> Any:
-        if self._next_look.due:
+        if self._next_look.left == 0:
             self._seen = look(self.wanted)
         if not self._connection.is_connected:
             raise self._fault("the connection was closed")
@@ -179,9 +172,7 @@ class Server:
             ) from error
         wanted = self._connection.server_info.get("observation_params") or {}
         self.wanted = Wanted(
-            bool(wanted.get("send_wrist_image")),
-            bool(wanted.get("send_state")),
-            not wanted.get("quat_no_antipodal"),
+            bool(wanted.get("send_wrist_image")), bool(wanted.get("send_state")), not wanted.get("quat_no_antipodal")
         )
 
     def _run(self, awaited: Any, limit_s: float | None = None) -> Any:
@@ -230,11 +221,8 @@ class Checkpoint:
             config, str(folder), preprocessor_overrides={"device_processor": {"device": config.device}}
         )
         cameras = {SCHEMA.views[view].lerobot_key: name for name, view in VIEWS.items()}
-        unknown = [key for key in config.image_features if key not in cameras]
-        if unknown:
-            raise PipelineError(
-                f"the policy wants the images {', '.join(unknown)}", where=folder, expected=", ".join(cameras)
-            )
+        if unknown := ", ".join(key for key in config.image_features if key not in cameras):
+            raise PipelineError(f"the policy wants the images {unknown}", where=folder, expected=", ".join(cameras))
         self._cameras = {key: name for key, name in cameras.items() if key in config.image_features}
         self._sizes_px = {key: config.image_features[key].shape[1:] for key in self._cameras}
         chunked = getattr(config, "n_obs_steps", 1) == 1 and getattr(config, "temporal_ensemble_coeff", None) is None
@@ -280,9 +268,10 @@ def content_of(checkpoint: Path) -> str:
     if not (checkpoint / "config.json").is_file():
         raise PipelineError("no config.json", where=checkpoint, expected="a folder that lerobot saved a policy in")
     inside = {path.relative_to(checkpoint): path for path in checkpoint.rglob("*") if path.is_file()}
-    deciding = {
-        name.as_posix(): path
-        for name, path in inside.items()
-        if name.name not in BESIDE and not any(part.startswith(".") for part in name.parts)
-    }
-    return digest({name: checksum(path) for name, path in deciding.items()})
+    return digest(
+        {
+            name.as_posix(): checksum(path)
+            for name, path in inside.items()
+            if name.name not in BESIDE and not any(part.startswith(".") for part in name.parts)
+        }
+    )

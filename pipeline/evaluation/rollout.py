@@ -152,14 +152,12 @@ class Evaluation:
 
     def save(self, environment: EpisodeEnvironment, wanted: Wanted) -> None:
         """Write the result of the episode that ended in an environment, of a policy that asked to see ``wanted``."""
-        task, progress, changes = environment.task, environment.progress, environment.perturbations
-        own = changes if task.source == "own" else ()
-        facts = asdict(task)
-        if own:
-            facts["component"] = "+".join(change.component for change in own)
+        task, progress = environment.task, environment.progress
+        own = environment.perturbations if task.source == "own" else ()
+        component = "+".join(change.component for change in own) or task.component
         self.files.save(
             EpisodeResult(
-                **facts,
+                **asdict(task) | {"component": component},
                 episode=self.episode(task),
                 prompt=self.settings.prompt,
                 instruction=environment.instruction,
@@ -189,7 +187,6 @@ def _deciding(row: EpisodeResult) -> dict[str, str]:
 
 @cache
 def _installed(packages: tuple[str, ...]) -> dict[str, str]:
-    """Package to version, of those that are there."""
     found = {}
     for package in packages:
         with suppress(PackageNotFoundError):

@@ -125,7 +125,6 @@ def _check_names(selection: Selection) -> None:
 
 
 def _check_known(field: str, named: Iterable[object], known: Collection[object], selection: Selection) -> None:
-    """Refuse a name of a field that is not known, with all that are."""
     if unknown := [name for name in named if name not in known]:
         raise PipelineError(
             f"{selection.file or selection.source} has no {unknown[0]!r}",
@@ -175,15 +174,12 @@ def _pairs(task: Task, turn: int, number: int, selection: Selection) -> Iterator
 
 
 def _matches(task: EvaluationTask, selection: Selection) -> bool:
-    for field, column in COLUMNS.items():
-        if getattr(selection, field) and getattr(task, column) not in getattr(selection, field):
-            return False
-    names = (task.name, task.base)
-    return not selection.tasks or any(fnmatch.filter(names, pattern) for pattern in selection.tasks)
+    named = not selection.tasks or any(fnmatch.filter((task.name, task.base), one) for one in selection.tasks)
+    asked = {column: getattr(selection, field) for field, column in COLUMNS.items()}
+    return named and all(not values or getattr(task, column) in values for column, values in asked.items())
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:
-    """Refuse a name that none of the listed tasks has."""
     for field in ("axes", "components", "levels"):
         known = {getattr(task, COLUMNS[field]) for task in listed}
         _check_known(field, getattr(selection, field), known, selection)

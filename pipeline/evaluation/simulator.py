@@ -96,11 +96,8 @@ class Simulator(Environment):
     """
 
     def __init__(self, task: Task, files: SceneFiles | None = None):
-        if files is None:
-            super().__init__(task)
-        else:
-            styles = _styles({"floor": files.floor, "wall": files.wall})
-            super().__init__(task, styles, files.scene_xml)
+        own = () if files is None else (_styles({"floor": files.floor, "wall": files.wall}), files.scene_xml)
+        super().__init__(task, *own)
         self._rewind: _Rewind | None = None
 
     @property
@@ -126,10 +123,10 @@ class Simulator(Environment):
         """
         env = self._env.env
         self._push = None
-        if self._rewind is None or (seed, posture_rad) != (self._rewind.seed, self._rewind.posture_rad):
+        saved = self._rewind
+        if saved is None or (seed, posture_rad) != (saved.seed, saved.posture_rad):
             self._reset(seed, posture_rad)
         else:
-            saved = self._rewind
             mujoco.mj_resetData(self.model, env.sim.data._data)
             mujoco.mj_setState(self.model, env.sim.data._data, saved.physics, _PHYSICS)
             env.sim.model.site_rgba[:] = saved.site_rgba

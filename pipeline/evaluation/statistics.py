@@ -198,9 +198,8 @@ def _compared(pairs: Sequence[Pair]) -> dict[str, Any]:
     counts = Counter((one.success, other.success) for one, other in pairs)
     both, only_first, only_second = counts[True, True], counts[True, False], counts[False, True]
     outcomes = np.array([(one.success, other.success, 1) for one, other in pairs], float)
-    measured = interval(
-        [(row.suite, row.base) for row, _ in pairs], [row.trial for row, _ in pairs], outcomes, difference
-    )
+    bases, trials = [(row.suite, row.base) for row, _ in pairs], [row.trial for row, _ in pairs]
+    measured = interval(bases, trials, outcomes, difference)
     return {
         "episodes": len(pairs),
         "both": both,

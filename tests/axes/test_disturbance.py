@@ -162,7 +162,7 @@ def test_held_out_draws_push_a_policy_once() -> None:
     positions = []
     for _ in range(push.first_step + push.steps + 5):
         evaluated.step([0.0] * 6 + [-1.0])
-        positions.append(evaluated.observed.state[:3])
+        positions.append(evaluated.simulator.observed.state[:3])
     evaluated.close()
     away_m = np.linalg.norm(np.array(positions) - positions[push.first_step - 1], axis=1)
     assert away_m[: push.first_step].max() < 0.003, "at rest"

@@ -176,13 +176,13 @@ def test_results_depend_on_the_files_of_their_task_wherever_they_are(
 def test_scenes_of_the_archive_are_seen(environment: EpisodeEnvironment, tasks: dict[str, TestTask]) -> None:
     clean = EvaluationTask("libero", STOVE.suite, STOVE.name, "clean", "clean", "clean", 0, 0)
     environment.reset(clean)
-    state, seen = environment._simulator.state, environment.image("wrist").copy()
+    state, seen = environment.simulator.state, environment.image("wrist").copy()
     for axis in ("light", "background"):
         environment.reset(named(tasks[axis]))
-        assert np.array_equal(environment._simulator.state, state), "what it looks like changes no state"
+        assert np.array_equal(environment.simulator.state, state), "what it looks like changes no state"
         assert not np.array_equal(environment.image("wrist"), seen)
         if axis == "light":
-            diffuse = environment._simulator.model.light_diffuse
+            diffuse = environment.simulator.model.light_diffuse
             assert np.allclose(diffuse, [float(number) for number in DIFFUSE.split()])
     environment.reset(named(tasks["floor"]))
     assert environment.image("agentview")[..., 2].mean() > environment.image("agentview")[..., 0].mean(), "a blue floor"
@@ -195,9 +195,9 @@ def test_added_objects_start_where_the_benchmark_puts_them(
     test = tasks["layout"]
     environment.reset(named(test))
     category, *_ = str(test.parameters["category"]).split(",")
-    first = environment._simulator.model.joint(f"{category}_1_joint0").qposadr[0]
+    first = environment.simulator.model.joint(f"{category}_1_joint0").qposadr[0]
     start_m = moved_state(test.suite, test.name)[1 + first : 1 + first + 3]
-    now_m = environment._simulator.state[1 + first : 1 + first + 3]
+    now_m = environment.simulator.state[1 + first : 1 + first + 3]
     assert np.abs(now_m - start_m)[:2].max() < 0.1
     assert now_m[2] < start_m[2] - 0.05, "it falls while things settle"
     environment.step(np.zeros(7))

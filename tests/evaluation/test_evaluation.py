@@ -84,7 +84,7 @@ def test_episodes_are_liberos_bit_for_bit(
         for step, (state, theirs) in enumerate(libero):
             if step:
                 evaluated.step(ACTIONS[step - 1])
-            assert np.array_equal(evaluated._simulator.state, state), f"state at step {step}"
+            assert np.array_equal(evaluated.simulator.state, state), f"state at step {step}"
             ours = evaluated.observation(Wanted())
             quat_xyzw = theirs["robot0_eef_quat"].copy()
             expected = [theirs["robot0_eef_pos"], transform.quat2axisangle(quat_xyzw), theirs["robot0_gripper_qpos"]]
@@ -105,7 +105,7 @@ def test_a_camera_task_is_seen_from_the_axis_camera(evaluated: EpisodeEnvironmen
     camera = evaluated._picture._opened._renderer.model.camera("agentview")
     test = load().by_name[task.suite, task.name]
     own = CameraPerturbation.model_validate({"component": test.component, "level": 1, **test.parameters})
-    nominal = evaluated._simulator.model.camera("agentview")
+    nominal = evaluated.simulator.model.camera("agentview")
     pos_m, quat_wxyz = own.pose(nominal.pos, nominal.quat)
     assert np.abs(camera.pos - pos_m).max() < 1.1e-4
     same_sign = np.sign(camera.quat @ quat_wxyz) * quat_wxyz  # of opposite sign, a quaternion is the same turn
@@ -119,10 +119,10 @@ def test_a_camera_task_is_seen_from_the_axis_camera(evaluated: EpisodeEnvironmen
 @pytest.mark.slow
 def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: EpisodeEnvironment) -> None:
     evaluated.reset(FIRST)
-    clean = evaluated.observed.joint_state
+    clean = evaluated.simulator.observed.joint_state
     task = some_test_task("robot", "initial_joints")
     evaluated.reset(task)
-    drift_rad = np.linalg.norm(evaluated.observed.joint_state - clean)
+    drift_rad = np.linalg.norm(evaluated.simulator.observed.joint_state - clean)
     # The benchmark's postures are 0.1 to 0.5 rad away; ten settling steps reach some of it.
     assert 0.01 < drift_rad < 0.6
     # By LIBERO's own code, with the posture in place of its own.
@@ -134,7 +134,7 @@ def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: E
     env.set_init_state(libero_states(STOVE)[0])
     for _ in range(10):
         env.step([0.0] * 6 + [-1.0])
-    assert np.array_equal(evaluated._simulator.state, env.get_sim_state())
+    assert np.array_equal(evaluated.simulator.state, env.get_sim_state())
     env.close()
 
 
@@ -167,7 +167,7 @@ def test_noise_changes_the_views_that_it_names(evaluated: EpisodeEnvironment) ->
     for kind, noisy in ((NoisePerturbation, "agentview"), (WristNoise, "wrist")):
         evaluated.reset(FIRST)
         noise = kind(component="gaussian", effect=Gaussian(sigma_px=3), level=1, seed=0)
-        evaluated._picture.show(evaluated._simulator.model, (noise,))
+        evaluated._picture.show(evaluated.simulator.model, (noise,))
         seen = evaluated.observation(Wanted())["images"]
         assert {view for view in clean if not np.array_equal(seen[view], clean[view])} == {noisy}
 

@@ -267,7 +267,7 @@ def test_liberos_environment_judges_the_new_goal_and_not_the_old(evaluated: Epis
         """Whether the episode succeeds when ``thing`` is let go above the plate."""
         progress = evaluated.reset(task)
         assert not progress.success
-        simulator = evaluated._simulator
+        simulator = evaluated.simulator
         state = simulator.state
         starts.append(state.copy())
         joint = simulator.model.joint(f"{thing}_joint0")

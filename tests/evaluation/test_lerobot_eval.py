@@ -79,7 +79,7 @@ def test_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
         if step:
             seen, *_ = ours.step(ACTIONS[step - 1])
         # In libero_object the last bits of velocities differ, by 1e-16.
-        np.testing.assert_allclose(ours._environment._simulator.state, state, rtol=0, atol=1e-12, err_msg=str(step))
+        np.testing.assert_allclose(ours._environment.simulator.state, state, rtol=0, atol=1e-12, err_msg=str(step))
         assert ours.observation_space.contains(seen)
         robot = seen["robot_state"]
         flat = {f"{part}/{name}": value for part, values in robot.items() for name, value in values.items()}
