@@ -124,7 +124,6 @@ def _client() -> httpx.Client:
 
 
 def _content(body: bytes) -> str:
-    """The text of a completion."""
     try:
         content = json.loads(body)["choices"][0]["message"]["content"]
     except (ValueError, RecursionError) as error:

@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import yaml
+from jinja2 import StrictUndefined, Template
 from pydantic import TypeAdapter
 
 from pipeline.axes.language import CLASSES, LENGTH, REMEDY, Bank, Component, lint, load_bank, normalise, read_bank
@@ -31,39 +32,14 @@ IDLE_ANSWERS = 3
 ASKED_AT_ONCE = 20
 """Longer lists get worse towards their end."""
 
-WANTED: dict[Component, str] = {
-    "distraction": "The request stands among talk that has nothing to do with it (weather, family, errands, moods), "
-    "as people talk while they ask for something. The talk must not name things of the scene or ask for anything else. "
-    "What is asked for is called by its name.",
-    "common_sense": "The things are not called by their names but by what everybody knows about them: what they are "
-    "used for, made of or look like, where one buys them. Among the things of the scene each description fits one.",
-    "reasoning_chain": "What to do has to be inferred in two or more steps: by exclusion, from a wish, a plan, a "
-    "condition or an order of places, with one conclusion.",
-    "paraphrase": "The same request in other words and grammar: other verbs, another order, a question, a wish, a few "
-    "words only. Things keep their names, and nothing is added.",
-}
 
+def brief(bddl_file: Path) -> dict[str, Any]:
+    """Read a task's scene and goal, as a model is told of them.
 
-@dataclass(frozen=True)
-class Brief:
-    """What a model is told about a task.
-
-    Attributes:
-        task: suite and name, its place in a bank, are the BDDL file's folder and stem; the instruction is LIBERO's
-            wording where the task is one of LIBERO's, else the BDDL file's own.
-        things: kinds of movable objects and fixtures, with their number where there are several.
-        start: what is where at first.
-        goal: what has to be so at the end.
-    """
-
-    task: Task
-    things: tuple[str, ...]
-    start: tuple[str, ...]
-    goal: tuple[str, ...]
-
-
-def brief(bddl_file: Path) -> Brief:
-    """Read a task's scene and goal.
+    Returns:
+        ``task``, whose suite and name, its place in a bank, are the BDDL file's folder and stem, and whose instruction
+        is LIBERO's where the task is one of LIBERO's; kinds of movable objects and fixtures, with their number where
+        there are several (``things``); what is where at first (``start``), and has to be so at the end (``goal``).
 
     Raises:
         PipelineError: when the file cannot be read or does not define a task.
@@ -72,12 +48,12 @@ def brief(bddl_file: Path) -> Brief:
     suite, name = bddl_file.resolve().parent.name, bddl_file.stem
     known = {task.name: task.instruction for task in tasks(suite)} if suite in SUITES else {}
     kinds = Counter([*bddl.objects.values(), *bddl.fixtures.values()])
-    return Brief(
-        task=Task(suite, name, known.get(name, bddl.language), bddl_file),
-        things=tuple(_words(kind) if count == 1 else f"{count} x {_words(kind)}" for kind, count in kinds.items()),
-        start=tuple(map(_sentence, bddl.start)),
-        goal=tuple(map(_sentence, bddl.goal)),
-    )
+    return {
+        "task": Task(suite, name, known.get(name, bddl.language), bddl_file),
+        "things": [_words(kind) if count == 1 else f"{count} x {_words(kind)}" for kind, count in kinds.items()],
+        "start": list(map(_sentence, bddl.start)),
+        "goal": list(map(_sentence, bddl.goal)),
+    }
 
 
 def _words(name: str) -> str:
@@ -89,35 +65,16 @@ def _sentence(fact: Fact) -> str:
     return f"{fact[0]}({', '.join(map(_words, fact[1:]))})"
 
 
-def prompt(told: Brief, component: Component, count: int, have: list[str], refused: Counter[str]) -> str:
+def prompt(told: Mapping[str, Any], component: Component, count: int, have: list[str], refused: Counter[str]) -> str:
     """The question for ``count`` more rewrites of one class."""
-    return "\n".join(
-        [
-            "Rewrite an instruction for a robot arm at a table.",
-            f"The instruction: {told.task.instruction}",
-            f"Everything in the scene: {', '.join(told.things)}",
-            f"At first: {'; '.join(told.start)}",
-            f"Done when: {'; '.join(told.goal)}",
-            f"What kind of rewrite: {WANTED[component]}",
-            "Each rewrite must ask for exactly this and nothing more, must be natural, and must leave only one "
-            "reading in this scene: the same thing, the same place, the same relation, the same order. "
-            "Vary length and form from one to the next.",
-            "Write them in lower case, letters only with , . ? ! ; : ' - between words, no digits, no underscores, no "
-            f"quotation marks, no full stop at the end; each has {LENGTH}.",
-            *(["Do not repeat any of these:", *(f"- {text}" for text in have)] if have else []),
-            *(
-                [f"Earlier answers were refused for: {'; '.join(reason for reason, _ in refused.most_common(5))}."]
-                if refused
-                else []
-            ),
-            f"Answer with a JSON list of exactly {count} strings and nothing else.",
-        ]
-    )
+    text = Path(__file__).with_name("prompt.txt.j2").read_text()
+    reasons = [reason for reason, _ in refused.most_common(5)]
+    known = {**told, "component": component, "count": count, "have": have, "refused": reasons, "length": LENGTH}
+    question: str = Template(text, undefined=StrictUndefined, trim_blocks=True).render(known)
+    return question
 
 
-def extend(
-    bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str], report: Callable[[str], None] = print
-) -> None:
+def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]) -> None:
     """Ask until the bank ``out`` has ``per_class`` rewrites of each class for the task.
 
     What ``out`` holds stays, and after each answer it holds what was accepted, so a run that was stopped goes on.
@@ -125,15 +82,17 @@ def extend(
     Args:
         bddl_file: the task, ``<suite>/<task>.bddl``.
         ask: answers a prompt, such as a ``LanguageModel``.
-        report: told of progress.
 
     Raises:
         PipelineError: when a file cannot be read, the model cannot be reached, or too few rewrites were acceptable.
     """
     told, bank = brief(bddl_file), read_bank(out) if out.exists() else {}
-    task = told.task
+    task: Task = told["task"]
     stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
-    _check(stored, task, out)
+    for component, text in ((component, text) for component, texts in stored.items() for text in texts):
+        if fault := lint(text, task, component):  # which the language axis would refuse
+            what = f"{component} rewrite {text!r} of {task.suite}/{task.name} is refused: {fault}"
+            raise PipelineError(what, where=out, remedy=REMEDY)
     shipped = load_bank().get(task.suite, {}).get(task.name, {})
     taken = {normalise(text) for texts in (*stored.values(), *shipped.values()) for text in texts}
     refused: Counter[str] = Counter()
@@ -149,7 +108,7 @@ def extend(
                 stored[component] += tuple(accepted)
                 bank.setdefault(task.suite, {})[task.name] = stored
                 _write(bank, out)
-            report(f"{component}: {len(stored[component])} of {per_class}{_because(reasons)}")
+            print(f"{component}: {len(stored[component])} of {per_class}{_because(reasons)}")
     if any(len(stored[component]) < per_class for component in CLASSES):
         counts = ", ".join(f"{component} {len(stored[component])}" for component in CLASSES)
         raise PipelineError(
@@ -158,18 +117,6 @@ def extend(
             expected=f"{per_class} of each class",
             remedy="run it again, it goes on from what was accepted; or ask another model",
         )
-
-
-def _check(stored: Mapping[Component, Iterable[str]], task: Task, out: Path) -> None:
-    """Refuse a bank that the language axis would refuse."""
-    for component, texts in stored.items():
-        for text in texts:
-            if fault := lint(text, task, component):
-                raise PipelineError(
-                    f"{component} rewrite {text!r} of {task.suite}/{task.name} is refused: {fault}",
-                    where=out,
-                    remedy=REMEDY,
-                )
 
 
 def _offered(ask: Callable[[str], str], question: str) -> list[str] | str:
@@ -191,8 +138,7 @@ def _sift(
     for text in map(tidy, offered):
         if len(accepted) == wanted:
             break
-        fault = lint(text, task, component) or ("a repetition" if normalise(text) in taken else None)
-        if fault:
+        if fault := lint(text, task, component) or ("a repetition" if normalise(text) in taken else None):
             reasons[fault] += 1
         else:
             accepted.append(text)

@@ -159,9 +159,9 @@ def test_two_of_a_kind_are_told_apart(server: Server) -> None:
         "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
     )
     told = rewrite.brief(task.bddl_file)
-    assert told.task == task
-    assert "2 x akita black bowl" in told.things
-    assert "plate" in told.things
+    assert told["task"] == task
+    assert "2 x akita black bowl" in told["things"]
+    assert "plate" in told["things"]
 
 
 GOOD = "please light the big stove"
