@@ -21,7 +21,7 @@ from pipeline.axes.scene import ScenePerturbation, displacements
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage
-from pipeline.report.figures import Groups, Panel, bars, histogram, scatter, strips
+from pipeline.report.figures import Panel, bars, histogram, scatter, strips
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Task
 
@@ -50,16 +50,12 @@ class AxisPlots(NamedTuple):
 
 def of(axis: str, draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     """The coverage of one axis by the draws on it."""
-    made = [draw.made for draw in draws]
-    of_draws = {"language": _language, "layout": _layout}
-    alone: dict[str, Callable[[Sequence[Any], TestSet], AxisPlots]] = {
-        **{"camera": _camera, "light": _light, "background": _background},
-        **{"noise": _noise, "pose": _pose, "robot": _robot},
+    plots: dict[str, Callable[[Sequence[Any], TestSet], AxisPlots]] = {
+        **{"camera": _camera, "light": _light, "background": _background, "noise": _noise},
+        **{"language": _language, "layout": _layout, "pose": _pose, "robot": _robot},
     }
-    if axis in of_draws:
-        shown = of_draws[axis](draws, test)
-    else:
-        shown = alone[axis](made, test) if axis in alone else _numbers(axis, made, test)
+    made: Sequence[Any] = draws if axis in ("language", "layout") else [draw.made for draw in draws]
+    shown = plots[axis](made, test) if axis in plots else _numbers(axis, made, test)
     unit = AXES[axis].draws[0].unit
     if unit is None or not test.of(axis):
         return shown
@@ -80,13 +76,9 @@ def _distances(axis: str, draws: Sequence[Draw], test: TestSet, unit: str) -> Pa
 def _numbers(axis: str, draws: Sequence[Perturbation], test: TestSet) -> AxisPlots:
     """An axis that has no plots of its own: the level and every parameter that is one number."""
     names = [name for name, field in AXES[axis].draws[0].model_fields.items() if field.annotation in (int, float)]
-    return AxisPlots(
-        f"{len(test.of(axis)):,} test tasks.",
-        [
-            strips(name.replace("_", " "), {"draws": {axis: np.array([getattr(p, name) for p in draws], float)}}, name)
-            for name in ("level", *names)
-        ],
-    )
+    values = {name: np.array([getattr(p, name) for p in draws], float) for name in ("level", *names)}
+    shown = [strips(name.replace("_", " "), {"draws": {axis: own}}, name) for name, own in values.items()]
+    return AxisPlots(f"{len(test.of(axis)):,} test tasks.", shown)
 
 
 def _camera(draws: Sequence[CameraPerturbation], test: TestSet) -> AxisPlots:
@@ -117,11 +109,10 @@ def _light(draws: Sequence[LightPerturbation], test: TestSet) -> AxisPlots:
         "gloss": ("multiple of the specular light", [p.specular_scale for p in draws]),
         "direction": ("lamps tilted by (°)", [p.tilt_deg for p in draws]),
     }
-    shown = [strips(name, {"draws": {"light": np.array(values)}}, label) for name, (label, values) in columns.items()]
     return AxisPlots(
         f"{len(test.of('light')):,} test tasks, whose values are unknown offline: they are published only within the "
         f"benchmark's asset archive. {sum(p.shadows for p in draws)} of {len(draws)} draws cast shadows.",
-        shown,
+        [strips(name, {"draws": {"light": np.array(own)}}, label) for name, (label, own) in columns.items()],
     )
 
 
@@ -167,16 +158,13 @@ def _language(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
         name.replace("_", " "): {"language": np.array([away for component, away in own if component == name])}
         for name in CLASSES
     }
+    every = {"benchmark": far, "language": np.array([away for _, away in own])}
+    label = "share of characters edited"
     return AxisPlots(
         f"{len(tested):,} test instructions, of no stated class. The distance is the share of characters to edit.",
         [
-            histogram(
-                "distance to the original wording",
-                {"benchmark": far, "language": np.array([away for _, away in own])},
-                np.linspace(0, 1, 21),
-                "share of characters edited",
-            ),
-            strips("the same by class", rows, "share of characters edited"),
+            histogram("distance to the original wording", every, np.linspace(0, 1, 21), label),
+            strips("the same by class", rows, label),
         ],
     )
 
@@ -208,19 +196,20 @@ def _pose(draws: Sequence[PosePerturbation | ScenePerturbation], test: TestSet) 
     targets = np.array([[float(p["dx_m"]), float(p["dy_m"])] for p in tested if "dx_m" in p]).reshape(-1, 2)
     alone = [p for p in draws if isinstance(p, PosePerturbation)]
     scenes = [p for p in draws if isinstance(p, ScenePerturbation)]
+
+    def to(title: str, tests: Floats, own: Sequence[tuple[float, float]]) -> Panel:
+        groups = {"benchmark": 100 * tests, "pose": 100 * np.array(own).reshape(-1, 2)}
+        return scatter(title, groups, "dx (cm)", "dy (cm)", equal=True)
+
     panels = []
     if alone:
-        own = np.array([[p.dx_m, p.dy_m] for p in alone]).reshape(-1, 2)
-        groups: Groups = {"benchmark": 100 * targets, "pose": 100 * own}
-        panels += [
-            scatter("where the moved object goes", groups, "dx (cm)", "dy (cm)", True),
-            strips("how far it turns", {"yaw": {"pose": np.array([p.dyaw_deg for p in alone])}}, "degrees"),
-        ]
+        turns = {"yaw": {"pose": np.array([p.dyaw_deg for p in alone])}}
+        panels.append(to("where the moved object goes", targets, [(p.dx_m, p.dy_m) for p in alone]))
+        panels.append(strips("how far it turns", turns, "degrees"))
     if scenes or not alone:
-        moved = [shift for p in tested for shift in displacements(p).values()]
-        shifts = np.array([[move.dx_m, move.dy_m] for p in scenes for move in p.moves]).reshape(-1, 2)
-        groups = {"benchmark": 100 * np.array(moved).reshape(-1, 2), "pose": 100 * shifts}
-        panels.append(scatter("where each thing of a scene goes", groups, "dx (cm)", "dy (cm)", True))
+        moved = np.array([shift for p in tested for shift in displacements(p).values()]).reshape(-1, 2)
+        own = [(move.dx_m, move.dy_m) for p in scenes for move in p.moves]
+        panels.append(to("where each thing of a scene goes", moved, own))
     return AxisPlots(
         f"{len(tested):,} test tasks, of which {len(targets):,} move the target, and all of which move everything "
         f"else as well. {len(scenes)} of {len(draws)} draws move the whole scene. Turns are this project's own.",

@@ -50,7 +50,12 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
             }
             for policy in policies
         },
-        "common": {source: _common([rows for policy in policies if (rows := policy.of(source))]) for source in sources},
+        "common": {
+            source: len(
+                set.intersection(*({row.trial for row in rows} for one in policies if (rows := one.of(source))))
+            )
+            for source in sources
+        },
         "paper_table": paper_table(tested) if tested else None,
         "comparisons": [
             {"source": source, "first": one.name, "second": other.name, **compare(pairs)}
@@ -70,40 +75,25 @@ def findings(policies: Sequence[Evaluated]) -> dict[str, Any]:
     }
 
 
-def _common(rows: Sequence[Sequence[EpisodeResult]]) -> int:
-    return len(set.intersection(*({row.trial for row in group} for group in rows)))
-
-
 def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
     """Of each source and axis those with a video first, then the weakest perturbations, then by name."""
     failed = [row for row in policy.rows if not row.success]
     failed.sort(key=lambda row: (row.axis, row.episode not in policy.videos, row.level, row.episode))
-    taken: Counter[tuple[str, str]] = Counter()
-    shown = []
+    groups: dict[tuple[str, str], list[EpisodeResult]] = defaultdict(list)
     for row in failed:
-        taken[row.source, row.axis] += 1
-        if taken[row.source, row.axis] <= FAILURES:
-            shown.append(row)
-    return shown
+        groups[row.axis, row.source].append(row)
+    return [row for group in groups.values() for row in group[:FAILURES]]
 
 
 def _versions(rows: Sequence[EpisodeResult]) -> dict[str, list[str]]:
-    """Package, and what rendered, to its versions; several where machines differ."""
     names = dict.fromkeys(name for row in rows for name in row.versions)
     return {name: sorted({row.versions[name] for row in rows if name in row.versions}) for name in names}
 
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 
-COLUMNS = {
-    "camera": ("camera",),
-    "robot": ("robot",),
-    "language": ("language",),
-    "light": ("light",),
-    "background": ("background",),
-    "noise": ("noise",),
-    "layout": ("layout", "pose"),
-}
+_SAME = ("camera", "robot", "language", "light", "background", "noise")
+COLUMNS: dict[str, tuple[str, ...]] = {**{axis: (axis,) for axis in _SAME}, "layout": ("layout", "pose")}
 """The paper's dimensions to this project's axes."""
 
 NAMES = {("layout", "objects"): "confounding objects", ("pose", "pose"): "displaced targets"}
@@ -170,17 +160,11 @@ def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, An
         rates = dict(zip(packed["columns"], row["rates"], strict=True))
         mean = _mean({column: rates[column] for column in shared}, tasks) if shared else None
         published.append({"name": name, "rates": rates, "total": row["total"], "shared": mean})
-    return {
-        "source": packed["source"],
-        "tasks": tasks,
-        "shared": shared,
-        "published": published,
-        "evaluated": evaluated,
-    }
+    found = {"source": packed["source"], "tasks": tasks, "shared": shared}
+    return {**found, "published": published, "evaluated": evaluated}
 
 
 def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None:
-    """A column's rate; None where it has no episode."""
     outcomes: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
     chosen = [row for row in rows if row.axis in axes]
     for row in chosen:
@@ -195,7 +179,6 @@ def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None
 
 
 def _joined(parts: Mapping[Any, Estimate], sizes: Mapping[Any, int]) -> Estimate:
-    """The rate over several parts of the benchmark, each weighted by its number of tasks."""
     rate = _mean({name: part.rate for name, part in parts.items()}, sizes)
     whole = sum(sizes[name] for name in parts)
     effective = whole**2 / sum(sizes[name] ** 2 / part.effective for name, part in parts.items())
@@ -204,12 +187,10 @@ def _joined(parts: Mapping[Any, Estimate], sizes: Mapping[Any, int]) -> Estimate
 
 
 def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
-    """The mean, weighted by the numbers of tasks."""
     return sum(sizes[name] * rate for name, rate in rates.items()) / sum(sizes[name] for name in rates)
 
 
 def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
-    """Which components, suites and levels of a column have no episode; ``rows`` are those of its axes."""
     run = {(row.axis, row.component) for row in rows}
     components = {kind: count for kind, count in _sizes(axes, 2).items() if kind not in run}
     tests = [kind for kind in _tests() if kind[0] in {axis for axis, _ in run}]
@@ -235,5 +216,4 @@ def _sizes(axes: Sequence[str], columns: int) -> Counter[Any]:
 
 @cache
 def _tests() -> Counter[tuple[str, str, int, str]]:
-    """How many test tasks there are of each axis, component, level and suite."""
     return Counter((test.axis, test.component, test.level, test.suite) for test in benchmark.load().tasks)

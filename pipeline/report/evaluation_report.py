@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
-from pipeline.files import replaced
+from pipeline.files import write_json
 from pipeline.report import figures, pages
 from pipeline.report.evaluation_findings import FAILURES, findings
 from pipeline.report.figures import Panel, Share
@@ -52,8 +51,7 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
     found = findings(policies)
     pages.write(page(found, {episode: file for policy in policies for episode, file in policy.videos.items()}), path)
     beside = path.with_suffix(".json")
-    with replaced(beside) as temporary:
-        temporary.write_text(json.dumps(found, indent=2) + "\n")
+    write_json(beside, found)
     rates = {
         name: {source: one["all"] for source, one in policy["results"].items()}
         for name, policy in found["policies"].items()
@@ -88,7 +86,6 @@ def page(found: Mapping[str, Any], videos: Mapping[str, Path]) -> str:
 
 
 def _differ(found: Mapping[str, Any]) -> bool:
-    """Whether some policy ran episodes that another did not."""
     policies = found["policies"].values()
     return any(
         policy["results"].get(source, {"all": {"episodes": 0}})["all"]["episodes"] != common

@@ -83,7 +83,6 @@ class Stage:
 
     @cached_property
     def _twin(self) -> Trajectory:
-        """The replay without a push, which all strips show."""
         return replay(shared(self.demo.task), self.demo, "twin", self.replay)
 
     def strip(self, perturbation: DisturbancePerturbation) -> list[tuple[int, list[Frame]]]:
@@ -206,7 +205,6 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
 
 
 def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
-    """What a push does, step by step, beside the replay without it; nothing where it is refused."""
     if not isinstance(push, DisturbancePerturbation):
         return []
     try:

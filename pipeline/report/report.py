@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from itertools import zip_longest
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,7 +74,7 @@ def page(config: Config, test: TestSet) -> str:
         overall=_histograms({axis: _stacked(rows, actions) for axis, rows in by_axis(kept).items()}),
         by_axis=_own_motion(kept, actions),
         lengths=_lengths(rows, kept),
-        quality=_quality(kept),
+        quality=[_strips(each.name, kept, itemgetter(each.name), each.name) for each in fields(Quality)],
         worst=_worst(kept, load),
         seen=seen.measure(config, test),
         coverage=_coverage(tried, test),
@@ -110,7 +111,6 @@ def _actions(kept: Rows, frames: FrameStore) -> dict[str, Floats]:
 
 
 def _histograms(groups: Mapping[str, Floats]) -> list[Panel]:
-    """One panel for each entry of an action, from actions (N, 7) by group."""
     low, high = SCHEMA.action.range
     bins = np.linspace(low, high, 42)  # an odd number, so that zero has a bin of its own
     return [
@@ -135,33 +135,23 @@ def _own_motion(kept: Rows, actions: Mapping[str, Floats]) -> dict[str, list[Pan
     return shown
 
 
+def _strips(title: str, rows: Rows, of: Callable[[Mapping[str, Any]], float | None], label: str) -> Panel:
+    """A figure of each episode, by axis; those that have none are left out."""
+    values = {axis: [value for row in group if (value := of(row)) is not None] for axis, group in by_axis(rows).items()}
+    return figures.strips(title, {axis: {axis: np.array(own, float)} for axis, own in values.items()}, label)
+
+
 def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
-    """Episode lengths by suite, and against the twins', whether these were kept or not."""
-    panels = []
-    for suite in dict.fromkeys(row["suite"] for row in kept):
-        of_axis = by_axis([row for row in kept if row["suite"] == suite]).items()
-        lengths = {axis: {axis: np.array([float(row["steps"]) for row in group])} for axis, group in of_axis}
-        panels.append(figures.strips(suite, lengths, "steps"))
+    suites = dict.fromkeys(row["suite"] for row in kept)
+    of_suites = {suite: [row for row in kept if row["suite"] == suite] for suite in suites}
+    panels = [_strips(suite, own, itemgetter("steps"), "steps") for suite, own in of_suites.items()]
     steps = {row["episode_id"]: row["steps"] for row in rows}
-    longer = {
-        axis: {axis: np.array([row["steps"] - steps[row["twin_id"]] for row in group if steps[row["twin_id"]]])}
-        for axis, group in by_axis(kept).items()
-        if axis != "clean"
-    }
-    return [*panels, figures.strips("longer than the twin by", longer, "steps")] if longer else panels
 
+    def longer(row: Mapping[str, Any]) -> float | None:
+        return row["steps"] - steps[row["twin_id"]] if steps[row["twin_id"]] else None
 
-def _quality(kept: Rows) -> list[Panel]:
-    """A panel for each figure of quality, by axis."""
-    groups = by_axis(kept).items()
-    return [
-        figures.strips(
-            each.name,
-            {axis: {axis: np.array([float(row[each.name]) for row in rows])} for axis, rows in groups},
-            each.name,
-        )
-        for each in fields(Quality)
-    ]
+    perturbed = [row for row in kept if row["axis"] != "clean"]
+    return [*panels, _strips("longer than the twin by", perturbed, longer, "steps")] if perturbed else panels
 
 
 def _worst(kept: Rows, load: EpisodeLoader) -> list[Video]:
@@ -169,14 +159,12 @@ def _worst(kept: Rows, load: EpisodeLoader) -> list[Video]:
     by_id = {row["episode_id"]: row for row in kept}
     twins = {row["trajectory_id"] for row in kept if row["role"] == "twin"}
     paired = [row for row in kept if row["twin_id"] in by_id and row["trajectory_id"] not in twins]
-    of_trajectory = {row["trajectory_id"]: row for row in paired}
-    moving = [row for row in of_trajectory.values() if row["non_target_moved_m"]]
+    moving = [row for row in {row["trajectory_id"]: row for row in paired}.values() if row["non_target_moved_m"]]
     shown = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
     return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in shown]
 
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
-    """Axis to its coverage by kept episodes, and its yields by component and level."""
     draws: dict[str, list[Draw]] = {}
     rows: dict[str, list[Mapping[str, Any]]] = {}
     for row in tried:
@@ -210,7 +198,8 @@ def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
     by_id = {row["episode_id"]: row for row in kept}
     videos = []
     for rows in by_axis(kept).values():
-        seen = [row for row in rows if row["twin_id"] in by_id and _looks_different(row, by_id[row["twin_id"]])]
+        paired = [row for row in rows if row["twin_id"] in by_id]
+        seen = [row for row in paired if _agent_view(row) != _agent_view(by_id[row["twin_id"]])]
         if seen:
             row = min(seen, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
             videos.append(_video(row, load, "; ".join(describe(made) for made in from_json(row["perturbations"]))))
@@ -222,9 +211,8 @@ def _video(row: Mapping[str, Any], load: EpisodeLoader, caption: str) -> Video:
     return Video(row["axis"], caption, row["instruction"], pages.beside(twin.frames["image"], episode.frames["image"]))
 
 
-def _looks_different(row: Mapping[str, Any], twin: Mapping[str, Any]) -> bool:
-    shown, clean = streams_of(row["perturbations"])["image"], streams_of(twin["perturbations"])["image"]
-    return bool(shown != clean or row["trajectory_id"] != twin["trajectory_id"])
+def _agent_view(row: Mapping[str, Any]) -> tuple[object, str]:
+    return streams_of(row["perturbations"])["image"], row["trajectory_id"]
 
 
 def _level(row: Mapping[str, Any]) -> int:

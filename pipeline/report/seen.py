@@ -166,7 +166,6 @@ def measure(config: Config, test: TestSet) -> list[Measure]:
 
 
 def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
-    """By name: the spread of numbers, and of what is true or false the share."""
     values: dict[str, list[float]] = defaultdict(list)
     for name, value in pairs:
         values[name].append(value)
@@ -230,7 +229,6 @@ class _Run:
 
 
 def _of_test(tested: TestTask) -> Iterator[tuple[str, float]]:
-    """What the benchmark's files say that a test task shows."""
     known = tested.parameters
     match tested.axis:
         case "pose":

@@ -76,7 +76,6 @@ def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, An
 
 
 def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
-    """The twin and the perturbed episode beside it, at the same moment."""
     perturbations = from_json(row["perturbations"])
     # The arm is back on the demonstration's path soon after another start.
     moment = 0 if any(perturbation.layer is Layer.PHYSICS for perturbation in perturbations) else MOMENT

@@ -77,7 +77,6 @@ def _kept(counts: Counts) -> Cell:
 
 
 def _by_axis(title: str, rows: Rows, column: str) -> Table:
-    """How often each value of a column occurs on each axis."""
     counts = tally(rows, column)
     values = sorted({value for of_axis in counts.values() for value in of_axis})
     body = [
