@@ -16,7 +16,6 @@ from pipeline.types import Floats
 
 
 def _rock(rng: Rng) -> Floats:
-    """Heights (512, 512) of plaster, gravel or rock."""
     return relief(rng, float(rng.uniform(0.8, 1.7)), coarsest=float(rng.choice([2, 4, 8, 16])))
 
 
@@ -36,7 +35,6 @@ def _blocks(rng: Rng) -> Floats:
 
 
 def _weave(rng: Rng) -> Floats:
-    """Heights (512, 512) of a plain weave."""
     down, right = grid()
     threads = int(rng.choice([24, 32, 48, 64]))
     waves = np.sin(np.pi * threads * down), np.sin(np.pi * threads * right)
@@ -66,7 +64,6 @@ def _smooth(heights: Floats, sigma_px: float) -> Floats:
 
 
 def _grey(level: Floats) -> Floats:
-    """(512, 512, 3) from (512, 512)."""
     return np.repeat(level[..., None], 3, axis=2)
 
 
@@ -116,11 +113,6 @@ def _flat(rng: Rng) -> Floats:
 
 
 DATA_MAPS: dict[str, Callable[[Rng], Floats]] = {
-    "normal": _normal,
-    "height": _height,
-    "gloss": _gloss,
-    "reflection": _reflection,
-    "occlusion": _occlusion,
-    "flat": _flat,
+    make.__name__.removeprefix("_"): make for make in (_normal, _height, _gloss, _reflection, _occlusion, _flat)
 }
 """Family to what makes an image (512, 512, 3) in [0, 1] of it."""

@@ -85,7 +85,9 @@ def convert(obj: Path, out: Path, size_m: tuple[float, float, float] | None = No
         colour = quoteattr(" ".join(f"{value:.4g}" for value in part.rgba))
         texture = ""
         if part.image is not None:
-            _texture(part.image).save(out / f"{name}.png")
+            small = part.image.convert("RGB")
+            small.thumbnail((_TEXTURE_PX, _TEXTURE_PX))
+            small.save(out / f"{name}.png")
             assets.append(f'<texture name="{name}" type="2d" file="{name}.png"/>')
             texture = f' texture="{name}"'
         assets.append(f'<material name="{name}"{texture} rgba={colour} specular="0.3" shininess="0.3"/>')
@@ -164,12 +166,6 @@ def _thickened(surface: _Surface) -> _Surface:
     both = np.concatenate([faces, faces[:, ::-1] + len(vertices)])
     back = vertices - _SHEET_M * normal
     return _Surface(np.concatenate([vertices, back]), both, None if uv is None else np.tile(uv, (2, 1)))
-
-
-def _texture(image: Image.Image) -> Image.Image:
-    small = image.convert("RGB")
-    small.thumbnail((_TEXTURE_PX, _TEXTURE_PX))
-    return small
 
 
 def _write_obj(path: Path, surface: _Surface) -> None:

@@ -70,10 +70,7 @@ class ObjectModel:
     @cached_property
     def sha256(self) -> str:
         """Hash of the model and of every file that it uses."""
-        content = hashlib.sha256(self.mjcf.read_bytes())
-        for file in self.files:
-            content.update(file.read_bytes())
-        return content.hexdigest()
+        return hashlib.sha256(b"".join(file.read_bytes() for file in (self.mjcf, *self.files))).hexdigest()
 
     @cached_property
     def files(self) -> tuple[Path, ...]:
@@ -90,9 +87,8 @@ class ObjectModel:
         import mujoco
 
         assets = "".join(ET.tostring(asset, "unicode") for asset in self._assets if asset.tag == "mesh")
-        geoms = "".join(
-            ET.tostring(geom, "unicode") for geom in self._geoms("", (0, 0, 0), 1.0) if not _is_visual(geom)
-        )
+        touched = (geom for geom in self._geoms("", (0, 0, 0), 1.0) if not _is_visual(geom))
+        geoms = "".join(ET.tostring(geom, "unicode") for geom in touched)
         try:
             model = mujoco.MjModel.from_xml_string(
                 f'<mujoco><asset>{assets}</asset><worldbody><body name="object">{geoms}</body></worldbody></mujoco>'
@@ -127,9 +123,8 @@ class ObjectModel:
         except (OSError, ET.ParseError) as error:
             raise PipelineError(f"not a readable model ({error})", where=self.mjcf) from error
         # What would change the meaning of the geoms when they are moved to another model.
-        redirected = any(
-            {"meshdir", "texturedir", "assetdir"} & set(compiler.attrib) for compiler in root.iter("compiler")
-        )
+        folders = {"meshdir", "texturedir", "assetdir"}
+        redirected = any(folders & set(compiler.attrib) for compiler in root.iter("compiler"))
         turned = any(element.get("euler", "0 0 0") != "0 0 0" for element in root.iter())
         if redirected or turned or any(root.find(tag) is not None for tag in ("default", "include", "deformable")):
             raise PipelineError(
@@ -142,7 +137,6 @@ class ObjectModel:
 
     @cached_property
     def _assets(self) -> tuple[ET.Element, ...]:
-        """The meshes, materials and textures that its geoms use, with absolute paths."""
         used = {geom.get(kind) for geom in self._root.iter("geom") for kind in ("mesh", "material")}
         used |= {material.get("texture") for material in self._root.iter("material") if material.get("name") in used}
         assets = []

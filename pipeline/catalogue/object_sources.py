@@ -77,11 +77,9 @@ def converted(name: str) -> ObjectModel:
     Raises:
         PipelineError: when there is none.
     """
-    about = _about(name)
-    if about is None:
-        raise PipelineError(
-            f"the object {name} is missing", where=FOLDER / name, remedy="run the plan stage again, which converts it"
-        )
+    if (about := _about(name)) is None:
+        remedy = "run the plan stage again, which converts it"
+        raise PipelineError(f"the object {name} is missing", where=FOLDER / name, remedy=remedy)
     return ObjectModel(name, about["category"], about["licence"], about["attribution"], FOLDER / name / "model.xml")
 
 
@@ -147,12 +145,8 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         made_from = digest("object", RECIPE, path.name, content)
         # The name holds a hash of what it was made from, so that an earlier plan still finds its own objects.
         name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
-        about = {
-            "made_from": made_from,
-            "category": category,
-            "licence": source.licence,
-            "attribution": f"{category}/{path.name}",
-        }
+        about = {"made_from": made_from, "category": category, "licence": source.licence}
+        about["attribution"] = f"{category}/{path.name}"
         if _about(name) != about:
             with _locked(), _made(name, about) as folder:
                 if path.suffix == ".obj":

@@ -138,13 +138,7 @@ def _metal(rng: Rng) -> Floats:
 
 
 COLOUR_MAPS: dict[str, Callable[[Rng], Floats]] = {
-    "wood": _wood,
-    "stone": _stone,
-    "tile": _tile,
-    "brick": _brick,
-    "plaster": _plaster,
-    "fabric": _fabric,
-    "metal": _metal,
+    make.__name__.removeprefix("_"): make for make in (_wood, _stone, _tile, _brick, _plaster, _fabric, _metal)
 }
 
 FAMILIES = COLOUR_MAPS | DATA_MAPS

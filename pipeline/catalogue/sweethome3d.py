@@ -8,6 +8,7 @@ import tarfile
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count, takewhile
 from pathlib import Path
 
 import numpy as np
@@ -73,8 +74,7 @@ def fetch(folder: Path) -> Path:
 def pieces(deb: Path) -> Iterator[Piece]:
     """Every model of the package."""
     for library, archive in _libraries(deb):
-        listed = _properties(archive.read("PluginFurnitureCatalog.properties").decode("latin-1"))
-        for entry in _entries(listed):
+        for entry in _entries(archive.read("PluginFurnitureCatalog.properties").decode("latin-1")):
             width, depth, height = (float(entry[side]) / 100 for side in ("width", "depth", "height"))
             yield Piece(
                 member=f"{library}/{Path(entry['model']).stem}",
@@ -103,15 +103,9 @@ def _libraries(deb: Path) -> Iterator[tuple[str, zipfile.ZipFile]]:
                 yield library, zipfile.ZipFile(io.BytesIO(file.read()))
 
 
-def _properties(text: str) -> dict[str, str]:
-    """A Java properties file."""
+def _entries(text: str) -> Iterator[dict[str, str]]:
+    """The pieces of a catalogue, a Java properties file of ``<property>#<number>``, numbered from 1."""
     lines = re.findall(r"^\s*([^#!=:\s][^=:\s]*)\s*[=:]\s*(.*?)\s*$", re.sub(r"\\\r?\n\s*", "", text), re.MULTILINE)
-    return {key: re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value) for key, value in lines}
-
-
-def _entries(listed: dict[str, str]) -> Iterator[dict[str, str]]:
-    """The pieces of a catalogue, whose properties are written ``<property>#<number>``, numbered from 1."""
-    number = 1
-    while f"id#{number}" in listed:
+    listed = {key: re.sub(r"\\u([0-9a-fA-F]{4})", lambda code: chr(int(code[1], 16)), value) for key, value in lines}
+    for number in takewhile(lambda number: f"id#{number}" in listed, count(1)):
         yield {key.rpartition("#")[0]: value for key, value in listed.items() if key.endswith(f"#{number}")}
-        number += 1

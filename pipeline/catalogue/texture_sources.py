@@ -13,6 +13,7 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -115,7 +116,10 @@ def offered(source: Source) -> Iterator[Texture]:
                 name = f"folder:{texture.sha256[:8]}/{file.relative_to(source.folder).as_posix()}"
                 yield replace(texture, name=name, own=file)
         case "procedural":
-            yield from _procedural()
+            for family, index in product(procedural.FAMILIES, range(PROCEDURAL_PER_FAMILY)):
+                sha256 = seeding.digest("texture", procedural.RECIPE, family, index)
+                make = partial(procedural.texture, family, index)
+                yield Texture(f"procedural:{family}/{index:03d}", source, _LICENCES[source], sha256, make)
         case "libero":
             for file in libero_images():
                 yield from_file(f"libero:{file.name}", file, _LICENCES[source])
@@ -124,7 +128,12 @@ def offered(source: Source) -> Iterator[Texture]:
                 yield from_file(f"robosuite:{file.name}", file, _LICENCES[source])
         case "metaworld" | "gymnasium-robotics":
             without = f"leave {source} out of plan.axes.background.sources"
-            yield from _in_wheel(source, fetch_wheel(WHEELS[source], FOLDER, without))
+            path = fetch_wheel(WHEELS[source], FOLDER, without)
+            with zipfile.ZipFile(path) as archive:
+                for member in sorted(name for name in archive.namelist() if name.lower().endswith(_IMAGES)):
+                    name = f"{source}:{member.partition('/assets/')[2].replace('textures/', '')}"
+                    sha256 = hashlib.sha256(archive.read(member)).hexdigest()
+                    yield Texture(name, source, _LICENCES[source], sha256, partial(_member, path, member))
 
 
 def from_file(name: str, file: Path, licence: str) -> Texture:
@@ -169,30 +178,6 @@ def kept(name: str, sha256: str) -> Texture:
 def libero_images() -> tuple[Path, ...]:
     """LIBERO's images of walls, floors and tables."""
     return _images(libero_assets() / "textures")
-
-
-def _procedural() -> Iterator[Texture]:
-    for family in procedural.FAMILIES:
-        for index in range(PROCEDURAL_PER_FAMILY):
-            yield Texture(
-                name=f"procedural:{family}/{index:03d}",
-                source="procedural",
-                licence=_LICENCES["procedural"],
-                sha256=seeding.digest("texture", procedural.RECIPE, family, index),
-                load=partial(procedural.texture, family, index),
-            )
-
-
-def _in_wheel(source: Package, path: Path) -> Iterator[Texture]:
-    with zipfile.ZipFile(path) as archive:
-        for member in sorted(name for name in archive.namelist() if name.lower().endswith(_IMAGES)):
-            yield Texture(
-                name=f"{source}:{member.partition('/assets/')[2].replace('textures/', '')}",
-                source=source,
-                licence=_LICENCES[source],
-                sha256=hashlib.sha256(archive.read(member)).hexdigest(),
-                load=partial(_member, path, member),
-            )
 
 
 def _member(wheel: Path, member: str) -> Frame:

@@ -124,9 +124,7 @@ def _may_be_drawn(texture: Texture, source: Source) -> bool:
     if isinstance(source, Folder):
         if reason is not None:
             raise PipelineError(
-                f"this image cannot be used: {reason}",
-                where=texture.own,
-                remedy="move it out of the folder",
+                f"this image cannot be used: {reason}", where=texture.own, remedy="move it out of the folder"
             )
         texture.load()  # a file that is not an image is reported now, not when it is rendered
         return True
