@@ -36,6 +36,14 @@ FREE = re.compile(r"(MIT|Apache-2\.0|CC0-1\.0|CC-BY-\d)")
 """How the licences begin under which a derived work may be CC BY 4.0."""
 
 
+TEMPLATES = jinja2.Environment(
+    loader=jinja2.PackageLoader("pipeline.publish"),
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+
 AnyFormat = Format[Any]
 
 
@@ -91,15 +99,8 @@ def render(
     kept = [row for row in rows if row["kept"]]
     owed = attributions(row["perturbations"] for row in kept)
     free = all(FREE.match(one.licence) for one in owed)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pipeline.publish"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.globals["line"] = _line
-    return environment.get_template("card.md.j2").render(
+    return TEMPLATES.get_template("card.md.j2").render(
+        line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
         metadata=_metadata(shown, name, free).to_yaml(),
         format=shown.title,
         others=" and ".join(others),
@@ -145,7 +146,6 @@ def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
 
 
 def _metadata(shown: AnyFormat, name: str, free: bool) -> DatasetCardData:
-    """What the hub files a dataset under, and what its viewer shows: frames' data, and the manifest."""
     return DatasetCardData(
         language="en",
         license="cc-by-4.0" if free else "other",
@@ -177,7 +177,6 @@ def _axes(kept: Iterable[Mapping[str, Any]], shown: AnyFormat) -> dict[str, dict
 
 
 def _changes(change: Perturbation, shown: AnyFormat) -> str:
-    """What differs between an episode and its twin."""
     if change.layer == Layer.TEXT:
         return "the instruction"
     views = " and ".join(f"`{shown.keys[view]}`" for view in SCHEMA.views if view in change.views)
@@ -185,7 +184,6 @@ def _changes(change: Perturbation, shown: AnyFormat) -> str:
 
 
 def _yields(rows: Sequence[Mapping[str, Any]]) -> list[list[object]]:
-    """What became of the planned episodes of each axis."""
     lost = tally([row for row in tried(rows) if not row["kept"]], "reason")
     modes = tally([row for row in rows if row["kept"]], "replay_mode")
     body: list[list[object]] = []
@@ -197,12 +195,8 @@ def _yields(rows: Sequence[Mapping[str, Any]]) -> list[list[object]]:
     return body
 
 
-def _line(*cells: object) -> str:
-    """Of a table in Markdown."""
-    return f"| {' | '.join(map(_cell, cells))} |"
-
-
 def _cell(value: object) -> str:
+    """Of a table in Markdown."""
     if value is None:
         return "-"
     if isinstance(value, float):

@@ -105,8 +105,11 @@ def send(upload: Upload, repository: str, *, private: bool = False) -> str:
         repository = api.create_repo(repository, repo_type="dataset", private=private, exist_ok=True).repo_id
         there = api.list_repo_files(repository, repo_type="dataset")
         stale = [path for path in there if path.partition("/")[0] in upload.folders and path not in upload.files]
+        # In the card, with the repository's name in the commands that load it.
+        card = upload.files["README.md"].read_text().replace(REPOSITORY, repository).encode()
+        contents: dict[str, Path | bytes] = {**upload.files, "README.md": card}
         operations: list[CommitOperationAdd | CommitOperationDelete] = [
-            *(CommitOperationAdd(path, _content(path, file, repository)) for path, file in upload.files.items()),
+            *(CommitOperationAdd(path, content) for path, content in contents.items()),
             *(CommitOperationDelete(path, is_folder=False) for path in stale),
         ]
         commit = api.create_commit(
@@ -119,11 +122,6 @@ def send(upload: Upload, repository: str, *, private: bool = False) -> str:
     except FAILURES as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url
-
-
-def _content(path: str, file: Path, repository: str) -> Path | bytes:
-    """The file, or the card with the repository's name in the commands that load it."""
-    return file.read_text().replace(REPOSITORY, repository).encode() if path == "README.md" else file
 
 
 def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
@@ -149,7 +147,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
 
 def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> None:
     """Stop unless these very files passed validation, and the card tells of it."""
-    report = _there(data / "validation.json")
+    report, card = data / "validation.json", data / "card" / name / "README.md"
     checks = read_json(report)
     failed = [f"{check} ({found['findings'][0]})" for check, found in checks.items() if found["findings"]]
     if failed or not checks:
@@ -159,12 +157,10 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
             expected="at least one check, and no findings",
             remedy="mend what it finds, and dvc repro",
         )
-    steps = [
-        max(*files.values(), data / "manifest.parquet", key=_written),
-        report,
-        _there(data / "card" / name / "README.md"),
-    ]
-    for before, after in pairwise(steps):
+    if not card.is_file():
+        raise PipelineError("not there", where=card, remedy="dvc repro")
+    newest = max(*files.values(), data / "manifest.parquet", key=_written)
+    for before, after in pairwise((newest, report, card)):
         if _written(after) < _written(before):
             raise PipelineError(
                 f"older than {before}, which it is about",
@@ -178,14 +174,7 @@ def _written(file: Path) -> int:
     return file.stat().st_mtime_ns
 
 
-def _there(file: Path) -> Path:
-    if not file.is_file():
-        raise PipelineError("not there", where=file, remedy="dvc repro")
-    return file
-
-
 def _explained(error: Exception, repository: str, endpoint: str) -> PipelineError:
-    """What the hub's library raised, with what to do about it."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, HfHubHTTPError):
         cause = cause.__cause__
