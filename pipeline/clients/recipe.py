@@ -26,6 +26,9 @@ OPENPI = "pi05_libero"
 OPENPI_ASSETS = Path("openpi_assets", "physical-intelligence", "libero", "norm_stats.json")
 """Where that configuration looks for statistics, below the folder of its assets, when it serves what it trained."""
 
+PI05_NORMALIZATION = {"ACTION": "MEAN_STD", "STATE": "MEAN_STD", "VISUAL": "IDENTITY"}
+"""By which lerobot fine-tuned its pi0.5 for LIBERO, in place of quantiles."""
+
 STARVLA = '''\
 """The datasets beside this folder as a mixture of starVLA, which finds this file in ``examples/`` of its checkout."""
 
@@ -181,6 +184,14 @@ def _on_lerobot(lerobot: str) -> dict[str, dict[str, str]]:
             "command": f"{train} {local} --policy.path=lerobot/smolvla_base --rename_map='{json.dumps(views)}' "
             "--batch_size=64 --steps=20000",
             "source": "lerobot's command for fine-tuning SmolVLA; the weights' cameras are camera1, camera2, camera3",
+        },
+        "lerobot_pi05": {
+            "where": "an environment with lerobot[pi], on a GPU of 80 GB",
+            "command": f"{train} {local} --policy.type=pi05 --policy.pretrained_path=lerobot/pi05_libero_base "
+            f"--policy.normalization_mapping='{json.dumps(PI05_NORMALIZATION)}' --policy.n_action_steps=10 "
+            "--policy.empty_cameras=1 --policy.gradient_checkpointing=true --policy.dtype=bfloat16 --batch_size=64 "
+            "--steps=30000",
+            "source": "lerobot's command for fine-tuning pi0.5 on LIBERO (docs/source/pi05.mdx), whose keys are these",
         },
     }
 
