@@ -15,6 +15,7 @@ import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 from episode_results import result
 
+from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
@@ -37,6 +38,15 @@ SHIPPED = EFFECT / "experiment.yaml"
 def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
     monkeypatch.chdir(REPOSITORY)
     return read(SHIPPED)
+
+
+def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:
+    """The same names of episodes, as many in both perturbed arms, and each task as many."""
+    runs = {arm: load(EFFECT / "gpu" / f"{arm}.yaml") for arm in shipped.arms}
+    assert {arm: tuple(run.plan.episodes) for arm, run in runs.items()} == shipped.arms
+    assert {sum(run.plan.episodes.values()) for arm, run in runs.items() if shipped.arms[arm]} == {2560}
+    assert all(count % 40 == 0 for run in runs.values() for count in run.plan.episodes.values())
+    assert len({run.demos.root for run in runs.values()}) == 1 < len({run.data for run in runs.values()})
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ class LeRobot(Format[LeRobotConfig]):
     keys = {view: spec.lerobot_key for view, spec in SCHEMA.views.items()} | {
         name: getattr(SCHEMA, name).lerobot_key for name in ("state", "joint_state", "action")
     }
-    clients = ("lerobot_act", "lerobot_smolvla")
+    clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
 
     @property
     def language(self) -> bool:

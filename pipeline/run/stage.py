@@ -77,7 +77,7 @@ def locked(folder: Path) -> Iterator[None]:
     The system ends the lock with this process, however it ends.
 
     Raises:
-        PipelineError: when a stage runs there.
+        PipelineError: when a stage runs there, or nothing can say whether one does.
     """
     with (folder / LOCK).open("a") as file:
         try:
@@ -88,6 +88,13 @@ def locked(folder: Path) -> Iterator[None]:
                 where=folder,
                 expected="one stage at a time, as each reads what the one before it has finished",
                 remedy="wait for it, or stop it; `dvc repro` runs all stages in order",
+            ) from error
+        except OSError as error:  # Such as Lustre, mounted without them.
+            raise PipelineError(
+                f"the file system cannot lock a file ({error.strerror})",
+                where=folder,
+                expected="locks that hold on all machines that see the folder",
+                remedy="have it mounted with them (Lustre: -o flock), or set `folder:` to one that has them",
             ) from error
         remove_leftovers(folder)
         yield

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
+import draccus
+import lerobot.policies.factory  # noqa: F401 - by which policies have names
 import numpy as np
 import pytest
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_tools import add_features, remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from synthetic import IDS, NAME, episode, write_lerobot
+
+from pipeline.clients import recipe
+from pipeline.export_config import ExportConfig, LeRobotConfig
 
 pytestmark = pytest.mark.slow
 KEYS = ("action", "observation.state", "observation.joint_state")
@@ -52,3 +59,19 @@ def test_adds_and_removes_a_feature(root: Path, tmp_path: Path) -> None:
             assert changed[index]["task"] == dataset[index]["task"]
             for key in KEYS:
                 np.testing.assert_array_equal(changed[index][key].numpy(), dataset[index][key].numpy())
+
+
+def test_takes_the_words_of_the_recipe(tmp_path: Path) -> None:
+    """As lerobot-train reads them; SmolVLA's begin with its weights from the hub, where its reader looks first."""
+    manifest = tmp_path / "manifest"
+    manifest.touch()
+    clients = recipe.build(manifest, [], ExportConfig(lerobot=LeRobotConfig(name=NAME)))["clients"]
+    read = {
+        name: draccus.parse(TrainPipelineConfig, args=shlex.split(clients[f"lerobot_{name}"]["command"])[1:])
+        for name in ("act", "pi05")
+    }
+    assert all(one.dataset.repo_id == NAME and not one.policy.push_to_hub for one in read.values())
+    pi05 = read["pi05"]
+    assert (pi05.policy.type, pi05.policy.n_action_steps, pi05.steps, pi05.batch_size) == ("pi05", 10, 30000, 64)
+    modes = {kind: mode.value for kind, mode in pi05.policy.normalization_mapping.items()}
+    assert modes == {"ACTION": "MEAN_STD", "STATE": "MEAN_STD", "VISUAL": "IDENTITY"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
 import resource
@@ -92,6 +94,17 @@ def test_one_stage_of_a_run_works_at_a_time(tmp_path: Path) -> None:
     with locked(tmp_path), pytest.raises(PipelineError, match="another stage of this run is running"), locked(tmp_path):
         pass
     with locked(tmp_path):
+        pass
+
+
+def test_a_file_system_without_locks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Lustre answers when it is mounted without them; there, two machines would clear each other's work."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(PipelineError, match="cannot lock a file"), locked(tmp_path):
         pass
 
 
