@@ -5,8 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,8 +19,12 @@ import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 from episode_results import result
 
-from pipeline.config import load
+from pipeline.__main__ import main
+from pipeline.config import ComputeConfig, load
 from pipeline.errors import PipelineError
+from pipeline.evaluation import environment
+from pipeline.evaluation.environment import EpisodeSettings
+from pipeline.evaluation.evaluate import _environment
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
@@ -27,6 +35,7 @@ sys.path.append(str(EFFECT))
 
 import comparison  # noqa: E402
 import episodes  # noqa: E402
+import evaluation  # noqa: E402
 import results  # noqa: E402
 import sentences  # noqa: E402
 from experiment import Experiment, read  # noqa: E402
@@ -224,19 +233,44 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, mo
     assert all(bool((whole[name] == other[name]).all()) for name in whole)
 
 
+@pytest.fixture
+def command() -> Iterator[ModuleType]:
+    """What ``python benchmarks/effect`` runs, in this process, which keeps its environment for the next evaluation."""
+    spec = spec_from_file_location("effect_command", EFFECT / "__main__.py")
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = module_from_spec(spec)
+    spec.loader.exec_module(loaded)
+    yield loaded
+    _environment(EpisodeSettings(), None).close()
+    _environment.cache_clear()
+
+
 @pytest.mark.slow
-def test_from_demonstrations_to_the_results(short_demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = small(tmp_path, short_demos)
-    kept = tmp_path / "results"
-    command = [sys.executable, str(EFFECT), "--experiment", str(file), "--results", str(kept), "evaluate", "clean", "0"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_from_demonstrations_to_the_results(
+    short_demos: Path, tmp_path: Path, command: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(PipelineError, match="ended with 2"):
+        command.run("-m", "pipeline", "no_such_command")
+
+    def run_here(*words: str) -> None:
+        monkeypatch.setattr(sys, "argv", [*words[1:], "--workers", "1"])
+        assert main() == 0
+
+    monkeypatch.setattr(command, "run", run_here)
+    monkeypatch.setattr(evaluation, "ComputeConfig", partial(ComputeConfig, cluster="loop"))
+    monkeypatch.setitem(environment.STEP_LIMITS, STOVE.suite, 50)
+    file, kept = small(tmp_path, short_demos), tmp_path / "results"
+    words = ["effect", "--experiment", str(file), "--results", str(kept), "evaluate", "clean", "0"]
+    monkeypatch.setattr(sys, "argv", words)
+    command.main()
     (found,) = results.read(kept)
     (row,) = found.rows
-    assert (row.source, row.axis, row.reason, row.steps, row.looks) == ("libero", "clean", "step_limit", 300, 8)
+    assert (row.source, row.axis, row.reason, row.steps, row.looks) == ("libero", "clean", "step_limit", 50, 2)
     assert [(one["state"], one["instruction"], one["reached"], one["steps"]) for one in found.reading] == [
-        (49, "turn on the stove", None, 300),
-        (49, "", None, 300),
+        (49, "turn on the stove", None, 50),
+        (49, "", None, 50),
     ]
     assert found.made["episodes_by_axis"] == {"clean": 1}
 
