@@ -70,11 +70,12 @@ class Killed:
     faults: list[str] = field(default_factory=list)
 
 
-def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float]) -> Killed:
+def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, float], target: str = "") -> Killed:
     """Kill the run of a clone so often, then let it end.
 
     Args:
         took_s: how long each stage takes that is to be killed; the moment is drawn from that time.
+        target: the last stage that is run (default: all are).
     """
     rng, result = random.Random(seed), Killed()
     whole: dict[Path, int] = {}
@@ -82,7 +83,7 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
     while (left := kills - result.kills.total()) > 0:
         due = due or set(rng.sample(sorted(took_s), min(left, len(took_s))))
         result.locks += _without_broken_locks(clone)
-        run = _started(clone)
+        run = _started(clone, target)
         victim: Victim = rng.choice(("everything", "stage", "worker"))
         for stage in _stages(run):
             if stage in due:
@@ -110,7 +111,7 @@ def kill_and_resume(clone: Path, kills: int, seed: int, took_s: Mapping[str, flo
         result.faults += [f"{file.name} was made again" for file, stamp in whole.items() if stamps.get(file) != stamp]
         whole = stamps
     result.locks += _without_broken_locks(clone)
-    run = _started(clone)
+    run = _started(clone, target)
     if run.wait() != 0:
         result.faults.append(f"the last run ended with {run.returncode}")
     remade = [file.name for file, stamp in whole.items() if not file.exists() or file.stat().st_mtime_ns != stamp]
@@ -132,9 +133,9 @@ def _without_broken_locks(clone: Path) -> int:
     return len(broken)
 
 
-def _started(clone: Path) -> subprocess.Popen[bytes]:
+def _started(clone: Path, target: str = "") -> subprocess.Popen[bytes]:
     with (clone.parent / f"{clone.name}.log").open("ab") as log:
-        command = [str(SCRIPTS / "dvc"), "repro"]
+        command = [str(SCRIPTS / "dvc"), "repro", *filter(None, [target])]
         return subprocess.Popen(command, cwd=clone, env=IN_SCRIPTS, start_new_session=True, stdout=log, stderr=log)
 
 

@@ -33,7 +33,7 @@ def test_a_run_that_is_killed_anywhere_ends_like_one_that_is_not(finished: Path,
         for made_last in sorted(store.rglob("*.h5"), key=lambda path: path.stat().st_size)[:2]:
             made_last.unlink()
     seed = 15
-    killed = kill_and_resume(clone, kills=2, seed=seed, took_s=dict.fromkeys(REPEATED, 5.0))
+    killed = kill_and_resume(clone, kills=2, seed=seed, took_s=dict.fromkeys(REPEATED, 5.0), target="manifest")
     assert killed.faults == [], f"repeat with seed {seed}"
     assert killed.kills.total() == 2
     assert compared(undisturbed, clone) == ["configs/tiny.yaml is another", "dvc.lock is another"], (
