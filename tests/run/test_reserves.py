@@ -19,36 +19,32 @@ from pipeline.run import manifest
 from pipeline.run.render_job import RenderJob
 from pipeline.validation.validate import validate
 
-AXES = ("layout", "robot")
-"""Each of their episodes has a replay of its own."""
-
 SEED = 15
 """Under it, the camera of the first candidate of layout and camera together shows nothing of the added object."""
 
 
 def reserved(demos: Path) -> dict[str, object]:
-    """One episode of each, and two in reserve; weak changes, so that a demonstration's last half second succeeds."""
+    """One episode of each, which has a replay of its own, and two in reserve."""
     return tiny_config(demos) | {
         "demos": {"source": "hdf5", "root": str(demos), "tasks": [f"{BOWL.suite}/{BOWL.name}"]},
         "plan": {
             "seed": SEED,
             "axes": {
                 "layout": {"levels": [1]},
-                "robot": {"norm_rad": [0.002] * 5},
                 "camera": {"levels": [5], "distance": None, "spherical": None},
             },
-            "episodes": dict.fromkeys((*AXES, "layout+camera"), 1),
+            "episodes": {"layout": 1, "layout+camera": 1},
             "reserve": 2.0,
         },
     }
 
 
-def refuse_frames_of_first_candidates(clone: Path, fields: dict[str, object]) -> None:
-    """Store what a render stage stores where no worker survives the frames of the first candidates of ``AXES``."""
+def refuse_frames_of_first_candidate(clone: Path, fields: dict[str, object]) -> None:
+    """Store what a render stage stores where no worker survives the frames of the first candidate of ``layout``."""
     config = Config.model_validate(fields)
     data = clone / config.data
     for row in plan.read(data / "plan.parquet"):
-        if row.axis in AXES and row.rank == 0:
+        if row.axis == "layout" and row.rank == 0:
             streams = tuple(streams_of(row.perturbations).values())
             folders = data / "trajectories", data / "frames"
             RenderJob(row, streams, *folders, config.render, gl.choose().device).lost()
@@ -80,15 +76,15 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
         copy_of(f"data/tiny/{name}", finished.parent.parent, clone)
     made(clone, "replay")
     replayed = set((clone / "data/tiny/trajectories").glob("*.h5"))
-    assert len(replayed) == 4, "the twin and the first candidates"
-    refuse_frames_of_first_candidates(clone, fields)
+    assert len(replayed) == 3, "the twin and the first candidates"
+    refuse_frames_of_first_candidate(clone, fields)
     made(clone, "manifest")
     rows = manifest.read(clone / "data/tiny/manifest.parquet")
     lost = ["worker_lost", "kept", "reserve_not_needed"]
     unseen = ["added_objects_not_seen", "kept", "reserve_not_needed"]
-    assert remains(rows) == {"clean": ["kept"], **dict.fromkeys(AXES, lost), "layout+camera": unseen}
+    assert remains(rows) == {"clean": ["kept"], "layout": lost, "layout+camera": unseen}
     exported = Counter(row["axis"] for row in rows if row["rlds_shard"] and row["lerobot_episode_index"] is not None)
-    assert exported == {"clean": 1, "layout+camera": 1, **dict.fromkeys(AXES, 1)}
+    assert exported == {"clean": 1, "layout": 1, "layout+camera": 1}
     before = contents(clone)
 
     assert made(clone, "manifest") == ["inputs"]
@@ -97,7 +93,7 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
     # As a kill leaves it, after the refusals were stored and before the reserves had their frames: one of these has no
     # trajectory either.
     reserves = sorted(set((clone / "data/tiny/trajectories").glob("*.h5")) - replayed)
-    assert len(reserves) == 3
+    assert len(reserves) == 2
     reserves[0].unlink()
     for reserve in reserves:
         for file in (clone / "data/tiny/frames" / reserve.stem).iterdir():
