@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -75,12 +75,17 @@ def harness(address: str, look_every: int) -> int:
     return looks
 
 
-def shown(run: Run, out: Path, chunk: int, keeps: bool, look_every: int) -> tuple[dict[int, str], int]:
-    """Control step to the observation from which the server computed new actions, and the number of looks."""
+def recording(out: Path, chunk: int, keeps: bool) -> AbstractContextManager[str]:
+    """The address of a server that writes into a file what it computes new actions from."""
     options = ["--args.out", str(out), "--args.chunk", str(chunk), "--args.keeps", str(keeps).lower()]
-    with running(str(REPOSITORY / "tests" / "recording_server.py"), *options) as address:
-        looks = run(address, look_every)
+    return running(str(REPOSITORY / "tests" / "recording_server.py"), *options)
+
+
+def shown(run: Run, address: str, out: Path, look_every: int) -> tuple[dict[int, str], int]:
+    """Control step to the observation from which the server computed new actions, and the number of looks."""
+    looks = run(address, look_every)
     lines = [json.loads(line) for line in out.read_text().splitlines()]
+    out.unlink()
     assert len(dict(lines)) == len(lines)
     return dict(lines), looks
 
@@ -103,20 +108,23 @@ def test_rows_of_the_harness_need_a_folder_and_a_label(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def at_every_step(tmp_path_factory: pytest.TempPathFactory) -> dict[int, str]:
     """What a run shows that looks at every step, whose server computes at every step."""
-    observations, looks = shown(ours, tmp_path_factory.mktemp("every") / "shown.jsonl", 1, False, 1)
+    out = tmp_path_factory.mktemp("every") / "shown.jsonl"
+    with recording(out, 1, False) as address:
+        observations, looks = shown(ours, address, out, 1)
     assert list(observations) == list(range(STEPS))
     assert len({*observations.values()}) == looks == STEPS
     return observations
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("run", [ours, harness])
 @pytest.mark.parametrize(("chunk", "keeps"), [(5, False), (LOOK_EVERY, True)])
 def test_new_actions_are_computed_from_the_state_as_it_is(
-    at_every_step: dict[int, str], tmp_path: Path, run: Run, chunk: int, keeps: bool
+    at_every_step: dict[int, str], tmp_path: Path, chunk: int, keeps: bool
 ) -> None:
     """A server answers with its chunk, of any length, or keeps it and answers with one action at a time."""
-    observations, looks = shown(run, tmp_path / "shown.jsonl", chunk, keeps, LOOK_EVERY)
-    starts = range(0, STEPS, chunk)
-    assert observations == {step: at_every_step[step] for step in starts}
-    assert looks == len(starts)
+    out, starts = tmp_path / "shown.jsonl", range(0, STEPS, chunk)
+    with recording(out, chunk, keeps) as address:
+        for run in (ours, harness):
+            observations, looks = shown(run, address, out, LOOK_EVERY)
+            assert observations == {step: at_every_step[step] for step in starts}, run
+            assert looks == len(starts)
