@@ -29,6 +29,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
+from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.render import render
 from pipeline.run import outcome
 from pipeline.run.outcome import outdated
@@ -43,6 +44,14 @@ from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.tables import read_table
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_scene(opened: LastScene) -> Iterator[None]:
+    """All tests render the same scene, which stays open from one to the next."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("pipeline.run.render_job.scene_of_process", lambda: opened)
+        yield
 
 
 @pytest.fixture(scope="module")
