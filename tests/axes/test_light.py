@@ -32,27 +32,25 @@ def drawn(component: Component, level: Level, key: str | int, task: Task = MILK)
     return axis.sample(rng("light", component, level, key), task, 0)
 
 
-def weakest_and_strongest(task: Task) -> Iterator[LightPerturbation]:
-    """A draw of each component at levels 1 and 5.
+def weakest(task: Task) -> Iterator[LightPerturbation]:
+    """A draw of each component at level 1.
 
     Of ``diffuse`` it is a darker, a brighter and a tinted one, where drawn; of ``combined`` one with shadows and one
     without; of ``direction`` one for each edge of the range of the azimuth, where a tilt changes least. Last comes the
     weakest tint in yellow, a hue that changes least in the study.
     """
     for component in COMPONENTS:
-        levels: tuple[Level, ...] = (1, 5)
-        for level in levels:
-            kinds: dict[object, LightPerturbation] = {}
-            for key in range(20 if component in ("diffuse", "combined") else 1):
-                one = drawn(component, level, key, task)
-                tint = "tinted" if len({*one.diffuse_scale_rgb}) > 1 else one.diffuse_scale_rgb[0] > 1
-                kinds[tint if component == "diffuse" else one.shadows] = one
-            if component == "direction":
-                (edges,) = TILT_AZIMUTH_DEG
-                kinds = {edge: one.model_copy(update={"tilt_azimuth_deg": edge}) for edge in edges}
-            yield from kinds.values()
-    ((weakest, _),) = LightAxis().ranges[0].saturation
-    yield NEUTRAL.model_copy(update={"diffuse_scale_rgb": colorsys.hsv_to_rgb(1 / 6, weakest, 1.0)})
+        kinds: dict[object, LightPerturbation] = {}
+        for key in range(20 if component in ("diffuse", "combined") else 1):
+            one = drawn(component, 1, key, task)
+            tint = "tinted" if len({*one.diffuse_scale_rgb}) > 1 else one.diffuse_scale_rgb[0] > 1
+            kinds[tint if component == "diffuse" else one.shadows] = one
+        if component == "direction":
+            (edges,) = TILT_AZIMUTH_DEG
+            kinds = {edge: one.model_copy(update={"tilt_azimuth_deg": edge}) for edge in edges}
+        yield from kinds.values()
+    ((saturation, _),) = LightAxis().ranges[0].saturation
+    yield NEUTRAL.model_copy(update={"diffuse_scale_rgb": colorsys.hsv_to_rgb(1 / 6, saturation, 1.0)})
 
 
 def share_changed(before: Frame, after: Frame) -> float:
@@ -129,7 +127,7 @@ def test_every_lamp_changes_and_nothing_but_lamps(shown: Renderer, request: pyte
     restored = frames(shown)
     assert all(np.array_equal(clean[view], restored[view]) for view in clean)
 
-    for perturbation in weakest_and_strongest(TASKS[request.node.callspec.params["shown"]]):
+    for perturbation in weakest(TASKS[request.node.callspec.params["shown"]]):
         with shown.perturbed([perturbation]):
             after = frames(shown, ["agentview"])
         assert share_changed(clean["agentview"], after["agentview"]) >= NOTICED_SHARE, perturbation
