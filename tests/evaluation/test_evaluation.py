@@ -37,6 +37,7 @@ from pipeline.evaluation.policies import Wanted  # noqa: E402
 from pipeline.evaluation.selection import Selection, select  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, libero_states  # noqa: E402
 from pipeline.images.jpeg import to_policy  # noqa: E402
+from pipeline.physics.control_env import control_env  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
 from pipeline.testset.benchmark import load  # noqa: E402
 
@@ -126,7 +127,7 @@ def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: E
     # The benchmark's postures are 0.1 to 0.5 rad away; ten settling steps reach some of it.
     assert 0.01 < drift_rad < 0.6
     # By LIBERO's own code, with the posture in place of its own.
-    env = OffScreenRenderEnv(bddl_file_name=str(STOVE.bddl_file), camera_heights=16, camera_widths=16)
+    env = control_env()(str(STOVE.bddl_file), use_camera_obs=False, has_offscreen_renderer=False)
     number = int(load().by_name[task.suite, task.name].parameters["id"])
     env.env.robot_configs[0]["initial_qpos"] = np.array(libero_plus.postures_rad()[number])
     env.seed(0)
