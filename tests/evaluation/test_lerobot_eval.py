@@ -30,7 +30,6 @@ from pipeline.evaluation.selection import Selection, select  # noqa: E402
 from pipeline.evaluation.tasks import libero_states  # noqa: E402
 from pipeline.libero.tasks import tasks  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
-from pipeline.testset.benchmark import TESTED_SUITES  # noqa: E402
 from pipeline.types import Task  # noqa: E402
 
 ACTIONS = rng("test_lerobot_eval").uniform(-1, 1, (10, 7))
@@ -69,8 +68,9 @@ def liberos(task: Task) -> list[tuple[Any, dict[str, Any]]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("suite", TESTED_SUITES)
+@pytest.mark.parametrize("suite", ["libero_spatial", "libero_object", "libero_10"])
 def test_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
+    """Of libero_goal, test_evaluation.py compares states and frames bit for bit."""
     task = tasks(suite)[0]
     shown = liberos(task)
     ours = PerturbedLiberoEnv(select(Selection(suites=(suite,), tasks=(task.name,))), EpisodeSettings())
