@@ -102,8 +102,7 @@ def test_the_file_tells_nobody_s_folders_and_liberos_own_reader_finds_its_assets
 @pytest.fixture(scope="module")
 def at_resets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("at_resets")
-    with runner(ComputeConfig(workers=2), folder) as workers:
-        made = expand(folder, TASKS, resets(TASKS, 2, 1), 2, workers)
+    made = expand(folder, TASKS, resets(TASKS, 2, 1), 2, loop)
     assert (made.written, made.short) == (2, {})
     return made.files[0]
 
@@ -132,7 +131,8 @@ def test_a_start_is_a_reset_of_liberos_own_environment(at_resets: Path) -> None:
 
 
 def test_how_many_start_at_resets_and_who_makes_them_changes_none(at_resets: Path, tmp_path: Path) -> None:
-    alone = expand(tmp_path, TASKS, resets(TASKS, 1, 1), 1, loop).files[0]
+    with runner(ComputeConfig(workers=1), tmp_path) as worker:
+        alone = expand(tmp_path, TASKS, resets(TASKS, 1, 1), 1, worker).files[0]
     with h5py.File(alone) as one, h5py.File(at_resets) as other:
         for name in ("reset_seed", "model_file"):
             assert one["data/demo_0"].attrs[name] == other["data/demo_0"].attrs[name]
