@@ -49,7 +49,6 @@ class Libero:
 
     def __init__(self, task: Task, model_xml: str):
         self.env = OffScreenRenderEnv(bddl_file_name=str(task.bddl_file), camera_heights=256, camera_widths=256)
-        self.env.reset()
         self.env.reset_from_xml_string(model_xml)
 
     def observe(self, state: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
