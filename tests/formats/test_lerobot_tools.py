@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import Any
 
 import draccus
 import lerobot.policies.factory  # noqa: F401 - by which policies have names
@@ -66,10 +67,8 @@ def test_takes_the_words_of_the_recipe(tmp_path: Path) -> None:
     manifest = tmp_path / "manifest"
     manifest.touch()
     clients = recipe.build(manifest, [], ExportConfig(lerobot=LeRobotConfig(name=NAME)))["clients"]
-    read = {
-        name: draccus.parse(TrainPipelineConfig, args=shlex.split(clients[f"lerobot_{name}"]["command"])[1:])
-        for name in ("act", "pi05")
-    }
+    words = {name: shlex.split(clients[f"lerobot_{name}"]["command"])[1:] for name in ("act", "pi05")}
+    read: dict[str, Any] = {name: draccus.parse(TrainPipelineConfig, args=those) for name, those in words.items()}
     assert all(one.dataset.repo_id == NAME and not one.policy.push_to_hub for one in read.values())
     pi05 = read["pi05"]
     assert (pi05.policy.type, pi05.policy.n_action_steps, pi05.steps, pi05.batch_size) == ("pi05", 10, 30000, 64)
