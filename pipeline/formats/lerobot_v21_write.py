@@ -87,7 +87,7 @@ def _write_episode(
                 shown[view] = of_episode.show(episode, view, video)
         else:
             shown[view] = of_episode.show(episode, view, None)
-    columns = {convention.name(name): of for name, of in of_episode.columns(episode, numbers).items()}
+    columns = {convention.name(name): of for name, of in of_episode.columns(episode, numbers, convention.frames).items()}
     schema = _schema(convention, extras)
     file = path / data_path(index)
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -62,7 +62,7 @@ class Video:
 
     def add(self, pixels: Frame, *, first: bool) -> None:
         """Append a frame (H, W, 3); ``first`` of an episode."""
-        frame = av.VideoFrame.from_ndarray(pixels, format="rgb24")
+        frame = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
         frame.pts, frame.time_base = self.frames, Fraction(1, SCHEMA.fps_hz)
         if first:
             frame.pict_type = PictureType.I
