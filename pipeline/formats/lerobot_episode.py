@@ -249,7 +249,7 @@ def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
 
 def _entries(file: Path, column: str) -> NDArray[Any]:
     """(N, D) of a file's column."""
-    values = pq.read_table(file, columns=[column])[column].combine_chunks()
+    values = pq.ParquetFile(file).read([column], use_threads=False)[column].combine_chunks()
     flat = values.flatten() if pa.types.is_fixed_size_list(values.type) else values
     return np.asarray(flat.to_numpy(zero_copy_only=False).reshape(len(values), -1))
 
