@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Collection, Mapping
+from functools import lru_cache
 from typing import Literal, Self
 
 import numpy as np
@@ -17,7 +18,8 @@ from pipeline.types import Episode, Extra
 
 SCHEMA_FILE = schema_file("episode.json")
 
-JPEG_END = b"\xff\xd9"
+JPEG_SCAN, JPEG_END = b"\xff\xda", b"\xff\xd9"
+SCAN_HEADER_BYTES = 14
 
 
 class _Model(BaseModel):
@@ -209,14 +211,20 @@ def _check_frames(episode: Episode, steps: int) -> None:
             raise _fault(episode, view, f"has {len(frames)} frames", f"{steps}, one per action")
         for index, data in enumerate(frames):
             try:
-                with Image.open(io.BytesIO(data)) as image:  # reads the header only
-                    found = (image.format, image.mode, image.size)
+                found = _look(data[: data.find(JPEG_SCAN) + SCAN_HEADER_BYTES])
             except UnidentifiedImageError:
                 raise _fault(episode, view, f"frame {index} is not an image", f"{expected}") from None
             if found != expected:
                 raise _fault(episode, view, f"frame {index} is {found}", f"{expected}")
             if not data.endswith(JPEG_END):
                 raise _fault(episode, view, f"frame {index} is cut short", "a whole JPEG file")
+
+
+@lru_cache
+def _look(header: bytes) -> tuple[str | None, str, tuple[int, int]]:
+    """Format, mode and size of an image; frames of the same encoder begin with the same header."""
+    with Image.open(io.BytesIO(header)) as image:
+        return image.format, image.mode, image.size
 
 
 def _check_geometry(episode: Episode, steps: int, extras: Collection[Extra]) -> None:

@@ -33,7 +33,7 @@ def describe(values: NDArray[Any], quantiles: Mapping[str, float]) -> dict[str, 
         "std": exact.std(axis=0),
         "max": exact.max(axis=0),
         "min": exact.min(axis=0),
-        **{name: np.quantile(exact, q, axis=0) for name, q in quantiles.items()},
+        **dict(zip(quantiles, np.quantile(exact, list(quantiles.values()), axis=0), strict=True)),
     }
 
 
@@ -96,13 +96,13 @@ def of_levels(counts: Counts) -> dict[str, NDArray[Any]]:
     height, width, _ = SCHEMA.frame.shape
     pixels = counts.sum(axis=1)
     mean = counts @ _LEVELS / pixels
-    found: dict[str, Floats] = {
-        "min": np.array([_LEVELS[channel > 0].min() for channel in counts]),
-        "max": np.array([_LEVELS[channel > 0].max() for channel in counts]),
+    shares = counts.cumsum(axis=1) / pixels[:, None]
+    found: dict[str, NDArray[Any]] = {
+        "min": (counts > 0).argmax(axis=1),
+        "max": (shares == 1).argmax(axis=1),
         "mean": mean,
         "std": np.sqrt((counts * (_LEVELS - mean[:, None]) ** 2).sum(axis=1) / pixels),
+        **{name: (shares >= q).argmax(axis=1) for name, q in QUANTILES.items()},
     }
-    for name, q in QUANTILES.items():
-        found[name] = np.array([np.quantile(_LEVELS, q, weights=channel, method="inverted_cdf") for channel in counts])
     scaled = {name: levels.reshape(3, 1, 1) / 255 for name, levels in found.items()}
     return {**scaled, "count": pixels[:1] // (height * width)}

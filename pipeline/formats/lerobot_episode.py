@@ -27,6 +27,7 @@ from pipeline.formats.lerobot_columns import (
     LANGUAGE,
     OBJECT_POSES,
     Convention,
+    Frames,
     camera_column,
     matrix_columns,
 )
@@ -167,8 +168,8 @@ def _numbers(episode: Episode, index: int, first_step: int, task: int) -> Number
     }
 
 
-def columns(episode: Episode, found: Numbers) -> dict[str, pa.Array]:
-    """All columns of an episode, with those of its images, which a dataset with videos leaves out."""
+def columns(episode: Episode, found: Numbers, frames: Frames) -> dict[str, pa.Array]:
+    """The columns of an episode's steps, with its images where frames are that."""
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, seen in episode.geometry.items():
         for name, files in seen.maps.items():
@@ -177,8 +178,14 @@ def columns(episode: Episode, found: Numbers) -> dict[str, pa.Array]:
     images = {
         view.lerobot_key: pa.array([{"bytes": packed, "path": None} for packed in episode.frames[name]], kind)
         for name, view in SCHEMA.views.items()
+        if frames == "images"
     }
-    stored = {name: pa.array(list(values)) for name, values in found.items()}
+    stored = {
+        name: pa.array(values)
+        if values.ndim == 1
+        else pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+        for name, values in found.items()
+    }
     return stored | {name: pa.array(values) for name, values in texts.items()} | images
 
 
@@ -242,7 +249,7 @@ def _exact(root: Path, column: str, width: int) -> dict[str, NDArray[Any]]:
 
 def _entries(file: Path, column: str) -> NDArray[Any]:
     """(N, D) of a file's column."""
-    values = pq.read_table(file, columns=[column])[column].combine_chunks()
+    values = pq.ParquetFile(file).read([column], use_threads=False)[column].combine_chunks()
     flat = values.flatten() if pa.types.is_fixed_size_list(values.type) else values
     return np.asarray(flat.to_numpy(zero_copy_only=False).reshape(len(values), -1))
 

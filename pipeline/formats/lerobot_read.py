@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -260,29 +260,34 @@ def decoded(table: pa.Table, videos: Mapping[str, tuple[Path, float]]) -> dict[t
     Args:
         videos: view to its video, and the time (s) at which the episode begins there; views without one are images.
     """
-    frames = {}
+    frames: dict[tuple[str, int], Frame] = {}
+    steps = sampled(len(table))
     for view, spec in SCHEMA.views.items():
-        for step in sampled(len(table)):
-            if view in videos:
-                # By the time that stands at the step, as lerobot does.
-                path, begins_s = videos[view]
-                frames[view, step] = frame_at(path, begins_s + table["timestamp"][step].as_py())
-            else:
-                frames[view, step] = decode(table[spec.lerobot_key][step]["bytes"].as_py())
+        if view in videos:
+            # By the times that stand at the steps, as lerobot does.
+            path, begins_s = videos[view]
+            shown = frames_at(path, [begins_s + table["timestamp"][step].as_py() for step in steps])
+        else:
+            shown = [decode(table[spec.lerobot_key][step]["bytes"].as_py()) for step in steps]
+        frames |= {(view, step): frame for step, frame in zip(steps, shown, strict=True)}
     return frames
 
 
-def frame_at(path: Path, at_s: float) -> Frame:
-    """The frame of a video that begins at a time.
+def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
+    """The frames of a video that begin at these times.
 
     Raises:
         ValueError: when there is none.
     """
+    frames = []
     with av.open(str(path)) as video:
         stream = video.streams.video[0]
-        at = round(at_s / float(stream.time_base or 1))
-        video.seek(at, stream=stream)
-        found = next((frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at), None)
-        if found is None or found.pts != at:
-            raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
-        return np.asarray(found.to_ndarray(format="rgb24"), np.uint8)
+        stream.thread_count = 1  # Starting more takes longer than a few frames.
+        for at_s in times_s:
+            at = round(at_s / float(stream.time_base or 1))
+            video.seek(at, stream=stream)
+            found = next((frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at), None)
+            if found is None or found.pts != at:
+                raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
+            frames.append(np.asarray(found.to_ndarray(format="rgb24"), np.uint8))
+    return frames

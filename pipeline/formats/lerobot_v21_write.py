@@ -87,7 +87,8 @@ def _write_episode(
                 shown[view] = of_episode.show(episode, view, video)
         else:
             shown[view] = of_episode.show(episode, view, None)
-    columns = {convention.name(name): of for name, of in of_episode.columns(episode, numbers).items()}
+    made = of_episode.columns(episode, numbers, convention.frames)
+    columns = {convention.name(name): of for name, of in made.items()}
     schema = _schema(convention, extras)
     file = path / data_path(index)
     file.parent.mkdir(parents=True, exist_ok=True)

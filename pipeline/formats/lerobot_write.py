@@ -64,7 +64,7 @@ def write_piece(path: Path, piece: Piece, load: Load, convention: Convention, ex
         videos = {view: opened.enter_context(Video(path / f"{view}.mp4")) for view in SCHEMA.views if with_videos}
         for index, first_step, episode, numbers in of_episode.each(piece, load, convention, extras):
             shown = {view: of_episode.show(episode, view, videos.get(view)) for view in SCHEMA.views}
-            columns = of_episode.columns(episode, numbers)
+            columns = of_episode.columns(episode, numbers, convention.frames)
             if convention.language:
                 columns |= of_episode.language(episode, piece.split == "train")
             # A row group for each episode, so that one is read without the others.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +57,14 @@ class Case:
     trajectory: Trajectory
     copies: Sequence[Copy]
     bank: Path | None
+
+    @cached_property
+    def shown(self) -> dict[int, dict[str, Frame]]:
+        """Sampled step to what the store has in every view there."""
+        return {
+            step: {view: decode(frames[step]) for view, frames in self.made.frames.items()}
+            for step in sampled(len(self.made))
+        }
 
     @property
     def whole(self) -> list[Copy]:
@@ -209,10 +218,10 @@ def alive(case: Case) -> Iterator[Fault]:
     """No view that shows nothing, or the same all along."""
     for copy in case.whole:
         for view in SCHEMA.views:
-            frames = [copy.decoded[view, step].astype(np.int16) for step in sampled(len(copy))]
-            if min(frame.std() for frame in frames) < BLANK_LEVELS:
+            frames = [copy.decoded[view, step] for step in sampled(len(copy))]
+            if min(cv2.meanStdDev(frame.reshape(-1))[1].item() for frame in frames) < BLANK_LEVELS:
                 yield case.finding(copy.dataset, f"{view} has a blank frame", f"more than {BLANK_LEVELS} grey levels")
-            elif max(np.abs(frame - frames[0]).mean() for frame in frames) < STILL_LEVELS:
+            elif max(cv2.norm(frame, frames[0], cv2.NORM_L1) / frame.size for frame in frames) < STILL_LEVELS:
                 yield case.finding(copy.dataset, f"{view} is constant", "a camera that sees the robot move")
 
 
@@ -260,8 +269,7 @@ def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Itera
 
 def _shown(case: Case) -> Iterator[tuple[Copy, str, int, Mapping[str, Frame]]]:
     """Copy, view, step, and what the store has in every view there, for the sampled steps."""
-    for step in sampled(len(case.made)):
-        shown = {view: decode(frames[step]) for view, frames in case.made.frames.items()}
+    for step, shown in case.shown.items():
         for copy in case.whole:
             for view in SCHEMA.views:
                 yield copy, view, step, shown
