@@ -116,11 +116,8 @@ class ActionSpec(VectorSpec):
 
 
 class EpisodeSchema(_Model):
-    """Names, shapes, units and signs that all writers read.
-
-    Attributes:
-        provenance: what each episode says of itself, as the manifest's column of that name does, to its type.
-    """
+    """Names, shapes, units and signs that all writers read. ``provenance``: what each episode says of itself, as the
+    manifest's column of that name does, to its type."""
 
     fps_hz: int
     robot_type: str
@@ -168,10 +165,7 @@ def named(extras: Collection[Extra]) -> bool:
 
 def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     """Refuse an episode that training would misread or choke on; it must have the ``extras`` beside the frames.
-
-    Raises:
-        PipelineError: naming the episode and the field.
-    """
+    PipelineError naming the episode and the field."""
     steps = len(episode)
     if steps < SCHEMA.min_steps:
         expected = f"at least {SCHEMA.min_steps}, the chunk policies predict"

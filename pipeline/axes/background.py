@@ -86,11 +86,8 @@ class BackgroundPerturbation(RenderPerturbation):
     clearance: ClassVar[float] = 1.0
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Write the coverings into the model's textures.
-
-        Raises:
-            PipelineError: when a texture is not there any more, or nothing in the scene is known by its material.
-        """
+        """Write the coverings into the model's textures; PipelineError when a texture is not there any more, or nothing
+        in the scene is known by its material."""
         # By texture, as two parts may be one: the last then stands for both.
         shown = {
             skin.texture: (covering, skin)

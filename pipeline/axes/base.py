@@ -247,14 +247,9 @@ class PhysicsPerturbation(Perturbation):
     layer: ClassVar[Layer] = Layer.PHYSICS
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The changed ``scene``, in which ``demo`` is replayed.
-
-        Args:
-            roll_out: gives the states that the demonstration's actions lead to from a scene; costs a whole replay.
-
-        Raises:
-            RefusedError: when the change cannot be made here; its reason is written into the manifest.
-        """
+        """The changed ``scene``, in which ``demo`` is replayed. ``roll_out`` gives the states that the demonstration's
+        actions lead to from a scene; it costs a whole replay. RefusedError when the change cannot be made here; its
+        reason is written into the manifest."""
         raise NotImplementedError
 
 

@@ -47,11 +47,8 @@ class PosePerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "the norm of the difference between the displacements of the same object"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene with the object moved; its height and velocity and everything else stay as they are.
-
-        Raises:
-            RefusedError: see ``pipeline.scenes.moving.move_one``.
-        """
+        """The scene with the object moved; its height and velocity and everything else stay as they are. RefusedError
+        as of ``pipeline.scenes.moving.move_one``."""
         from pipeline.scenes.moving import move_one
 
         return move_one(scene, demo.task, self.moved, (self.dx_m, self.dy_m), self.dyaw_deg)

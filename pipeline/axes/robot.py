@@ -36,10 +36,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
     The offset is added to the same of the clean twin: ``initial_joints`` to the recorded start, which LIBERO's reset
     scattered by 0.02 to 0.10 rad about home, ``controller_posture`` to the posture of the reset. Only so is the change
-    as large as its level says, and no offset the clean twin.
-
-    Attributes:
-        joint_offsets_rad: base to wrist.
+    as large as its level says, and no offset the clean twin. ``joint_offsets_rad``: base to wrist.
     """
 
     axis: Literal["robot"] = "robot"
@@ -53,12 +50,9 @@ class RobotPerturbation(PhysicsPerturbation):
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the arm turned and at rest, or with the controller's posture; all else stays as it is.
-
-        Raises:
-            RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot
-                is put where it touches what it did not touch before, ``test_posture`` when recorded start and offset
-                happen to add up to a posture of the test set.
-        """
+        RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot is
+        put where it touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add
+        up to a posture of the test set."""
         from pipeline.scenes.compiled import CompiledScene
 
         compiled = CompiledScene(scene)

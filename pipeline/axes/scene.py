@@ -66,9 +66,7 @@ class Move(Frozen):
 class ScenePerturbation(PhysicsPerturbation):
     """Every object and fixture moved in the horizontal plane.
 
-    Attributes:
-        moves: of each thing by its name in the BDDL file. What stands on or in another thing has that one's move.
-    """
+    What stands on or in another thing has that one's move; ``moves`` has each thing by its name in the BDDL file."""
 
     axis: Literal["pose"] = "pose"
     component: Literal["scene"] = "scene"
@@ -83,11 +81,8 @@ class ScenePerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "the largest difference along an axis between the displacements of the same thing"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene with everything moved; heights, rotations, velocities and joints stay as they are.
-
-        Raises:
-            RefusedError: see ``pipeline.scenes.moving.move``.
-        """
+        """The scene with everything moved; heights, rotations, velocities and joints stay as they are. RefusedError
+        as of ``pipeline.scenes.moving.move``."""
         from pipeline.scenes.moving import move
 
         return move(scene, demo.task, self.shifts)

@@ -48,11 +48,8 @@ class Workplace:
     setup: Mapping[str, str]
 
     def enter(self) -> None:
-        """Make sure that this process may work for the run, and forget what it knows of earlier ones.
-
-        Raises:
-            PipelineError: when the run's folder is not here, or other code or packages are.
-        """
+        """Make sure that this process may work for the run, and forget what it knows of earlier ones; PipelineError
+        when the run's folder is not here, or other code or packages are."""
         global _entered
         if _entered == self:
             return
@@ -113,10 +110,7 @@ def setup() -> dict[str, str]:
 def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
     """Check every worker that a Dask client has now; later ones are checked when they get their first work.
 
-    The run writes into ``folder``.
-
-    Raises:
-        PipelineError: naming every worker that cannot work for this run, and why.
+    The run writes into ``folder``. PipelineError naming every worker that cannot work for this run, and why.
     """
     folder.mkdir(parents=True, exist_ok=True)
     token = folder.absolute() / f".cluster-{uuid4().hex}"

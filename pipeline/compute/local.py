@@ -23,10 +23,7 @@ def local_cluster(
 ) -> Iterator[tuple[Any, Callable[[], None]]]:
     """A client of so many workers, one for each core when left out, and what brings back those that died.
 
-    ``opengl`` is that of ``runner``.
-
-    Raises:
-        PipelineError: when the workers end while they start.
+    ``opengl`` is that of ``runner``. PipelineError when the workers end while they start.
     """
     from dask.system import CPU_COUNT
     from distributed import Client

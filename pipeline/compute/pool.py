@@ -239,11 +239,7 @@ class _Workers:
                 self.client.cancel([future for future in futures if future.key in numbers])
 
     def _next(self, done: Queue[Any]) -> Any:
-        """The next future that is done.
-
-        Raises:
-            PipelineError: when nobody is left who could do one.
-        """
+        """The next future that is done; PipelineError when nobody is left who could do one."""
         alone_s, last_came_s = 0, 0.0
         while True:
             try:

@@ -24,14 +24,11 @@ def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
     """A scheduler in this process and a job for each worker; when the block ends, so do the jobs.
 
     What a site needs beyond ``SlurmConfig``, such as the network interface, dask-jobqueue reads from its own file,
-    ``~/.config/dask/jobqueue.yaml``.
+    ``~/.config/dask/jobqueue.yaml``. PipelineError when SLURM takes no job.
 
     Args:
         config: with ``cluster: slurm``.
         folder: what the work writes into; the nodes must see it too.
-
-    Raises:
-        PipelineError: when SLURM takes no job.
     """
     from dask_jobqueue.slurm import SLURMCluster
 
@@ -61,11 +58,8 @@ def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
 
 
 def _try(script: str) -> None:
-    """Have SLURM look at a job without starting it: Dask would wait for ever for one that is refused.
-
-    Raises:
-        PipelineError: in SLURM's words.
-    """
+    """Have SLURM look at a job without starting it: Dask would wait for ever for one that is refused. PipelineError in
+    SLURM's words."""
     try:
         looked = subprocess.run(["sbatch", "--test-only"], input=script, capture_output=True, text=True, check=False)
         refusal = looked.stderr.strip() if looked.returncode else ""

@@ -114,11 +114,7 @@ class Bddl:
 
 @cache
 def read(path: Path) -> Bddl:
-    """Read a task's file, once a process.
-
-    Raises:
-        PipelineError: when it cannot be read or does not define a task.
-    """
+    """Read a task's file, once a process; PipelineError when it cannot be read or does not define a task."""
     try:
         return parse(path.read_text(), path)
     except (OSError, UnicodeDecodeError) as error:
@@ -126,11 +122,7 @@ def read(path: Path) -> Bddl:
 
 
 def parse(text: str, where: object) -> Bddl:
-    """Read a BDDL file's text; ``where`` is what an error names.
-
-    Raises:
-        PipelineError: when it does not define a task.
-    """
+    """Read a BDDL file's text; ``where`` is what an error names. PipelineError when it does not define a task."""
     expected = "a BDDL problem with :language, :objects, :init and :goal"
     try:
         _, (_, problem), *rest = scan_tokens(string=text)
@@ -153,10 +145,7 @@ def parse(text: str, where: object) -> Bddl:
 
 def heading(text: str, where: object) -> tuple[str, str]:
     """``problem`` and ``language`` of a BDDL file's text; of 10,030 test tasks, most need no more, and parsing is slow.
-
-    Raises:
-        PipelineError: when it has no problem or no instruction.
-    """
+    PipelineError when it has no problem or no instruction."""
     text = text.lower()
     problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
     if problem is None or language is None:
@@ -167,10 +156,7 @@ def heading(text: str, where: object) -> tuple[str, str]:
 def arena(problem: str) -> Arena:
     """The arena of a scene's class, by its name in lower case, such as libero_kitchen_tabletop_manipulation.
 
-    LIBERO-Plus's names go on after that.
-
-    Raises:
-        PipelineError: when the name has none.
+    LIBERO-Plus's names go on after that. PipelineError when the name has none.
     """
     match = _ARENA.match(problem)
     if match is None:

@@ -81,11 +81,7 @@ class DemoSource(Protocol):
         """The first ``per_task`` usable demonstrations of each task (all by default), and what was unusable."""
 
     def load(self, demo_id: str) -> Demo:
-        """One demonstration, by ``<suite>/<task>/<key>``.
-
-        Raises:
-            PipelineError: when it is not there or cannot be used.
-        """
+        """One demonstration, by ``<suite>/<task>/<key>``; PipelineError when it is not there or cannot be used."""
 
 
 class StarterSource:
@@ -133,11 +129,8 @@ class StarterSource:
 
 @dataclass(frozen=True)
 class HDF5Source:
-    """LIBERO's demonstrations as published: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file.
-
-    Attributes:
-        root: the folder that holds the suites.
-    """
+    """LIBERO's demonstrations as published: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file; ``root`` holds the
+    suites."""
 
     root: Path
 
@@ -257,11 +250,7 @@ class _Recorded(NamedTuple):
     model_file: str | None
 
     def checked(self, where: str) -> Demo:
-        """The demonstration.
-
-        Raises:
-            PipelineError: when it cannot be used.
-        """
+        """The demonstration; PipelineError when it cannot be used."""
         actions, states = self.actions, self.states
         fault = None
         if actions.ndim != 2 or actions.shape[1] != 7 or len(actions) == 0:

@@ -42,11 +42,7 @@ def _undamaged(where: str) -> Iterator[None]:
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file, open for reading.
-
-    Raises:
-        PipelineError: when it is missing or truncated.
-    """
+    """An HDF5 file, open for reading; PipelineError when it is missing or truncated."""
     if not path.is_file():
         raise PipelineError("no such file", where=path, remedy="download it, or leave its task out of demos.tasks")
     with _undamaged(str(path)):

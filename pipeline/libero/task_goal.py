@@ -86,11 +86,7 @@ class TaskGoal:
 
 @cache
 def read_goal(bddl_file: Path) -> TaskGoal:
-    """The goal of a task.
-
-    Raises:
-        PipelineError: when the file cannot be read or does not define a task.
-    """
+    """The goal of a task; PipelineError when the file cannot be read or does not define a task."""
     bddl = read(bddl_file)
     scene = _Scene(bddl)
     facts = [fact for fact in bddl.goal if fact not in bddl.start]

@@ -115,10 +115,8 @@ class Environment:
     def restore(self, scene: Scene) -> None:
         """Put the environment where a scene starts; nothing from before has an effect on what follows.
 
-        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms.
-
-        Raises:
-            UnusableSceneError: when MuJoCo or LIBERO refuses the scene, or the state is not of its model.
+        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms. UnusableSceneError when MuJoCo or
+        LIBERO refuses the scene, or the state is not of its model.
         """
         env = self._env.env
         if scene.model_xml != self._scene:
@@ -207,11 +205,8 @@ class Environment:
             raise UnusableSceneError("state_mismatch", what, self.task)
 
     def step(self, action: Floats) -> None:
-        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1].
-
-        Raises:
-            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
-        """
+        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1]. RefusedError: ``simulation_unstable``
+        when the numbers grow beyond what can be computed with."""
         self._act_from_outside()
         try:
             self._control_step(action)

@@ -13,24 +13,15 @@ from pipeline.types import Demo, Floats, Push, Scene, Task
 
 
 def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
-    """(K+1, S) states that the demonstration's actions lead through from ``scene``, once that has settled.
-
-    Args:
-        config: how the replay that follows settles, and which actions it leaves out.
-
-    Raises:
-        RefusedError: ``simulation_unstable``.
-    """
+    """(K+1, S) states that the demonstration's actions lead through from ``scene``, once that has settled. ``config``:
+    how the replay that follows settles, and which actions it leaves out. RefusedError: ``simulation_unstable``."""
     actions = demo.actions[kept_actions(demo.actions, config.noops)]
     return _states(demo.task, _start(scene), actions.tobytes(), config.settle_steps)
 
 
 def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
-    """(S,) what the first frame of a replay shows: the state in which ``scene`` has settled.
-
-    Raises:
-        RefusedError: ``simulation_unstable``.
-    """
+    """(S,) what the first frame of a replay shows: the state in which ``scene`` has settled. RefusedError:
+    ``simulation_unstable``."""
     state: Floats = _states(task, _start(scene), b"", config.settle_steps)[0]
     return state
 

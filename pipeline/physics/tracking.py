@@ -76,17 +76,15 @@ class Route:
     def through(cls, reference: Reference, hand: Hand, poses: Mapping[str, Floats]) -> Route:
         """Bend a reference to a scene.
 
-        An object's displacement (about the vertical and along it and across it) is followed from before the hand
-        meets it until it is carried off; then the route returns to the reference on the way to the goal. What objects
-        are put on or in, and what is opened, closed or turned, is followed from before the hand meets it until its
-        last contact. Where several are met at once, what the hand moves comes first, then what it meets for longest.
+        An object's displacement (about the vertical and along it and across it) is followed from before the hand meets
+        it until it is carried off; then the route returns to the reference on the way to the goal. What objects are put
+        on or in, and what is opened, closed or turned, is followed from before the hand meets it until its last
+        contact. Where several are met at once, what the hand moves comes first, then what it meets for longest.
+        RefusedError: ``object_not_upright`` when an object was tilted, which no bend about the vertical follows.
 
         Args:
             hand: where the hand starts.
             poses: object, fixture or region to its pose (7,) in the scene; those that are left out have not moved.
-
-        Raises:
-            RefusedError: ``object_not_upright`` when an object was tilted, which no bend about the vertical follows.
         """
         positions, rotations = reference.positions_m, reference.rotations
         free: Floats = np.ones(len(reference) + 1)

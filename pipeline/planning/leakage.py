@@ -176,11 +176,8 @@ def report(findings: dict[str, AxisDistance]) -> Group:
 
 
 def refuse_overlap(findings: dict[str, AxisDistance]) -> None:
-    """Stop a run that would train on test tasks.
-
-    Raises:
-        PipelineError: when any episode overlaps, naming for each axis how many and the closest.
-    """
+    """Stop a run that would train on test tasks; PipelineError when any episode overlaps, naming for each axis how many
+    and the closest."""
     faults = [
         f"{finding.overlaps} of {finding.rows} on the {axis} axis (such as {finding.closest}, distance "
         f"{finding.smallest:.3g}, clearance {finding.clearance:g})"

@@ -65,10 +65,8 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     """Draw the plan: a clean twin of every demonstration, then each axis's or combination's candidates, task by task.
 
     A draw that comes closer to one of the benchmark's ``test`` tasks than its axis allows is drawn anew. The benchmark
-    perturbs one axis at a time, but so must each part of a combination keep clear.
-
-    Raises:
-        PipelineError: when there is nothing to plan from, at all or for an axis.
+    perturbs one axis at a time, but so must each part of a combination keep clear. PipelineError when there is nothing
+    to plan from, at all or for an axis.
     """
     if not demos:
         raise PipelineError("no demonstrations to plan from", remedy="widen demos.tasks or check demos.root")
@@ -222,11 +220,7 @@ def write(rows: Sequence[Row], path: Path) -> None:
 
 
 def read(path: Path) -> list[Row]:
-    """Read a plan back.
-
-    Raises:
-        PipelineError: when it is missing, damaged or not a plan of this version.
-    """
+    """Read a plan back; PipelineError when it is missing, damaged or not a plan of this version."""
     names = [column.name for column in fields(Row)]
     columns = read_table(path, names, "dvc repro plan").select(names).to_pydict()
     return [Row(*row) for row in zip(*columns.values(), strict=True)]

@@ -46,10 +46,7 @@ def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> 
 class PlainDrawing:
     """Renders all of a model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in a context of its own.
 
-    Close it before another is made.
-
-    Raises:
-        PipelineError: when nothing renders on this machine.
+    Close it before another is made. PipelineError when nothing renders on this machine.
     """
 
     def __init__(self, model: mujoco.MjModel):

@@ -26,11 +26,8 @@ class LastScene:
     def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
         """The renderer of a scene, by its MJCF or by a compiled model, which must not change meanwhile.
 
-        It is no longer to be used when another scene was asked for.
-
-        Raises:
-            PipelineError: when nothing renders on this machine.
-            ValueError: when MuJoCo refuses the scene or one of its images.
+        It is no longer to be used when another scene was asked for. PipelineError when nothing renders on this machine.
+        ValueError when MuJoCo refuses the scene or one of its images.
         """
         same = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
         if self._renderer is not None and same:

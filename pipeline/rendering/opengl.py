@@ -56,10 +56,7 @@ def calls() -> Any:
 
 def check(call: str) -> None:
     """Look for errors after a call of MuJoCo's, or of ``OTHERS``; those in ``LEFT`` are logged, once a process.
-
-    Raises:
-        PipelineError: for any other, such as GL_OUT_OF_MEMORY.
-    """
+    PipelineError for any other, such as GL_OUT_OF_MEMORY."""
     # OpenGL keeps one error of each kind.
     for _ in ERRORS:
         # MuJoCo's glGetError; a third of what it takes through PyOpenGL.
@@ -78,11 +75,8 @@ def say_once(error: str, call: str) -> None:
 
 @contextmanager
 def making_context() -> Iterator[None]:
-    """Raise the OpenGL errors that MuJoCo only warns of while it makes a context.
-
-    Raises:
-        PipelineError: when it reports any, or makes none.
-    """
+    """Raise the OpenGL errors that MuJoCo only warns of while it makes a context; PipelineError when it reports any, or
+    makes none."""
     said: list[str] = []
     former = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(said.append)

@@ -189,14 +189,9 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     """Write a dataset, replacing the one before, and go on where a killed call with the same episodes was.
 
     The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``workers``, and
-    not on how often the work was interrupted.
-
-    Args:
-        workers: do the work; one call for each piece.
-
-    Raises:
-        PipelineError: when an episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that
-            are whole stay in the work folder.
+    not on how often the work was interrupted. ``workers`` do the work, one call for each piece. PipelineError when an
+    episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that are whole stay in the work
+    folder.
     """
     pieces = target.pieces(episodes)
     work = target.work / identity(target, episodes)

@@ -41,10 +41,7 @@ class RenderJob:
 
     def __call__(self) -> None:
         """Store the streams in one file: those that other files of the trajectory hold are copied, others rendered.
-
-        Raises:
-            PipelineError: when another device renders here: its pixels differ, and the run would never use them.
-        """
+        PipelineError when another device renders here: its pixels differ, and the run would never use them."""
         device = gl.choose().device
         if device != self.device:
             raise PipelineError(

@@ -50,13 +50,10 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     """Render the streams of every kept episode, and of failures where asked for, that ``folder`` does not hold yet.
 
     Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing that
-    can be made from the trajectories that are there.
+    can be made from the trajectories that are there. PipelineError when rendering leaves the same work undone.
 
     Returns:
         The files of ``folder`` that the plan needs: the same ones whatever was rendered before.
-
-    Raises:
-        PipelineError: when rendering leaves the same work undone.
     """
     device = gl.choose().device
     store = FrameStore(folder, config.render)

@@ -40,11 +40,8 @@ class ReplayJob:
     folder: Path
 
     def __call__(self) -> Verdict:
-        """Replay, judge and store; returns the verdict.
-
-        Raises:
-            PipelineError: when the demonstration is not there, or another than the plan was drawn for.
-        """
+        """Replay, judge and store; returns the verdict. PipelineError when the demonstration is not there, or another
+        than the plan was drawn for."""
         demo = self.demos.open().load(self.row.demo_id)
         if demo.sha256 != self.row.demo_sha256:
             raise PipelineError(

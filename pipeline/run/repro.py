@@ -25,11 +25,8 @@ HEADER = """\
 
 
 def run(file: Path) -> int:
-    """Run all stages that have something to do; the exit status.
-
-    Raises:
-        PipelineError: when DVC would not find the configuration.
-    """
+    """Run all stages that have something to do; the exit status. PipelineError when DVC would not find the
+    configuration."""
     config = load(file)
     _refuse_elsewhere(file, config)
     choose(config)

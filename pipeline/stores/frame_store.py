@@ -108,14 +108,12 @@ class FrameStore(Store):
                 file["object_poses"] = rendered.object_poses
 
     def load(self, trajectory_id: str, streams: Collection[str], geometry: Collection[str] = ()) -> Rendered:
-        """Read the named streams of a trajectory.
+        """Read the named streams of a trajectory; PipelineError when a file is damaged, or one of the streams or its
+        geometry is not there.
 
         Args:
             streams: ids of streams, one at least.
             geometry: ids of the geometry to read with them.
-
-        Raises:
-            PipelineError: when a file is damaged, or one of the streams or its geometry is not there.
         """
         frames, views = set(streams), set(geometry)
         parts: list[Rendered] = []
@@ -170,11 +168,8 @@ class FrameStore(Store):
         return reasons
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Action (K, 7) and state (K, 8) of a trajectory, without its frames.
-
-        Raises:
-            PipelineError: when a file is damaged, or none is there.
-        """
+        """Action (K, 7) and state (K, 8) of a trajectory, without its frames; PipelineError when a file is damaged, or
+        none is there."""
         for name in self._files_of(trajectory_id):
             with self.opened(name) as file:
                 if file.groups("streams"):

@@ -86,11 +86,7 @@ class Store(ABC):
 
     @contextmanager
     def opened(self, name: str) -> Iterator[SealedFile]:
-        """A file to read.
-
-        Raises:
-            PipelineError: when it is missing, damaged, or not current.
-        """
+        """A file to read; PipelineError when it is missing, damaged, or not current."""
         path, remedy = self.path(name), f"run the {self.stage} stage again"
         if not path.exists():
             raise PipelineError("missing", where=path, remedy=remedy)

@@ -70,11 +70,8 @@ class TrajectoryStore(Store):
             file.create_dataset("site_alpha", data=trajectory.site_alpha, compression="gzip")
 
     def load(self, trajectory_id: str) -> Trajectory:
-        """Read a trajectory back.
-
-        Raises:
-            PipelineError: when its file is missing, damaged or not current, or what its scene is made of is not here.
-        """
+        """Read a trajectory back; PipelineError when its file is missing, damaged or not current, or what its scene is
+        made of is not here."""
         with self.opened(trajectory_id) as file:
             posture_rad, push = file.attributes["posture_rad"], file.attributes.get("push")
             scene = Scene(

@@ -65,10 +65,7 @@ class Picture(NamedTuple):
 
 class Culling:
     """Tests the bounding boxes of a model's geoms against a camera's view. All planes must have bounds.
-
-    Args:
-        hidden_groups: groups of geoms that are not rendered.
-    """
+    ``hidden_groups``: groups of geoms that are not rendered."""
 
     def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int]):
         self._model, self.shown = model, ~np.isin(model.geom_group, list(hidden_groups))

@@ -45,11 +45,7 @@ class Shot(NamedTuple):
 
 
 class SoftwareDrawing(PlainDrawing):
-    """Renders models that are ``possible``.
-
-    Raises:
-        PipelineError: when OpenGL does not do what is asked of it.
-    """
+    """Renders models that are ``possible``; PipelineError when OpenGL does not do what is asked of it."""
 
     def __init__(self, model: mujoco.MjModel):
         # The context is made for what all scenes have in common, and then goes on with this model.
@@ -127,12 +123,8 @@ class SoftwareDrawing(PlainDrawing):
         self._draw(shot, opaque & ~still, underlay)
 
     def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
-        """Render opaque geoms (ngeom,) of a picture over an underlay.
-
-        Args:
-            last: whether this completes the picture, with what is in no underlay: mirror, transparent geoms, sites,
-                shadows and sky.
-        """
+        """Render opaque geoms (ngeom,) of a picture over an underlay. ``last``: whether this completes the picture,
+        with what is in no underlay: mirror, transparent geoms, sites, shadows and sky."""
         model, picture, flags = self._model, shot.picture, self._scene.flags
         rendered, passes = opaque, [Pass(Purpose.CAMERA, picture.seen & opaque)]
         if last:

@@ -31,10 +31,8 @@ class Skins:
 
     A display list always renders the same faces, and recording one takes as long as rendering a third of them. For a
     skin MuJoCo renders the faces of an index buffer. Before each rendering it would overwrite the skins with those of
-    the bare model, so ``nskin`` is set to 0, which hides them from that step.
-
-    Attributes:
-        rendered: (2 ``SKINS``,) number of faces that each skin renders; the first ``SKINS`` have texture coordinates.
+    the bare model, so ``nskin`` is set to 0, which hides them from that step. ``rendered``: (2 ``SKINS``,) number of
+    faces that each skin renders; the first ``SKINS`` have texture coordinates.
     """
 
     def __init__(self, context: mujoco.MjrContext, scene: mujoco.MjvScene):
