@@ -13,6 +13,7 @@ from pydantic import Field
 from pipeline.axes.base import Axis, ByLevel, Intervals, PhysicsPerturbation, pick
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
+from pipeline.libero.starts import kept_actions
 from pipeline.types import Demo, Floats, Push, RollOut, Scene, Task
 
 STEP_S = 1 / SCHEMA.fps_hz
@@ -60,8 +61,6 @@ class DisturbancePerturbation(PhysicsPerturbation):
         ``push_at_grasp`` when it is too near to where the gripper opens or closes, ``push_after_end`` when the
         demonstration ends before it does.
         """
-        from pipeline.scenes.noops import kept_actions  # loads MuJoCo, which a plan does without
-
         gripper = demo.actions[kept_actions(demo.actions, "drop"), 6]
         end = self.first_step + self.steps
         if end + self.away_steps > len(gripper):

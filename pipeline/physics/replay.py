@@ -13,12 +13,11 @@ from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
-from pipeline.libero.starts import recorded_start
+from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError
 from pipeline.physics.reference import Reference
 from pipeline.physics.roll_out import roll_out
 from pipeline.physics.tracking import Route, follow
-from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
 
 

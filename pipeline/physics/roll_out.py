@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from pipeline.config import ReplayConfig
+from pipeline.libero.starts import kept_actions
 from pipeline.physics.environment import shared
-from pipeline.scenes.noops import kept_actions
 from pipeline.types import Demo, Floats, Push, Scene, Task
 
 

@@ -13,13 +13,12 @@ from pipeline.compute.pool import LOST
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
-from pipeline.libero.starts import LEFT_OUT_STEPS
+from pipeline.libero.starts import LEFT_OUT_STEPS, kept_actions
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.quality import measure
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
 from pipeline.planning.plan import Row
-from pipeline.scenes.noops import kept_actions
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Demo, Scene, Trajectory, Verdict
 
