@@ -27,8 +27,7 @@ from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay
-from pipeline.physics.roll_out import first_look, roll_out
+from pipeline.physics.replay import first_look, replay, roll_out
 from pipeline.planning.plan import Draws
 from pipeline.planning.streams import Stream
 from pipeline.rendering.frames import frames_of

@@ -22,8 +22,7 @@ from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.replay import replay, roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
