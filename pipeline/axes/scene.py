@@ -14,7 +14,7 @@ from pydantic import Field
 from pipeline.axes.base import Frozen, Level, PhysicsPerturbation
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
-from pipeline.libero.relations import relation_holds
+from pipeline.libero.task_goal import relation_holds
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 

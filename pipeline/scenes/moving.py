@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline import rotations
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
-from pipeline.libero.relations import relation_holds
+from pipeline.libero.task_goal import relation_holds
 from pipeline.scenes.compiled import CompiledScene, simulate_held
 from pipeline.types import Floats, Scene, Task
 
