@@ -12,8 +12,7 @@ from pipeline.episode_schema import named
 from pipeline.images.jpeg import encode
 from pipeline.planning.streams import Stream
 from pipeline.rendering.frames import changes_of, frames_of
-from pipeline.rendering.geometry import see
-from pipeline.rendering.instances import Instances
+from pipeline.rendering.geometry import Instances, see
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception

@@ -30,7 +30,7 @@ from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream
-from pipeline.rendering.instances import COMMON
+from pipeline.rendering.geometry import COMMON
 from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.render import render
 from pipeline.rendering.renderer import Renderer
