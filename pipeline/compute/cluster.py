@@ -146,7 +146,7 @@ def _refusal(where: str, faults: list[str]) -> PipelineError:
 
 def _forget() -> None:
     """Empty every cache of this package: what lies at a path, such as a bank of rewrites, may be another file now."""
-    if (open_scenes := sys.modules.get(f"{PACKAGE}.rendering.last_scene")) is not None:
+    if (open_scenes := sys.modules.get(f"{PACKAGE}.rendering.renderer")) is not None:
         open_scenes.scene_of_process().close()
     for name, module in list(sys.modules.items()):
         if name.startswith(f"{PACKAGE}.") and name != __name__:

@@ -19,7 +19,7 @@ from pipeline.physics.quality import ARM, FINGERS
 from pipeline.physics.stepping import ControlStep
 from pipeline.planning.streams import Stream
 from pipeline.rendering.frames import changes_of, frames_of
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import LastScene
 from pipeline.scenes.compiled import proprioception
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task

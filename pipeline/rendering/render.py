@@ -13,7 +13,7 @@ from pipeline.images.jpeg import encode
 from pipeline.planning.streams import Stream
 from pipeline.rendering.frames import changes_of, frames_of
 from pipeline.rendering.geometry import Instances, see
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import LastScene
 from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception
 from pipeline.types import Rendered, Task, Trajectory

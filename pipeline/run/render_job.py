@@ -16,8 +16,8 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
 from pipeline.planning.plan import Row
 from pipeline.planning.streams import Stream
-from pipeline.rendering.last_scene import scene_of_process
 from pipeline.rendering.render import render
+from pipeline.rendering.renderer import scene_of_process
 from pipeline.stores.frame_store import FrameStore, merged
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Rendered, Trajectory

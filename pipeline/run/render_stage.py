@@ -74,7 +74,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
             )
         undone = set(missing)
         # A stage that has nothing to do loads no simulator.
-        from pipeline.rendering.last_scene import scene_of_process
+        from pipeline.rendering.renderer import scene_of_process
         from pipeline.run.render_job import RenderJob
 
         # Those of many streams first, so that no worker is left alone with one at the end. Those of few, to which the

@@ -18,7 +18,7 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import decode, encode
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import LastScene
 from pipeline.types import Frame
 from pipeline.validation.checks import Case
 
