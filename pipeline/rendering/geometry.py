@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import RenderPerturbation, of_layer
 from pipeline.episode_schema import MAPS, SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode_exactly, to_policy
@@ -83,7 +82,7 @@ def see(
     each executed action, by the ids of ``instances``."""
     view = SCHEMA.views[stream.view]
     maps: dict[Extra, list[bytes]] = {name: [] for name in MAPS if name in extras}
-    with renderer.perturbed(of_layer(stream.perturbations, RenderPerturbation)):
+    with renderer.perturbed(stream.changes):
         renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
         intrinsics, extrinsics = matrices(renderer, stream.view)
         for step in range(len(trajectory.actions) if maps else 0):

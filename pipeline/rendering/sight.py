@@ -11,7 +11,6 @@ from pipeline.axes.light import exposure
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero import bddl
 from pipeline.planning.streams import Stream
-from pipeline.rendering.frames import changes_of
 from pipeline.rendering.renderer import Renderer
 from pipeline.scenes.placement import added_objects, enough_seen
 from pipeline.types import Floats, Task, Trajectory
@@ -90,7 +89,7 @@ class FirstFrame:
     def fault(self, streams: Sequence[Stream]) -> str | None:
         """What is wrong with the streams' scene, which the renderer shows now; None when nothing is."""
         self._renderer.restore(*self._first)
-        changes = changes_of(streams[0])
+        changes = streams[0].changes
         faults: list[str] = []
         cameras = dict.fromkeys(SCHEMA.views[stream.view].camera for stream in streams)
         if changes:

@@ -30,7 +30,7 @@ from pipeline.physics.reference import Reference
 from pipeline.physics.replay import first_look, replay, roll_out
 from pipeline.planning.plan import Draws
 from pipeline.planning.streams import Stream
-from pipeline.rendering.frames import frames_of
+from pipeline.rendering.render import frames_of
 from pipeline.rendering.renderer import LastScene, scene_of_process
 from pipeline.report.sheets import Tile, describe, sheet, side_by_side
 from pipeline.testset import benchmark

@@ -1,7 +1,7 @@
 """Some episodes rendered anew: is what the store and the datasets have the right picture, and the right way up?
 
 The process is another than the one that rendered the frames, and the pictures are made from the trajectory's states.
-Noise and turning are done here once more, by other code than that of the run (``rendering/frames.py``).
+Noise and turning are done here once more, by other code than that of the run (``rendering/render.py``).
 """
 
 from __future__ import annotations
