@@ -14,9 +14,8 @@ from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
 
 from pipeline.compute.cluster import Workplace, in_place, workplace_of
-from pipeline.compute.local import local_cluster
 from pipeline.compute.progress import progress_of
-from pipeline.compute.slurm import slurm_cluster
+from pipeline.compute.workers import local_cluster, slurm_cluster
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
