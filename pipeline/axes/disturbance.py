@@ -59,8 +59,7 @@ class DisturbancePerturbation(PhysicsPerturbation):
 
         Steps are counted in the demonstration without its no-ops, as it is replayed by default. RefusedError:
         ``push_at_grasp`` when it is too near to where the gripper opens or closes, ``push_after_end`` when the
-        demonstration ends before it does.
-        """
+        demonstration ends before it does."""
         gripper = demo.actions[kept_actions(demo.actions, "drop"), 6]
         end = self.first_step + self.steps
         if end + self.away_steps > len(gripper):
@@ -78,14 +77,8 @@ class DisturbancePerturbation(PhysicsPerturbation):
 
     def apart(self, others: Sequence[DisturbancePerturbation]) -> Floats:
         """Compared with the pushes that begin at the same step."""
-        return np.array(
-            [
-                float(np.linalg.norm(self.impulse_n_s - other.impulse_n_s))
-                if self.first_step == other.first_step
-                else math.nan
-                for other in others
-            ]
-        )
+        apart_n_s = [float(np.linalg.norm(self.impulse_n_s - other.impulse_n_s)) for other in others]
+        return np.where([self.first_step == other.first_step for other in others], apart_n_s, math.nan)
 
 
 class DisturbanceAxis(Axis):
@@ -110,8 +103,8 @@ class DisturbanceAxis(Axis):
         level = self.draw_level(rng)
         steps, first_step = _step(rng, self.steps), _step(rng, self.first_step)
         bearing_rad, rise = rng.uniform(-math.pi, math.pi), rng.uniform(-RISE, RISE)
-        level_part = math.sqrt(1 - rise**2)
-        direction = np.array([level_part * math.cos(bearing_rad), level_part * math.sin(bearing_rad), rise])
+        flat = math.sqrt(1 - rise**2)
+        direction = np.array([flat * math.cos(bearing_rad), flat * math.sin(bearing_rad), rise])
         force_n = direction * self.impulse_n_s[level - 1] / (steps * STEP_S)
         return DisturbancePerturbation(
             level=level,

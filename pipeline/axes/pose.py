@@ -6,7 +6,6 @@ Physics layer. The component ``scene`` is in ``pipeline.axes.scene``.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from functools import cache
 from typing import Annotated, ClassVar, Literal
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from pipeline.axes.base import Axis, PhysicsPerturbation, pick, point
-from pipeline.axes.scene import ScenePerturbation, draw_scene
+from pipeline.axes.scene import ScenePerturbation, displacements, draw_scene
 from pipeline.libero import bddl
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
@@ -26,13 +25,10 @@ Component = Literal["target", "receptacle", "scene"]
 
 
 class PosePerturbation(PhysicsPerturbation):
-    """One object moved in the horizontal plane and turned on the spot.
+    """One object, by its name in the BDDL file, moved in the horizontal plane and turned on the spot.
 
-    Attributes:
-        moved: the object's name in the BDDL file.
-        dx_m, dy_m: displacement along the world's axes from where the demonstration has it.
-        dyaw_deg: counter-clockwise turn about the vertical through its origin.
-    """
+    Displacements are along the world's axes from where the demonstration has it, the turn is counter-clockwise about
+    the vertical through its origin."""
 
     axis: Literal["pose"] = "pose"
     component: Literal["target", "receptacle"]
@@ -75,17 +71,10 @@ class PosePerturbation(PhysicsPerturbation):
 
 @cache
 def _test_moves_m(test: TestSet, task: Task, moved: str) -> Floats:
-    """(N, 2) the displacement of an object in each of the axis's test tasks of ``task``; NaN where it has none."""
-    moves_m = np.full((len(test.on(task, "pose")), 2), np.nan)
-    for place, tested in enumerate(test.on(task, "pose")):
-        known = tested.parameters
-        if known.get("target") == moved:
-            moves_m[place] = known["dx_m"], known["dy_m"]
-        # Such as moka_pot_2:0.01,-0.02;plate_1:0,0.03.
-        for name, dx_m, dy_m in re.findall(r"([^;:]+):([^,]+),([^;]+)", str(known.get("others", ""))):
-            if name == moved:
-                moves_m[place] = float(dx_m), float(dy_m)
-    return moves_m
+    """(N, 2) how far each of the axis's test tasks of ``task`` moves one of its targets; NaN for another thing."""
+    nowhere, is_target = (math.nan, math.nan), moved in bddl.read(task.bddl_file).targets
+    moves_m = [displacements(one.parameters).get(moved, nowhere) for one in test.on(task, "pose")]
+    return np.array(moves_m if is_target else [nowhere] * len(moves_m)).reshape(-1, 2)
 
 
 class PoseAxis(Axis):
@@ -125,12 +114,5 @@ class PoseAxis(Axis):
         if component == "scene":
             return draw_scene(rng, level, task)
         dx_m, dy_m = point(rng, self.step_m * math.sqrt(rng.uniform((level - 1) ** 2, level**2)))
-        dyaw_deg = rng.uniform(-self.turn_deg, self.turn_deg)
-        return PosePerturbation(
-            level=level,
-            component=component,
-            moved=moved,
-            dx_m=dx_m,
-            dy_m=dy_m,
-            dyaw_deg=round(dyaw_deg, 2),
-        )
+        turn_deg = round(rng.uniform(-self.turn_deg, self.turn_deg), 2)
+        return PosePerturbation(level=level, component=component, moved=moved, dx_m=dx_m, dy_m=dy_m, dyaw_deg=turn_deg)

@@ -8,6 +8,7 @@ from functools import cache
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
@@ -21,7 +22,6 @@ Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
 
 LIMIT_MARGIN_RAD = 0.05
 """How far from its limits every joint must start."""
-
 
 Component = Literal["initial_joints", "controller_posture"]
 
@@ -84,23 +84,20 @@ class RobotPerturbation(PhysicsPerturbation):
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """To the offsets of all robot tasks; the arm is the same in all, so ``task`` does not matter."""
-        ids = [int(tested.parameters["id"]) - 1 for tested in test.of("robot")]
-        distances_rad: Floats = np.linalg.norm(benchmark_offsets_rad()[ids] - self.joint_offsets_rad, axis=1)
-        return distances_rad
+        return self._apart_rad(benchmark_offsets_rad())[[int(one.parameters["id"]) - 1 for one in test.of("robot")]]
 
     def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
-        """To the offsets of all, as the arm is the same in all tasks."""
-        offsets_rad = np.array([other.joint_offsets_rad for other in others])
-        apart_rad: Floats = np.linalg.norm(offsets_rad - self.joint_offsets_rad, axis=1)
-        return apart_rad
+        return self._apart_rad([other.joint_offsets_rad for other in others])
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450; the arm is the same in all
-        tasks, so ``task`` does not matter."""
+        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450."""
         compared = len(test.of("robot"))
-        if not compared:
-            return Nearest(np.inf, 0)
-        return Nearest(float(np.linalg.norm(benchmark_offsets_rad() - self.joint_offsets_rad, axis=1).min()), compared)
+        return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()) if compared else np.inf, compared)
+
+    def _apart_rad(self, offsets_rad: ArrayLike) -> Floats:
+        """(N,) from offsets (N, 7)."""
+        distances_rad: Floats = np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1)
+        return distances_rad
 
 
 @cache
