@@ -30,12 +30,7 @@ HUMAN, EXPANDED = "human", "expanded"
 
 @dataclass(frozen=True)
 class DemoEntry:
-    """A demonstration in a source's index: all that planning needs, without its arrays.
-
-    Attributes:
-        task, key, source, origin, sha256: as in ``Demo``.
-        steps: number of actions, 20 a second.
-    """
+    """A demonstration in a source's index: what planning needs of it; ``steps`` are its actions, 20 a second."""
 
     task: Task
     key: str
@@ -53,21 +48,14 @@ class DemoEntry:
         return cls(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
 
 
-@dataclass(frozen=True)
-class Problem:
-    """Something in a source that cannot be used.
-
-    Attributes:
-        name: a demonstration's id, or ``<suite>/<task>`` when its whole file is unusable.
-        error: why, and what to do.
-    """
+class Problem(NamedTuple):
+    """What of a source cannot be used, a demonstration or ``<suite>/<task>`` for a whole file, and why."""
 
     name: str
     error: PipelineError
 
 
-@dataclass(frozen=True)
-class DemoIndex:
+class DemoIndex(NamedTuple):
     """What a source holds. Every entry was read and checked once, so it can be loaded."""
 
     entries: list[DemoEntry]
@@ -95,18 +83,16 @@ class StarterSource:
         return DemoIndex([DemoEntry.of(self.of(task)) for task in wanted], [])
 
     def load(self, demo_id: str) -> Demo:
-        task, key = _parse(demo_id)
-        demo = self.of(task)
-        if demo.key != key:
+        demo = self.of(_parse(demo_id)[0])
+        if demo.demo_id != demo_id:
             raise PipelineError(f"the starter set has no {demo_id}", expected=demo.demo_id)
         return demo
 
     def of(self, task: Task) -> Demo:
         """The task's one demonstration."""
         if task.suite not in SUITES:
-            raise PipelineError(
-                f"the starter set has no demonstration of {task.suite}/{task.name}", expected="a LIBERO task"
-            )
+            what = f"the starter set has no demonstration of {task.suite}/{task.name}"
+            raise PipelineError(what, expected="a LIBERO task")
         group = "libero-90" if task.suite == "libero_90" else "libero"
         name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
         folder = package_folder("robouse") / "bundled_tasks" / group / name
@@ -135,11 +121,9 @@ class HDF5Source:
     root: Path
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
-        wanted = list(wanted)
-        entries: list[DemoEntry] = []
-        problems = [
-            stray for suite in dict.fromkeys(task.suite for task in wanted) for stray in self._files_of_no_task(suite)
-        ]
+        wanted, entries = list(wanted), []
+        suites_of_them = dict.fromkeys(task.suite for task in wanted)
+        problems = [stray for suite in suites_of_them for stray in self._files_of_no_task(suite)]
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
             name, usable = f"{task.suite}/{task.name}", 0
@@ -150,9 +134,8 @@ class HDF5Source:
                             break
                         try:
                             entry = DemoEntry.of(self._read(task, key, data))
-                            first = first_with.setdefault(entry.sha256, entry)
-                            if first is not entry:
-                                # Episodes are identified by content: two copies would make two rows with one id.
+                            # Episodes are identified by content: two copies would make two rows with one id.
+                            if (first := first_with.setdefault(entry.sha256, entry)) is not entry:
                                 raise PipelineError(
                                     f"holds the same actions, states and model as {first.demo_id}",
                                     where=f"{self._path(task)} data/{key}",
@@ -208,7 +191,7 @@ class HDF5Source:
             # Of the places that name the task, only this one was corrected for publication; the tasks' earlier names
             # stay in env_args. A name that no task has counts as one of those.
             recorded = PurePosixPath(hdf5.text(data, "bddl_file_name", f"{path} data")).stem
-            if recorded != task.name and recorded in _task_names():
+            if recorded != task.name and any(recorded == other.name for suite in suites() for other in tasks(suite)):
                 raise PipelineError(
                     f"named after one task but recorded for another, {recorded!r} (bddl_file_name)",
                     where=path,
@@ -284,7 +267,3 @@ def _parse(demo_id: str) -> tuple[Task, str]:
     if len(parts) != 3:
         raise PipelineError(f"not a demonstration's id: {demo_id!r}", expected="<suite>/<task>/<key>")
     return find_task(parts[0], parts[1]), parts[2]
-
-
-def _task_names() -> frozenset[str]:
-    return frozenset(task.name for suite in suites() for task in tasks(suite))

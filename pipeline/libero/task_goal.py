@@ -52,15 +52,10 @@ BETWEEN = 0.25
 
 
 class Aim(NamedTuple):
-    """Where something is to be, or is at first.
+    """Where a kind of thing is to be, or is at first.
 
-    Attributes:
-        relation: ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the place; None where the
-            part is enough.
-        thing: its kind.
-        place: kind of what it is put on, in, next to; None where the part is enough.
-        part: which of ``PARTS`` of the place, or which of several places of that kind.
-    """
+    ``relation`` is ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the kind of place; both are
+    None where the ``part`` is enough: which of ``PARTS`` of the place, or which of several places of that kind."""
 
     relation: str | None
     thing: str
