@@ -53,12 +53,12 @@ class RobotPerturbation(PhysicsPerturbation):
         RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot is
         put where it touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add
         up to a posture of the test set."""
-        from pipeline.scenes.compiled import CompiledScene
+        from pipeline.scenes.compiled import ARM, CompiledScene
 
         compiled = CompiledScene(scene)
         data, model = compiled.data, compiled.model
         before = compiled.touching().keys()
-        joints = [model.joint(f"robot0_joint{n}") for n in range(1, 8)]
+        joints = [model.joint(name) for name in ARM]
         arm = [joint.qposadr[0] for joint in joints]
         pulled = self.component == "controller_posture" and scene.posture_rad is not None
         posture = (scene.posture_rad if pulled else data.qpos[arm]) + np.array(self.joint_offsets_rad)

@@ -15,12 +15,11 @@ from pipeline.axes import Perturbation
 from pipeline.errors import RefusedError
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
-from pipeline.physics.quality import ARM, FINGERS
 from pipeline.physics.stepping import ControlStep
 from pipeline.planning.streams import Stream
 from pipeline.rendering.render import frames_of
 from pipeline.rendering.renderer import LastScene
-from pipeline.scenes.compiled import proprioception
+from pipeline.scenes.compiled import ARM, FINGERS, proprioception
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
 

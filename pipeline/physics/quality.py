@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
-from pipeline.scenes.compiled import CompiledScene
+from pipeline.scenes.compiled import ARM, FINGERS, CompiledScene
 from pipeline.types import Floats, Quality, State, Task, Trajectory
 
 MOVED_M = 0.001
@@ -19,9 +19,6 @@ MOVED_M = 0.001
 
 IDLE_M, IDLE_DEG = 0.0005, 0.25
 """A step is idle where hand and fingers move less: 1 cm/s and 5 degrees/s."""
-
-ARM = tuple(f"robot0_joint{number}" for number in range(1, 8))
-FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
 
 
 def measure(trajectory: Trajectory, task: Task) -> Quality:
@@ -38,8 +35,8 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
         grip = data.site("gripper0_grip_site")
         positions.append(grip.xpos.copy())
         turns.append(grip.xmat.reshape(3, 3).copy())
-        roots = model.body_rootid[model.geom_bodyid[data.contact.geom[data.contact.dist <= 0]]]
-        touched += step > 0 and any(robot in pair and not allowed & {*pair} for pair in roots.tolist())
+        roots = model.body_rootid[scene.contacts].tolist()
+        touched += step > 0 and any(robot in pair and not allowed & {*pair} for pair in roots)
     hand, qpos = np.stack(positions), np.stack([State.of(state, model.nq).qpos for state in trajectory.states])
     steps_m: Floats = np.linalg.norm(np.diff(hand, axis=0), axis=1)
     asked = hand[:-1] + SCHEMA.action.unit_m * np.clip(trajectory.actions[:, :3], -1, 1)

@@ -81,8 +81,7 @@ class _Seen:
         self.pairs = []
         for state in trajectory.states:
             scene.restore(state)
-            contact = scene.data.contact
-            self.pairs.append(self.model.geom_bodyid[contact.geom[contact.dist <= 0]])
+            self.pairs.append(scene.contacts)
         self.robot = self._below(self.model.body("robot0_base").id)
 
     def deeds(self, known: Bddl, fact: Fact) -> Iterator[_Deed]:

@@ -14,6 +14,10 @@ from pipeline.types import Floats, Scene, State
 
 Joints = NDArray[np.intp]
 
+ARM = tuple(f"robot0_joint{number}" for number in range(1, 8))
+FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
+"""The robot's joints, base to wrist, and those of its gripper."""
+
 
 def compiled(model_xml: str) -> mujoco.MjModel:
     """A scene's model, images included.
@@ -70,6 +74,12 @@ class CompiledScene:
         first = int(self.model.joint(f"{name}_joint0").qposadr[0])
         return State.of(state, self.model.nq).qpos[first : first + 7]
 
+    @property
+    def contacts(self) -> NDArray[np.intp]:
+        """(C, 2) the bodies in contact."""
+        contact = self.data.contact
+        return np.asarray(self.model.geom_bodyid[contact.geom[contact.dist <= 0]], np.intp)
+
     def touching(self) -> dict[tuple[int, int], float]:
         """Each pair of bodies of different things in contact, and the gap in m: deepest, negative."""
         contact = self.data.contact
@@ -106,7 +116,6 @@ def proprioception(data: mujoco.MjData) -> tuple[NDArray[np.float32], NDArray[np
     """State (8,) and joint state (7,) of a restored scene; names and units in ``schemas/episode.json``."""
     position = data.site("gripper0_grip_site").xpos
     w, *xyz = data.body("robot0_right_hand").xquat
-    fingers = [data.joint(f"gripper0_finger_joint{n}").qpos[0] for n in (1, 2)]
-    joints = [data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)]
+    fingers, joints = ([data.joint(name).qpos[0] for name in names] for names in (FINGERS, ARM))
     state = np.concatenate([position, axis_angle(w, np.array(xyz)), fingers])
     return state.astype(np.float32), np.array(joints, np.float32)
