@@ -35,13 +35,8 @@ SOURCES = (".py", ".yaml", ".json", ".j2")
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where a run works, and with what.
-
-    Attributes:
-        folder: absolute path of the folder that the run was started in, from which its relative paths start.
-        token: absolute path of a file that the run wrote for its workers to find.
-        setup: what ``setup()`` is there.
-    """
+    """Where a run works, and with what: absolute paths of the folder that it was started in and of a file that it wrote
+    for its workers to find, and what ``setup()`` is there."""
 
     folder: Path
     token: Path
@@ -91,7 +86,6 @@ def setup() -> dict[str, str]:
 
     A process keeps the code that it imported first, so this is found out once and not again.
     """
-
     # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
@@ -110,8 +104,7 @@ def setup() -> dict[str, str]:
 def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
     """Check every worker that a Dask client has now; later ones are checked when they get their first work.
 
-    The run writes into ``folder``. PipelineError naming every worker that cannot work for this run, and why.
-    """
+    The run writes into ``folder``. PipelineError naming every worker that cannot work for this run, and why."""
     folder.mkdir(parents=True, exist_ok=True)
     token = folder.absolute() / f".cluster-{uuid4().hex}"
     workplace = Workplace(Path.cwd(), token, setup())

@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from pipeline.compute.cluster import Workplace, in_place, workplace_of
 from pipeline.compute.progress import progress_of
-from pipeline.compute.workers import local_cluster, slurm_cluster
+from pipeline.compute.workers import ended, local_cluster, slurm_cluster
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
@@ -164,19 +164,15 @@ def _limited(fn: Expendable[Item, Result], item: Item) -> Result:
 
 @dataclass(frozen=True)
 class _Workers:
-    """Work on a client's workers.
-
-    Attributes:
-        client: of the cluster.
-        workplace: what workers elsewhere have to have in common with the run.
-        refill: brings back workers that are missing.
-        patience_s: how long to wait for a worker where none is left.
-    """
+    """Work on the workers of a cluster's client."""
 
     client: Any
     workplace: Workplace | None = None
+    """What workers elsewhere have to have in common with the run."""
     refill: Callable[[], None] = lambda: None
+    """Brings back workers that are missing."""
     patience_s: float = ALONE_S
+    """How long to wait for a worker where none is left."""
 
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         from distributed import KilledWorker
@@ -270,12 +266,8 @@ def _result(outcome: Result | Exception) -> Result:
     from distributed import KilledWorker
 
     if isinstance(outcome, KilledWorker):
-        raise PipelineError(
-            f"one piece of work ended {outcome.allowed_failures + 1} workers",
-            where=f"the last was {outcome.last_worker.address}",
-            expected="workers that live: the system may have ended them because memory ran out",
-            remedy=f"see the system's log, use fewer workers, and {GO_ON}",
-        )
+        what = f"one piece of work ended {outcome.allowed_failures + 1} workers"
+        raise ended(what, f"the last was {outcome.last_worker.address}")
     if isinstance(outcome, Exception):
         raise outcome
     return outcome

@@ -45,8 +45,7 @@ def local_cluster(
 
 
 def _started(workers: int) -> Any:
-    """Worker processes on this machine. Where one of them dies before all have started, Dask ends them; they are
-    started once more."""
+    """Worker processes on this machine, started once more where one dies and Dask ends all, before all have started."""
     from distributed import LocalCluster
 
     # An error reaches the user once, from here.
@@ -63,11 +62,15 @@ def _started(workers: int) -> Any:
             )
         except RuntimeError as error:
             failure = error
-    raise PipelineError(
-        f"worker processes ended while they started, {STARTS} times",
-        expected="workers that live: the system may have ended them because memory ran out",
-        remedy=f"see the system's log, use fewer workers, and {GO_ON}",
-    ) from failure
+    raise ended(f"worker processes ended while they started, {STARTS} times") from failure
+
+
+def ended(what: str, where: str | None = None) -> PipelineError:
+    """The error that workers ended, and nothing says why."""
+    expected = "workers that live: the system may have ended them because memory ran out"
+    return PipelineError(
+        what, where=where, expected=expected, remedy=f"see the system's log, use fewer workers, and {GO_ON}"
+    )
 
 
 @contextmanager
@@ -108,11 +111,8 @@ def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
     """A scheduler in this process and a job for each worker; when the block ends, so do the jobs.
 
     What a site needs beyond ``SlurmConfig``, such as the network interface, dask-jobqueue reads from its own file,
-    ``~/.config/dask/jobqueue.yaml``. PipelineError when SLURM takes no job.
-
-    Args:
-        config: with ``cluster: slurm``.
-        folder: what the work writes into; the nodes must see it too.
+    ``~/.config/dask/jobqueue.yaml``. The work writes into ``folder``, which the nodes must see too. PipelineError when
+    SLURM takes no job.
     """
     from dask_jobqueue.slurm import SLURMCluster
 
