@@ -104,12 +104,9 @@ def unsealed(path: Path) -> Iterator[SealedFile]:
 
 @contextmanager
 def sealed(path: Path, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
-    """A new file to fill with arrays; it gets its checksums when the block ends. The same arrays make the same bytes.
+    """A new file to fill with arrays, with JSON-serialisable ``attributes``; it gets its checksums when the block ends.
 
-    Args:
-        path: where it will lie.
-        attributes: JSON-serialisable, what it says beside its arrays.
-    """
+    The same arrays make the same bytes."""
     with h5py.File(path, "w", libver=FORMAT) as file:
         yield file
         # Or a compressed array finds its place when its last reference goes, and a profiler may hold one for a moment.

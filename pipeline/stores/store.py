@@ -37,12 +37,8 @@ _MADE_WITH = b"made_with"
 
 
 class Store(ABC):
-    """The files of one stage.
-
-    Args:
-        settings: JSON-serialisable, those of the user that the bytes depend on; files with others count as missing.
-        form: what else of this project they depend on, by its name for people.
-    """
+    """The files of one stage. Their bytes depend on ``settings`` of the user, and files with others count as missing;
+    and on what else of this project is in ``form``, by its name for people. Both are JSON-serialisable."""
 
     step: ClassVar[Step]
     """What makes the files, in ``pipeline/identity.py``."""
