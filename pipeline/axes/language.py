@@ -46,12 +46,9 @@ MAX_WORDS_AND_MARKS, MAX_CHARACTERS = 38, 172
 """SmolVLA and pi0 keep the first 48 tokens of an instruction and cut the rest without a warning.
 
 Two of the 48 are not free: pi0's tokenizer puts a token at the beginning, and both policies a line break at the end.
-A common word or a punctuation mark is one token, a rare word two or more. Their tokenizers (SmolVLM's with 49,152
-entries, PaliGemma's with 257,152) could not be had, so three public ones were measured on the bank: GPT-2's (50,257
-entries), Mistral's (32,000) and its successor (131,072). By none has a rewrite more than 8 tokens beyond its words and
-marks, hence 46 - 8; the bound on characters is for sentences with more rare words than the bank's. The longest rewrite
-has 42, 43 and 41 tokens of the 46. Passages of this length, cut from the rewrites of one class in a row, have 47, 48
-and 48 at most, and over 46 in less than 1 of 100. The smaller a vocabulary, the more words it splits.
+Their tokenizers could not be had, so three public ones were measured on the bank: GPT-2's, Mistral's and its successor.
+By none has a rewrite more than 8 tokens beyond its words and marks, hence 46 - 8; the longest has 43 of the 46. The
+bound on characters is for sentences with more rare words than the bank's.
 """
 LENGTH = (
     f"at least {MIN_WORDS} words, at most {MAX_WORDS_AND_MARKS} words and punctuation marks together, "

@@ -46,11 +46,8 @@ class Compared:
 class Coverage:
     """How far the test tasks of one component are from the nearest episode, in the axis's measure.
 
-    Attributes:
-        test_tasks: the benchmark's tasks of this component.
-        compared: those that some episode could be compared with; 0 where the measure does not tell near from far.
-        smallest, median, p90, largest: of their distances, 90 % are at most ``p90``; None when none was compared.
-    """
+    ``compared`` are those that some episode could be compared with, none where the measure does not tell near from far;
+    90 % of their distances are at most ``p90``. Figures are None when none was compared."""
 
     test_tasks: int
     compared: int

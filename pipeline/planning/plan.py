@@ -124,14 +124,8 @@ def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Draws:
-    """What a plan draws for its episodes of one axis or combination.
-
-    Attributes:
-        name: of the axis or combination, as in ``plan.episodes``.
-        axes: what it draws from.
-        seed: of the plan.
-        test: the benchmark's tasks, of which draws keep clear.
-    """
+    """What a plan draws from ``axes`` for its episodes of one axis or combination, called as in ``plan.episodes``;
+    draws keep clear of the benchmark's tasks."""
 
     name: str
     axes: Sequence[Axis]
@@ -139,11 +133,8 @@ class Draws:
     test: TestSet
 
     def of(self, demo_id: str, task: Task) -> Iterator[tuple[Perturbation, ...]]:
-        """Draws for one demonstration, variant after variant: all different, and clear of the test set.
-
-        Yields:
-            One perturbation of each axis, until no different draw is left.
-        """
+        """Draws for one demonstration, each one perturbation of each axis, variant after variant: all different, and
+        clear of the test set, until no different draw is left."""
         first = int(rng(self.seed, self.name, demo_id).integers(2**31))
         drawn: set[tuple[str, ...]] = set()
         for variant in count():
@@ -240,12 +231,8 @@ def pending(
 def select(
     rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
 ) -> dict[str, Verdict]:
-    """What became of every row: kept, dropped with a reason, or a reserve that was not needed.
-
-    Args:
-        verdicts: trajectory id to its verdict.
-        rejected: episode id to the reason why its frames were rejected.
-    """
+    """What became of every row: kept, dropped with a reason, or a reserve that was not needed; by the verdicts of
+    trajectories, and the reasons why episodes' frames were rejected."""
     unknown = Verdict(False, "not_replayed")
     return {row.episode_id: verdict or unknown for row, verdict in _verdicts(rows, verdicts, rejected)}
 

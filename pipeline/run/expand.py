@@ -59,15 +59,12 @@ class Expansion:
 
 
 def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: int, workers: Workers) -> Expansion:
-    """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
+    """Make ``per_task`` demonstrations of each task from ``rows``, which ``candidates`` or ``resets`` drew for as many,
+    and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
     A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those before
     it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was. PipelineError when a
     demonstration cannot be read, or finished replays would be made anew unasked.
-
-    Args:
-        demos: what the candidates are made from.
-        rows: what ``candidates`` or ``resets`` drew for as many demonstrations.
     """
     store = TrajectoryStore(out / ".replays")
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)

@@ -10,7 +10,7 @@ import hashlib
 import time
 import timeit
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -38,21 +38,15 @@ TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
 
 
 class Speed(NamedTuple):
-    """How fast this machine is: seconds of one core for a control step, and for a frame of the trial's scene by the
-    plain renderer."""
+    """Seconds of one core for a control step, and for a frame of the trial's scene by the plain renderer."""
 
     step_s: float
     frame_s: float
 
 
-@dataclass(frozen=True)
-class Trial:
-    """What a trial came to.
-
-    Attributes:
-        digests: of ten control steps and of a frame of their end, and the device that rendered it.
-        speed: of this machine.
-    """
+class Trial(NamedTuple):
+    """Digests of ten control steps and of a frame of their end, with the device that rendered it; this machine's
+    speed."""
 
     digests: Mapping[str, str]
     speed: Speed

@@ -30,14 +30,8 @@ yields in docs/axes.md."""
 
 @dataclass(frozen=True)
 class Outcome:
-    """The plan, and what replay and rendering made of it.
-
-    Attributes:
-        trajectories: trajectory id to its row in the table of replays.
-        frames: trajectory id to what is stored of its frames.
-        verdicts: episode id to verdict.
-        missed: ids of the failures to write, in the order of the plan; none unless they are asked for.
-    """
+    """The plan, and what replay and rendering made of it: by trajectory its row in the table of replays and what is
+    stored of its frames, and by episode its verdict. ``missed`` are the ids of the failures to write, if asked for."""
 
     rows: Sequence[plan.Row]
     trajectories: Mapping[str, Mapping[str, Any]]

@@ -25,12 +25,8 @@ from pipeline.types import Rendered, Trajectory
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Streams of one trajectory to render into one file, as they are sent to a worker.
-
-    Attributes:
-        row: a row of the plan that has this trajectory.
-        device: what renders the run, as OpenGL names it.
-    """
+    """Streams of the trajectory of a row to render into one file, as they are sent to a worker; ``device`` renders the
+    run, as OpenGL names it."""
 
     row: Row
     streams: tuple[Stream, ...]

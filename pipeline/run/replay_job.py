@@ -25,12 +25,8 @@ from pipeline.types import Demo, Scene, Trajectory, Verdict
 
 @dataclass(frozen=True)
 class ReplayJob:
-    """One trajectory's replay, as it is sent to a worker.
-
-    Attributes:
-        row: a row of the plan that has this trajectory.
-        twin: trajectory of the same demonstration without perturbations, which tracking follows.
-    """
+    """The replay of a row's trajectory, as it is sent to a worker; tracking follows the trajectory ``twin``, that of
+    the same demonstration without perturbations."""
 
     row: Row
     twin: str

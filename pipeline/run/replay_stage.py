@@ -29,10 +29,7 @@ class Replays:
         """Have what a plan needs in the store; reserves only where a candidate failed.
 
         The twins come first, because tracking follows them. ``rejected``: episode id to the reason why its frames were
-        rejected, as far as frames were made.
-
-        Returns:
-            Trajectory id to verdict, for every trajectory that was needed.
+        rejected, as far as frames were made. Returns the verdict of every trajectory that was needed, by its id.
         """
         store = TrajectoryStore(self.folder)
         stored = verdicts_of(store.refresh(), self.limits)
