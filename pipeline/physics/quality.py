@@ -55,6 +55,12 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
     )
 
 
+def smoothness(trajectory: Trajectory, task: Task) -> dict[str, float]:
+    """Its steps, and path and jerk of its ``Quality``, which is measured where nobody has."""
+    quality = trajectory.quality or measure(trajectory, task)
+    return {"steps": len(trajectory.actions), "path_m": quality.path_m, "jerk_rms_m_s3": quality.jerk_rms_m_s3}
+
+
 def of_goal(known: Bddl) -> Set[str]:
     """The objects and fixtures that a solution may touch and move: those that the goal names, and what stands on or in
     an object that it puts somewhere or in a drawer that it opens."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -26,7 +26,7 @@ from pipeline.identity import DISTRIBUTION, refuse_unasked
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
-from pipeline.physics.quality import measure
+from pipeline.physics.quality import smoothness
 from pipeline.planning import plan
 from pipeline.run.replay_stage import Replays
 from pipeline.scenes.compiled import CompiledScene, physics_to_read, proprioception
@@ -129,7 +129,7 @@ def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: Trajec
     for row in rows:
         task, before = find_task(row.suite, row.task), accepted[row.suite, row.task]
         motion, human = (_motion(store, one, task) for one in (row.trajectory_id, twins[row.demo_id]))
-        if any(motion.figures[name] > limit * human.figures[name] for name, limit in ROUGH.items()):
+        if any(motion.smoothness[name] > limit * human.smoothness[name] for name, limit in ROUGH.items()):
             faults[row.episode_id] = "not_smooth"
         elif any(motion.starts_like(other) for other in before):
             faults[row.episode_id] = "duplicate"
@@ -140,9 +140,9 @@ def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: Trajec
 
 @dataclass(frozen=True)
 class _Motion:
-    """What candidates are compared by: steps and ``Quality``; where arm (7,) in rad and objects (N, 3) in m start."""
+    """What candidates are compared by; where the arm (7,) in rad and objects (N, 3) in m start."""
 
-    figures: Mapping[str, float]
+    smoothness: Mapping[str, float]
     joints_rad: Floats
     objects_m: Floats
 
@@ -155,13 +155,11 @@ class _Motion:
 @cache
 def _motion(store: TrajectoryStore, trajectory_id: str, task: Task) -> _Motion:
     trajectory = store.load(trajectory_id)
-    # Of what missed its goal, such as a twin, only this asks for it.
-    figures = asdict(trajectory.quality or measure(trajectory, task)) | {"steps": len(trajectory.actions)}
     model = physics_to_read(trajectory.model_xml)
     qpos = State.of(trajectory.states[0], model.nq).qpos
     free = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
     # A state begins with the arm's seven joints.
-    return _Motion(figures, qpos[:7], qpos[free[:, None] + np.arange(3)])
+    return _Motion(smoothness(trajectory, task), qpos[:7], qpos[free[:, None] + np.arange(3)])
 
 
 def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
