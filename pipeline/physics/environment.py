@@ -42,25 +42,15 @@ class UnusableSceneError(PipelineError):
 class Environment:
     """One task's environment; every ``restore`` forgets what happened before it.
 
-    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task.
-
-    Args:
-        scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
-        scene_xml: absolute path of another file for the arena.
+    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task. It may have another
+    ``floor_style`` and ``wall_style`` than the task's arena, or another file for it, by its absolute path.
     """
 
     def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
         self.task = task
-        build = partial(
-            control_env(),
-            bddl_file_name=str(task.bddl_file),
-            has_renderer=False,
-            has_offscreen_renderer=False,
-            use_camera_obs=False,
-            ignore_done=True,
-            scene_properties=scene_properties,
-            scene_xml=scene_xml,
-        )
+        unseen = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
+        arena = {"scene_properties": scene_properties, "scene_xml": scene_xml}
+        build = partial(control_env(), bddl_file_name=str(task.bddl_file), ignore_done=True, **unseen, **arena)
         with seeded(0):
             self._env = until_placed(build, task)
         self._control_step = ControlStep(self._env.env)

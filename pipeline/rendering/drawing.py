@@ -24,12 +24,8 @@ MOST_GEOMS = 1000
 
 
 class Surfaces(NamedTuple):
-    """What each pixel shows, in the orientation of LIBERO's raw observations.
-
-    Attributes:
-        depth_m: (H, W) float32, along the axis that the camera looks along.
-        number, kind: (H, W) the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 for none.
-    """
+    """What each pixel (H, W) shows, in the orientation of LIBERO's raw observations: its depth along the axis that the
+    camera looks along, and the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 for none."""
 
     depth_m: NDArray[np.float32]
     number: NDArray[np.int32]

@@ -20,12 +20,8 @@ from pipeline.types import Frame, State
 
 
 class Renderer:
-    """Renders one scene; close it before the next is made.
-
-    Args:
-        scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
-        drawing: renders the model already; by default one is made.
-    """
+    """Renders one scene, of its MJCF or a compiled model, which belongs to the renderer from then on; close it before
+    the next is made. ``drawing`` renders the model already; by default one is made."""
 
     def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None):
         self.model = compiled(scene) if isinstance(scene, str) else scene

@@ -26,13 +26,8 @@ MOST_OUTSIDE = 0.25
 
 @dataclass(frozen=True)
 class Sight:
-    """What is seen from one camera.
-
-    Attributes:
-        things_px: thing to the number of pixels that show it in the restored state.
-        hand_outside: share of an episode's steps at which the hand is outside of the frame.
-        added_px: the same as ``things_px`` for each object that the layout axis added.
-    """
+    """What is seen from one camera: the pixels that show each thing of the task, and each object that the layout axis
+    added; and the share of an episode's steps at which the hand is outside of the frame."""
 
     things_px: dict[str, int]
     hand_outside: float

@@ -97,12 +97,8 @@ def _refuse_relations(task: Task, scene: CompiledScene) -> None:
 
 
 class _Settled(NamedTuple):
-    """How a scene came to rest: gaps in m of what touched at the start and at rest, and how far objects went.
-
-    Attributes:
-        started, rested: pairs of bodies to the gap between them, deepest, negative.
-        slid_m, tilted_deg: (N,) of each object that was free to move.
-    """
+    """How a scene came to rest: gaps between bodies that touched at the start and at rest (deepest, negative), and how
+    far objects that were free to move went (N,)."""
 
     started: Mapping[tuple[int, int], float]
     rested: Mapping[tuple[int, int], float]

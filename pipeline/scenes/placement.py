@@ -45,9 +45,7 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
     at. The objects' joints come last: the state is time, the old qpos, the new qpos (7 each), the old qvel, the new
     qvel (6 each). RefusedError when no place was found; the reason is the one that most places were refused for.
 
-    Args:
-        seed: keys the places that are tried.
-        roll_out: gives the states that the demonstration's actions lead through when nothing is added.
+    ``seed`` keys the places that are tried.
     """
     placement = _Placement(scene, roll_out(scene, demo), objects, bddl.read(demo.task.bddl_file))
     rejected: Counter[str] = Counter()

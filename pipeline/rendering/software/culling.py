@@ -32,7 +32,7 @@ SHADOW_MARGIN_M = 0.05
 
 
 class Lamp(NamedTuple):
-    """For a light with shadows: (ngeom,) which geoms cast shadows into the picture, and which it may light there."""
+    """Of a light with shadows, (ngeom,) which geoms cast shadows into the picture, and which it may light there."""
 
     casts: NDArray[np.bool_]
     lights: NDArray[np.bool_]

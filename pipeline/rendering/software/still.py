@@ -25,13 +25,10 @@ class Still:
         self._view = b""
 
     def geoms(self, view: bytes, places: NDArray[np.float32], rendered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(ngeom,) the geoms of the underlay for the next picture.
+        """(ngeom,) the geoms of the underlay for the next picture of those that are to be ``rendered`` (ngeom,).
 
-        Args:
-            view: what a picture depends on beside the geoms: the camera, and where the lamps are.
-            places: (ngeom, 12) positions and rotations of the geoms, as they are rendered.
-            rendered: (ngeom,) which geoms are to be rendered.
-        """
+        ``view`` is what a picture depends on beside the geoms: the camera, and where the lamps are. ``places`` (ngeom,
+        12) are positions and rotations of the geoms, as they are rendered."""
         if view != self._view:
             self._view, self._places = view, places
             self._geoms: NDArray[np.bool_] = np.zeros(len(places), np.bool_)
