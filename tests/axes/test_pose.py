@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.base import Level
-from pipeline.axes.pose import PoseAxis, PosePerturbation
-from pipeline.axes.scene import BASE_M, Move, ScenePerturbation
+from pipeline.axes.pose import BASE_M, Move, PoseAxis, PosePerturbation, ScenePerturbation
 from pipeline.config import ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
