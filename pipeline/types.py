@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
 
 if TYPE_CHECKING:
     import mujoco
@@ -21,6 +22,12 @@ RenderedExtra = Literal["depth", "segmentation", "object_poses"]
 """What the render stage makes beside the frames when it is asked to."""
 Extra = Literal[RenderedExtra, "outcome"]
 """What a dataset has beside the frames; ``outcome``, that of failures says of each episode why it is one."""
+
+
+class Frozen(BaseModel):
+    """A record that cannot change and refuses fields it does not know, and numbers that are not finite."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class State(NamedTuple):

@@ -19,10 +19,11 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
 
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
+from pipeline.types import Frozen as Frozen
 
 if TYPE_CHECKING:
     import mujoco
@@ -32,12 +33,6 @@ class Layer(IntEnum):
     """The cheapest thing that has to be made again when an axis changes; lower is cheaper."""
 
     TEXT, PIXELS, RENDER, PHYSICS = range(4)
-
-
-class Frozen(BaseModel):
-    """A record that cannot change and refuses fields it does not know, and numbers that are not finite."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 Level = Literal[1, 2, 3, 4, 5]
