@@ -125,10 +125,8 @@ def _sync(path: Path) -> None:
 
 
 def keep_below(folder: Path, files: set[Path]) -> None:
-    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one.
-
-    Such as shards of an earlier plan, and temporaries of a killed run.
-    """
+    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one. Such
+    as shards of an earlier plan, and temporaries of a killed run."""
     if not folder.is_dir():
         return
     on_the_way = {parent for file in files for parent in file.parents}

@@ -148,10 +148,8 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a trajectory was moved (``physics/quality.py``): columns of the manifest, with what they mean.
-
-    Another object is one that the goal does not name, and that stands on or in nothing that the goal moves.
-    """
+    """How well a trajectory was moved (``physics/quality.py``): columns of the manifest, with what they mean. Another
+    object is one that the goal does not name, and that stands on or in nothing that the goal moves."""
 
     non_target_moved_m: Annotated[float, "largest displacement of another object at any step, from the first look"]
     non_target_left_m: Annotated[float, "largest displacement of another object after the last step"]

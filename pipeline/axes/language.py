@@ -129,9 +129,7 @@ class LanguageAxis(Axis):
 
     def wordings(self, task: Task, axes: Collection[str], test: TestSet) -> tuple[str, ...]:
         """All that it can draw for a task beside other axes, as far as it keeps clear of the benchmark's instructions.
-
-        None where no bank has any. PipelineError when one of them does not pass ``lint``.
-        """
+        None where no bank has any. PipelineError when one of them does not pass ``lint``."""
         rewrites = _dealt(task, self._classes(axes), self.levels, self.bank)
         return tuple(one.text for one in rewrites if one.nearest(test, task).distance >= one.clearance)
 

@@ -58,10 +58,8 @@ class LayoutPerturbation(PhysicsPerturbation):
     per_task: ClassVar[bool] = True
 
     def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
-        """By category: infinite where a test task on this LIBERO task adds nothing of the same category.
-
-        The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
-        """
+        """By category: infinite where a test task on this LIBERO task adds nothing of the same category. The rule is
+        stricter than a distance between positions: every position of a shared category counts as 0 m."""
         return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")]
 
     def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:

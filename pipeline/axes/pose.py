@@ -86,10 +86,8 @@ class PosePerturbation(PhysicsPerturbation):
     per_task: ClassVar[bool] = True
 
     def distances_on_task(self, test: TestSet, task: Task) -> Floats:
-        """Compared with the test tasks that move the same object, alone or with others.
-
-        These move every other thing as well, each its own way, so even at distance zero the scenes would differ.
-        """
+        """Compared with the test tasks that move the same object, alone or with others. These move every other thing as
+        well, each its own way, so even at distance zero the scenes would differ."""
         return self._apart_m(_test_moves_m(test, task, self.moved))
 
     def apart(self, others: Sequence[PosePerturbation]) -> Floats:

@@ -82,10 +82,8 @@ def in_place(fn: Callable[[Item], Result], workplace: Workplace, item: Item) -> 
 
 @cache
 def setup() -> dict[str, str]:
-    """What a result may depend on beside its input: versions of Python and the packages, code and machine code.
-
-    A process keeps the code that it imported first, so this is found out once and not again.
-    """
+    """What a result may depend on beside its input: versions of Python and the packages, code and machine code. A
+    process keeps the code that it imported first, so this is found out once and not again."""
     # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:

@@ -26,10 +26,8 @@ STARTS = 2
 def local_cluster(
     workers: int | None, opengl: Callable[[], Callable[[int], None]] | None
 ) -> Iterator[tuple[Any, Callable[[], None]]]:
-    """A client of so many workers, one for each core when left out, and what brings back those that died.
-
-    ``opengl`` is that of ``runner``. PipelineError when the workers end while they start.
-    """
+    """A client of so many workers, one for each core when left out, and what brings back those that died. ``opengl`` is
+    that of ``runner``. PipelineError when the workers end while they start."""
     from dask.system import CPU_COUNT
     from distributed import Client
 

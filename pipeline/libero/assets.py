@@ -31,10 +31,8 @@ def package_folder(package: str) -> Path:
 
 
 def libero_folder() -> Path:
-    """The folder of LIBERO's definitions and initial states.
-
-    LIBERO's own function for it takes a third of a second to import, and follows a file in the user's home.
-    """
+    """The folder of LIBERO's definitions and initial states. LIBERO's own function for it takes a third of a second to
+    import, and follows a file in the user's home."""
     return package_folder("libero") / "libero"
 
 

@@ -73,10 +73,8 @@ class DemoSource(Protocol):
 
 
 class StarterSource:
-    """One human LIBERO demonstration for each of the 130 tasks, carried by the package ``robouse``.
-
-    Actions are rounded to six decimals; of the states only the first is there, and the scene's model is not.
-    """
+    """One human LIBERO demonstration for each of the 130 tasks, carried by the package ``robouse``. Actions are rounded
+    to six decimals; of the states only the first is there, and the scene's model is not."""
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         del per_task  # There is one for each task, and a count is at least one.

@@ -135,9 +135,7 @@ class Recording:
 
 def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
     """Write a task's demonstrations the way LIBERO publishes them, so that what can read its files can read this one.
-
-    The same recordings make the same bytes.
-    """
+    The same recordings make the same bytes."""
     bddl = task.bddl_file.read_text()
     (problem,), (language,) = (re.findall(rf"\({key}\s+([^()]+)\)", bddl) for key in ("problem", ":language"))
     bddl_file = f"libero/libero/bddl_files/{task.suite}/{task.name}.bddl"

@@ -143,10 +143,8 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
 
 
 def _grasp_offset(reference: Reference, step: int, hand: Hand, pose: Callable[[str], Floats], before: Floats) -> Floats:
-    """(3,) m from where a carried object is in the hand to where it was in the reference's, in the hand's frame.
-
-    Zero when nothing is carried; ``before`` while it is put down, because contacts then shift it in the hand.
-    """
+    """(3,) m from where a carried object is in the hand to where it was in the reference's, in the hand's frame. Zero
+    when nothing is carried; ``before`` while it is put down, because contacts then shift it in the hand."""
     held = [name for name, mask in reference.held.items() if mask[step]]
     carried = [name for name in held if reference.carried[name][step]]
     if not carried:

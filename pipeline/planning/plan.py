@@ -220,10 +220,8 @@ def read(path: Path) -> list[Row]:
 def pending(
     rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
 ) -> list[str]:
-    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given.
-
-    Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
-    """
+    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given. Reserves come in
+    only where a candidate before them failed, so this is asked again until it is empty."""
     found = _verdicts(rows, verdicts, rejected)
     return list(dict.fromkeys(row.trajectory_id for row, verdict in found if verdict is None))
 
@@ -240,10 +238,8 @@ def select(
 def _verdicts(
     rows: Iterable[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None
 ) -> Iterator[tuple[Row, Verdict | None]]:
-    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
-
-    The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
-    """
+    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed. The twins,
+    and each axis or combination, have a quota for each task, which candidates fill in order of rank."""
     quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
     for row in rows:
         quotas[row.axis, row.suite, row.task].append(row)

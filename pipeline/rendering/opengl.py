@@ -46,10 +46,8 @@ _DRIVER = "MUJOCO_GL=osmesa, which renders in software; and report this message 
 
 
 def calls() -> Any:
-    """PyOpenGL's functions and constants for the current context, which is one of MuJoCo's.
-
-    A function raises PipelineError where OpenGL reports an error of it.
-    """
+    """PyOpenGL's functions and constants for the current context, which is one of MuJoCo's. A function raises
+    PipelineError where OpenGL reports an error of it."""
     check(OTHERS)
     return _functions()
 

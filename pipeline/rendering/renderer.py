@@ -50,10 +50,8 @@ class Renderer:
 
     @contextmanager
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
-        """Apply render-layer perturbations to the model, and undo them at the end.
-
-        Entered again inside itself with the same perturbations, it does nothing.
-        """
+        """Apply render-layer perturbations to the model, and undo them at the end. Entered again inside itself with the
+        same perturbations, it does nothing."""
         if tuple(perturbations) == self._perturbations:
             yield
             return

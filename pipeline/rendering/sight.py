@@ -35,10 +35,8 @@ class Sight:
 
     @classmethod
     def of(cls, renderer: Renderer, task: Task, hand_m: Floats) -> Sight:
-        """What the agent view sees in the restored state, of what LIBERO lists as of interest in the task.
-
-        ``hand_m`` (T, 3) is where the grip site is at each step, in the world.
-        """
+        """What the agent view sees in the restored state, of what LIBERO lists as of interest in the task. ``hand_m``
+        (T, 3) is where the grip site is at each step, in the world."""
         model, data = renderer.model, renderer.data
         seen = renderer.geoms(CAMERA)
         bodies = model.geom_bodyid[seen[seen >= 0]]
@@ -55,10 +53,8 @@ class Sight:
         )
 
     def faults(self, original: Sight) -> list[str]:
-        """Names of what a camera shows too little of; empty when it shows enough.
-
-        Of the task's things and the hand, no more is asked than the scene's own camera shows.
-        """
+        """Names of what a camera shows too little of; empty when it shows enough. Of the task's things and the hand, no
+        more is asked than the scene's own camera shows."""
         least_px = {thing: min(LEAST_PX, px) for thing, px in original.things_px.items()}
         faults = {
             "task_object_not_seen": any(px < least_px[thing] for thing, px in self.things_px.items()),

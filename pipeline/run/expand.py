@@ -163,10 +163,8 @@ def _motion(store: TrajectoryStore, trajectory_id: str, task: Task) -> _Motion:
 
 
 def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
-    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin.
-
-    As in LIBERO's files, states are those before each action and observations those after it.
-    """
+    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin. As in
+    LIBERO's files, states are those before each action and observations those after it."""
     compiled = CompiledScene(Scene(trajectory.model_xml, trajectory.states[0]))
     robot, state, joints = [], [], []
     for number, flattened in enumerate(trajectory.states):

@@ -36,10 +36,8 @@ AnyFormat = Format[Any]
 
 
 def export_run(kind: type[AnyFormat], config: Config) -> None:
-    """Bring a run's dataset of one format up to date, and say what was done.
-
-    One that is not asked for is left as it is: where there is none, its record is an empty one.
-    """
+    """Bring a run's dataset of one format up to date, and say what was done. One that is not asked for is left as it
+    is: where there is none, its record is an empty one."""
     options = config.export.formats.get(kind.name)
     if options is None:
         record = config.data / f"{kind.name}.json"

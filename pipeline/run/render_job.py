@@ -63,10 +63,8 @@ class RenderJob:
         return 1800.0 + 2.0 * self.frames_at_most()
 
     def lost(self) -> None:
-        """Store that no worker survived the streams, unless one stored them before it was lost.
-
-        They are not tried again while the file is there.
-        """
+        """Store that no worker survived the streams, unless one stored them before it was lost. They are not tried
+        again while the file is there."""
         trajectory = self._trajectory()
         action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
         state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)

@@ -77,10 +77,8 @@ def _refuse_elsewhere(file: Path, config: Config) -> None:
 
 
 def _mend() -> None:
-    """DVC writes two lock files in place, and refuses to start where it was killed meanwhile.
-
-    What is finished, a run knows by itself.
-    """
+    """DVC writes two lock files in place, and refuses to start where it was killed meanwhile. What is finished, a run
+    knows by itself."""
     if subprocess.run([*DVC, "stage", "list"], capture_output=True, check=False).returncode:
         remove(Path("dvc.lock"))
     running = Path(".dvc/tmp/rwlock")

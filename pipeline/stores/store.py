@@ -108,9 +108,7 @@ class Store(ABC):
 
     def _believed(self) -> tuple[dict[str, dict[str, Any]], set[str]]:
         """The table's rows of files that have not changed since, and the names of all other files, also of those gone.
-
-        The rows are whatever fingerprint they have.
-        """
+        The rows are whatever fingerprint they have."""
         told, written_ns = self._table()
         believed = {}
         for name in self.names():
@@ -177,10 +175,8 @@ class Store(ABC):
         return known
 
     def outdated(self, names: Iterable[str]) -> Counter[str]:
-        """Why finished files count as missing, to how many do for this reason.
-
-        Those that are damaged are not counted, nor those with other settings: whoever changed these wants new files.
-        """
+        """Why finished files count as missing, to how many do for this reason. Those that are damaged are not counted,
+        nor those with other settings: whoever changed these wants new files."""
         current, known = self.rows(), self._known()
         reasons: Counter[str] = Counter()
         for name in names:

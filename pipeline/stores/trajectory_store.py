@@ -19,10 +19,8 @@ from pipeline.types import Push, Quality, Scene, Trajectory, Verdict
 
 
 class TrajectoryStore(Store):
-    """Trajectories under one folder; its table has verdict, executed steps, ``Quality`` and more of each.
-
-    A file holds no path of the machine, so that it is the same, and can be read, wherever the packages are installed.
-    """
+    """Trajectories under one folder; its table has verdict, executed steps, ``Quality`` and more of each. A file holds
+    no path of the machine, so that it is the same, and can be read, wherever the packages are installed."""
 
     step, stage = "physics", "render"
     columns: ClassVar = {

@@ -173,10 +173,8 @@ class Culling:
         return np.asarray(self.shown & (opacity < 1))
 
     def _sites(self, shadows: bool) -> NDArray[np.bool_]:
-        """(nsite,) which sites may show.
-
-        robosuite hides some by a negative opacity: MuJoCo renders them, and only where lamps cast shadows they show.
-        """
+        """(nsite,) which sites may show. robosuite hides some by a negative opacity: MuJoCo renders them, and only
+        where lamps cast shadows they show."""
         return np.asarray((self._model.site_rgba[:, 3] > 0) | shadows)
 
 

@@ -18,10 +18,8 @@ LEAST_FACES = 256
 
 
 class SkinnedMeshes:
-    """Gives each geom of a large mesh that is ``shown`` (ngeom,) a skin, which renders chosen faces of it.
-
-    ``samples`` (SAMPLES, 2) are places in a pixel; ``former`` are those of the model that the context was for before.
-    """
+    """Gives each geom of a large mesh that is ``shown`` (ngeom,) a skin, which renders chosen faces of it. ``samples``
+    (SAMPLES, 2) are places in a pixel; ``former`` are those of the model that the context was for before."""
 
     def __init__(
         self,
