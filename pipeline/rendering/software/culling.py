@@ -49,7 +49,7 @@ class Picture(NamedTuple):
         lamps: lights with shadows, in MuJoCo's order.
         sites: (nsite,) sites that may show.
         projection: for the choice of single faces, or None where all are rendered.
-        underlaid: whether the picture may be composed of underlays (``still.py``).
+        underlaid: whether the picture may be composed of underlays (``Still``).
     """
 
     opaque: NDArray[np.bool_]
