@@ -63,10 +63,9 @@ class AxisDistance:
 
     Attributes:
         rows: planned episodes that the axis perturbs, reserves among them.
-        test_tasks: the benchmark's tasks of this axis.
         comparisons: pairs of an episode and a test task that were compared.
-        smallest: the least distance of all; None when there was nothing to compare with, or nothing similar.
-        closest: the episode it belongs to.
+        smallest, closest: the least distance of all, and its episode; None when there was nothing to compare with, or
+            nothing similar.
         clearance: the least distance that is allowed, of this episode's kind where the axis has several.
         measure: what the distance is and its unit; of each kind.
         overlaps: episodes that are closer than that.
