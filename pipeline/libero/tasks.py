@@ -18,7 +18,6 @@ from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
-
 OWN = Path("tasks")
 """Tasks of one's own: ``<suite>/<task>.bddl`` below this folder of the one that a run is started in, as workers are."""
 
@@ -54,18 +53,15 @@ def tasks(suite: str) -> tuple[Task, ...]:
 @cache
 def _listed(suite: str) -> tuple[Task, ...]:
     folder = libero_folder() / "bddl_files" / suite
-    return tuple(Task(suite, name, _instruction(name), folder / f"{name}.bddl") for name in _names()[suite])
+    # LIBERO words an instruction as the task's name without its scene.
+    worded = {name: re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ") for name in _names()[suite]}
+    return tuple(Task(suite, name, text, folder / f"{name}.bddl") for name, text in worded.items())
 
 
 @cache
 def _names() -> Any:
     """Suite to LIBERO's list of names; only the file that holds it is run."""
     return run_path(str(libero_folder() / "benchmark" / "libero_suite_task_map.py"))["libero_task_map"]
-
-
-def _instruction(name: str) -> str:
-    """As LIBERO words it: the task's name without its scene."""
-    return re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ")
 
 
 def find_task(suite: str, name: str) -> Task:

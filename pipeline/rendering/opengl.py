@@ -49,7 +49,7 @@ def calls() -> Any:
     """PyOpenGL's functions and constants for the current context, which is one of MuJoCo's. A function raises
     PipelineError where OpenGL reports an error of it."""
     check(OTHERS)
-    return _functions()
+    return _FUNCTIONS
 
 
 def check(call: str) -> None:
@@ -93,11 +93,6 @@ def making_context() -> Iterator[None]:
     check("mjr_setBuffer")
 
 
-@functools.cache
-def _functions() -> Any:
-    return _Functions()
-
-
 class _Functions:
     """What PyOpenGL has, looked up when it is first asked for, and by then a context is there: it chooses its platform
     when it is imported."""
@@ -110,6 +105,9 @@ class _Functions:
             found = _stopping(name, found)
         setattr(self, name, found)
         return found
+
+
+_FUNCTIONS = _Functions()
 
 
 def _stopping(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
