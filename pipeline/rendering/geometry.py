@@ -3,7 +3,6 @@ of ``schemas/episode.json``."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection
 from typing import Any
 
@@ -35,7 +34,7 @@ class Instances:
 
     def __init__(self, model: mujoco.MjModel, trajectory: Trajectory, task: Task):
         things = bddl.read(task.bddl_file).things
-        added = [placed["name"] for placed in json.loads(trajectory.resolved).get("layout", {}).get("objects", [])]
+        added = [placed["name"] for placed in trajectory.scene.resolved.get("layout", {}).get("objects", [])]
         self.names: tuple[str, ...] = (*COMMON, *things, *added)
         rows = SCHEMA.object_poses.shape[0]
         if len(self.names) > rows:
