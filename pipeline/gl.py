@@ -136,13 +136,12 @@ class WorkerSetup:
             os.environ["MUJOCO_EGL_DEVICE_ID"] = self._gpus[worker % len(self._gpus)]
 
 
-def prepare() -> GlChoice:
+def prepare() -> None:
     """``choose``, and have MuJoCo render with the choice, also where it was imported before without OpenGL."""
-    choice = choose()
+    backend = choose().backend
     # mujoco.Renderer looks its context class up here; MuJoCo itself fills it in by MUJOCO_GL, but only when imported.
     context: Any = import_module("mujoco.gl_context")
-    context.GLContext = import_module(f"mujoco.{choice.backend}").GLContext
-    return choice
+    context.GLContext = import_module(f"mujoco.{backend}").GLContext
 
 
 def import_mujoco() -> None:
