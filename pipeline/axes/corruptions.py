@@ -179,8 +179,10 @@ def _scatter(frame: Frame, offsets: NDArray[np.int8], delta_px: int) -> None:
 
 
 class Glass(Frozen):
-    """Frosted glass: blur, scatter pixels by -delta .. delta - 1 in each direction, blur again. ImageNet-C means to
-    swap pixels, but its assignment between NumPy views copies one over the other; so does this."""
+    """Frosted glass: blur, scatter pixels by -delta .. delta - 1 in each direction, blur again.
+
+    ImageNet-C means to swap pixels, but its assignment between NumPy views copies one over the other; so does this.
+    """
 
     component: ClassVar[Component] = "glass"
     strength: ClassVar[tuple[str, float]] = ("sigma_px", 0)
