@@ -29,12 +29,14 @@ from pipeline.axes import from_json
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
 from pipeline.evaluation.statistics import wilson
-from pipeline.libero.tasks import SUITES
+from pipeline.libero.tasks import SUITES, find_task
+from pipeline.physics.quality import smoothness
 from pipeline.physics.reference import Reference
 from pipeline.planning import plan
 from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
+from pipeline.types import Task
 
 AXES: dict[str, tuple[str, dict[str, Any]]] = {
     "controller_posture": ("robot", {"components": ["controller_posture"]}),
@@ -122,7 +124,8 @@ def _shapes(
     for row in rows:
         outcome = replayed[row.trajectory_id]
         if outcome["kept"] and outcome["mode"] == "tracked":
-            own, twin = (_shape(store, trajectory_id) for trajectory_id in (row.trajectory_id, twins[row.demo_id]))
+            task = find_task(row.suite, row.task)
+            own, twin = (_shape(store, one, task) for one in (row.trajectory_id, twins[row.demo_id]))
             ratios = {name: own[name] / twin[name] for name in own if name != "saturated"}
             yield ratios | {"saturated": own["saturated"], "saturated_twin": twin["saturated"]}
 
@@ -149,11 +152,10 @@ def _displaced_cm(
 
 
 @cache
-def _shape(store: TrajectoryStore, trajectory_id: str) -> dict[str, float]:
+def _shape(store: TrajectoryStore, trajectory_id: str, task: Task) -> dict[str, float]:
     trajectory = store.load(trajectory_id)
-    reference = Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
     arm = trajectory.actions[:, :6]
-    return reference.shape | {
+    return smoothness(trajectory, task) | {
         "action_change": float(np.sqrt((np.diff(arm, axis=0) ** 2).sum(axis=1).mean())),
         "saturated": float((np.abs(arm) > SATURATED).any(axis=1).mean()),
     }

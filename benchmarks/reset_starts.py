@@ -25,13 +25,13 @@ from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, DemosConfig
 from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.starts import HOME_RAD
-from pipeline.physics.reference import Reference
+from pipeline.physics.quality import smoothness
 from pipeline.planning import plan
 from pipeline.run.expand import REPLAY, ROUGH
 from pipeline.run.replay_stage import Replays
 from pipeline.scenes.compiled import physics_to_read
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Floats, Trajectory
+from pipeline.types import Floats, Task, Trajectory
 
 SEED = 39
 
@@ -51,7 +51,7 @@ def main() -> None:
     yields, ours, libero = {}, [], []
     for task, rows in planned.items():
         human, *replays = (store.load(row.trajectory_id) for row in rows)
-        yields[f"{task.suite}/{task.name}"] = _yield(human, replays)
+        yields[f"{task.suite}/{task.name}"] = _yield(human, replays, task)
         starts = np.stack([replay.states[0] for replay in replays])
         ours.append(_Starts.of(starts, human.model_xml))
         libero.append(_Starts.of(libero_states(task), human.model_xml))
@@ -68,14 +68,14 @@ def main() -> None:
     print(json.dumps(result))
 
 
-def _yield(human: Trajectory, replays: list[Trajectory]) -> dict[str, Any]:
+def _yield(human: Trajectory, replays: list[Trajectory], task: Task) -> dict[str, Any]:
     """What became of the replays of a task; kept is what reached the goal and moved about as smoothly as the human."""
     reasons: Counter[str] = Counter()
     steps = []
     for replay in replays:
         reason = replay.verdict.reason
         if replay.verdict.kept:
-            own, reference = _shape(replay), _shape(human)
+            own, reference = smoothness(replay, task), smoothness(human, task)
             rough = any(own[name] > limit * reference[name] for name, limit in ROUGH.items())
             reason = "not_smooth" if rough else reason
         reasons[reason] += 1
@@ -83,10 +83,6 @@ def _yield(human: Trajectory, replays: list[Trajectory]) -> dict[str, Any]:
             steps.append(len(replay.actions))
     found = {"tried": len(replays), "kept": reasons.pop("kept", 0), "steps": steps, "human_steps": len(human.actions)}
     return found | {"human": human.verdict.reason, "dropped": dict(reasons)}
-
-
-def _shape(trajectory: Trajectory) -> dict[str, float]:
-    return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions).shape
 
 
 class _Starts(NamedTuple):

@@ -10,23 +10,17 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
-from pydantic import BaseModel, ConfigDict, model_validator
+from pydantic import model_validator
 
 from pipeline.errors import PipelineError
 from pipeline.files import schema_file
-from pipeline.types import Episode, Extra
-
-SCHEMA_FILE = schema_file("episode.json")
+from pipeline.types import Episode, Extra, Frozen
 
 JPEG_SCAN, JPEG_END = b"\xff\xda", b"\xff\xd9"
 SCAN_HEADER_BYTES = 14
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class ViewSpec(_Model):
+class ViewSpec(Frozen):
     """One camera: its name in MuJoCo and its key in LeRobot; its key here is its name in RLDS.
 
     Attributes:
@@ -41,7 +35,7 @@ class ViewSpec(_Model):
     seen_from: Literal["world", "end_effector"]
 
 
-class FrameSpec(_Model):
+class FrameSpec(Frozen):
     """How every frame is stored."""
 
     shape: tuple[int, int, int]
@@ -50,7 +44,7 @@ class FrameSpec(_Model):
     encoding: str
 
 
-class MatrixSpec(_Model):
+class MatrixSpec(Frozen):
     """A matrix of a view's camera, the same at every step."""
 
     shape: tuple[int, int]
@@ -58,7 +52,7 @@ class MatrixSpec(_Model):
     meaning: str
 
 
-class MapSpec(_Model):
+class MapSpec(Frozen):
     """A picture of numbers for each step of a view, of the frame's size."""
 
     dtype: str
@@ -78,7 +72,7 @@ class PosesSpec(MatrixSpec):
     names: tuple[str, ...]
 
 
-class VectorSpec(_Model):
+class VectorSpec(Frozen):
     """A per-step vector; units stand in the names of its entries."""
 
     shape: tuple[int]
@@ -100,7 +94,7 @@ class StateSpec(VectorSpec):
     frame: str
 
 
-class GripperSpec(_Model):
+class GripperSpec(Frozen):
     """The two commands of the gripper entry."""
 
     open: float
@@ -117,12 +111,9 @@ class ActionSpec(VectorSpec):
     controller: str
 
 
-class EpisodeSchema(_Model):
-    """Names, shapes, units and signs that all writers read.
-
-    Attributes:
-        provenance: what each episode says of itself, as the manifest's column of that name does, to its type.
-    """
+class EpisodeSchema(Frozen):
+    """Names, shapes, units and signs that all writers read. ``provenance``: what each episode says of itself, as the
+    manifest's column of that name does, to its type."""
 
     fps_hz: int
     robot_type: str
@@ -141,8 +132,7 @@ class EpisodeSchema(_Model):
     provenance: dict[str, Literal["string", "int64", "float32"]]
 
 
-SCHEMA = EpisodeSchema.model_validate_json(SCHEMA_FILE.read_text())
-
+SCHEMA = EpisodeSchema.model_validate_json(schema_file("episode.json").read_text())
 
 MOTION = ("action", "state", "joint_state")
 """What each step of an episode has in numbers."""
@@ -152,7 +142,6 @@ MATRICES = ("intrinsics", "extrinsics")
 
 MAPS: tuple[Extra, ...] = ("depth", "segmentation")
 """What each view of an episode has at each step on request."""
-
 
 OUTCOME: Mapping[str, Literal["bool", "string"]] = {"success": "bool", "reason": "string"}
 """What each failure says of itself beside its provenance: ``success`` is false, ``reason`` as in the manifest."""
@@ -170,10 +159,7 @@ def named(extras: Collection[Extra]) -> bool:
 
 def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     """Refuse an episode that training would misread or choke on; it must have the ``extras`` beside the frames.
-
-    Raises:
-        PipelineError: naming the episode and the field.
-    """
+    PipelineError naming the episode and the field."""
     steps = len(episode)
     if steps < SCHEMA.min_steps:
         expected = f"at least {SCHEMA.min_steps}, the chunk policies predict"

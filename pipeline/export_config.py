@@ -7,9 +7,10 @@ from itertools import count
 from typing import Annotated, Literal
 
 from packaging.version import Version
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from pipeline.errors import PipelineError
+from pipeline.types import Frozen
 
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 """More than anybody has a use for would fill memory before anything is said."""
@@ -47,11 +48,7 @@ Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$")]
 """Of a dataset; empty for ``libero_`` and the name of the run, which ``Config`` puts in its place."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class RldsConfig(_Frozen):
+class RldsConfig(Frozen):
     """How the RLDS sets are written.
 
     Attributes:
@@ -65,7 +62,7 @@ class RldsConfig(_Frozen):
     validation: Share = 0.0
 
 
-class LeRobotConfig(_Frozen):
+class LeRobotConfig(Frozen):
     """How the LeRobot dataset is written.
 
     Attributes:
@@ -100,7 +97,7 @@ CLEAN = "clean"
 """Axis and component of a clean twin in ``where``, as in the manifest; its level is 0."""
 
 
-class Where(_Frozen):
+class Where(Frozen):
     """Which of the kept episodes are written: those whose value is listed, for each field that is not left out.
 
     A clean twin has the axis and the component ``clean`` and the level 0.
@@ -126,7 +123,7 @@ class Where(_Frozen):
         )
 
 
-class LeRobotV21Config(_Frozen):
+class LeRobotV21Config(Frozen):
     """How LeRobot datasets of version 2.1 are written.
 
     Attributes:
@@ -141,7 +138,7 @@ class LeRobotV21Config(_Frozen):
     validation: Share = 0.0
 
 
-class ExportConfig(_Frozen):
+class ExportConfig(Frozen):
     """The output formats, and which of the kept episodes they get.
 
     Attributes:
@@ -189,14 +186,8 @@ class ExportConfig(_Frozen):
         return self.model_copy(update=formats)
 
     def refuse_too_few(self, demonstrations: int) -> None:
-        """Refuse a validation split that nothing could be in.
-
-        Args:
-            demonstrations: of the task that has most of them.
-
-        Raises:
-            PipelineError: when a share holds none of them out.
-        """
+        """Refuse a validation split that nothing could be in. ``demonstrations``: of the task that has most of them.
+        PipelineError when a share holds none of them out."""
         for name, options in self.formats.items():
             if options.validation and not held_out(options.validation, demonstrations):
                 raise too_few(options.validation, f"export.{name}.validation")

@@ -66,10 +66,8 @@ def choose() -> GlChoice:
     """Try what is there in short subprocesses (0.7 s each), set the environment, return the choice for printing.
 
     ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set. A worker of this machine takes over
-    what the run's own process chose (``WorkerSetup``).
-
-    Raises:
-        PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does.
+    what the run's own process chose (``WorkerSetup``). PipelineError when ``MUJOCO_GL`` names something that does not
+    render here, or when nothing does.
     """
     if _of_the_run is not None:
         return _of_the_run
@@ -138,13 +136,12 @@ class WorkerSetup:
             os.environ["MUJOCO_EGL_DEVICE_ID"] = self._gpus[worker % len(self._gpus)]
 
 
-def prepare() -> GlChoice:
+def prepare() -> None:
     """``choose``, and have MuJoCo render with the choice, also where it was imported before without OpenGL."""
-    choice = choose()
+    backend = choose().backend
     # mujoco.Renderer looks its context class up here; MuJoCo itself fills it in by MUJOCO_GL, but only when imported.
     context: Any = import_module("mujoco.gl_context")
-    context.GLContext = import_module(f"mujoco.{choice.backend}").GLContext
-    return choice
+    context.GLContext = import_module(f"mujoco.{backend}").GLContext
 
 
 def import_mujoco() -> None:

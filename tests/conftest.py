@@ -38,8 +38,7 @@ from pipeline.testset.benchmark import fetch_testset
 from pipeline.types import Demo, Task, Trajectory
 
 if TYPE_CHECKING:  # the tests that render choose what renders
-    from pipeline.rendering.last_scene import LastScene
-    from pipeline.rendering.renderer import Renderer
+    from pipeline.rendering.renderer import LastScene, Renderer
 
 Result = TypeVar("Result")
 
@@ -95,7 +94,7 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(scope="module")
 def opened() -> Iterator[LastScene]:
     """What the tests of a file render with."""
-    from pipeline.rendering.last_scene import LastScene
+    from pipeline.rendering.renderer import LastScene
 
     with closing(LastScene()) as opened:
         yield opened
@@ -250,7 +249,7 @@ def link_testset(folder: Path) -> None:
 
 def run_stages(folder: Path, config: dict[str, object], stages: Sequence[str]) -> str:
     """Run stages in ``folder``, in this process; returns what they printed."""
-    from pipeline.rendering.last_scene import scene_of_process
+    from pipeline.rendering.renderer import scene_of_process
 
     (folder / "configs").mkdir(exist_ok=True)
     (folder / "configs" / "tiny.yaml").write_text(yaml.safe_dump(config))

@@ -22,7 +22,7 @@ import pipeline
 from pipeline.commands.develop import schemas
 from pipeline.axes.language import load_bank
 from pipeline.catalogue.objects import models
-from pipeline.episode_schema import SCHEMA, SCHEMA_FILE
+from pipeline.episode_schema import SCHEMA
 from pipeline.files import schema_file
 from pipeline.clients.recipe import TEMPLATES
 from pipeline.publish import card
@@ -30,7 +30,7 @@ from pipeline.run import manifest
 
 assert SCHEMA.fps_hz == 20 and manifest.schema().names and load_bank() and models(("libero",))
 assert json.loads(schema_file("config.schema.json").read_text()) == schemas()["config.schema.json"]
-for file in (pipeline.__file__, SCHEMA_FILE, TEMPLATES / "run_openvla_oft.py"):
+for file in (pipeline.__file__, schema_file("episode.json"), TEMPLATES / "run_openvla_oft.py"):
     print(Path(file).is_file(), file)
 """
 

@@ -51,15 +51,9 @@ _DARKEST, _BRIGHTEST = 40.0, 205.0
 
 
 class Covering(Frozen):
-    """A texture on one part of the scene.
+    """A texture, by its name in ``pipeline.catalogue.textures``, on one part of the scene, turned counter-clockwise.
 
-    Attributes:
-        part: where; a part that the scene does not have is left out. Where the floor is worked on, it is the surface.
-        texture: name in the sources of :mod:`pipeline.catalogue.textures`.
-        licence: as the texture's source states it.
-        sha256: of the texture.
-        quarter_turns: how often it is turned by 90 degrees, counter-clockwise.
-    """
+    A part that the scene does not have is left out. Where the floor is worked on, it is the surface."""
 
     part: Part
     texture: str
@@ -86,17 +80,11 @@ class BackgroundPerturbation(RenderPerturbation):
     clearance: ClassVar[float] = 1.0
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Write the coverings into the model's textures.
-
-        Raises:
-            PipelineError: when a texture is not there any more, or nothing in the scene is known by its material.
-        """
+        """Write the coverings into the model's textures; PipelineError when a texture is not there any more, or nothing
+        in the scene is known by its material."""
         # By texture, as two parts may be one: the last then stands for both.
-        shown = {
-            skin.texture: (covering, skin)
-            for covering in self.coverings
-            if (skin := skin_of(model, covering.part)) is not None
-        }
+        skins = ((covering, skin_of(model, covering.part)) for covering in self.coverings)
+        shown = {skin.texture: (covering, skin) for covering, skin in skins if skin}
         if not shown:
             raise PipelineError(
                 f"the scene shows no {' or '.join(c.part for c in self.coverings)}",
@@ -111,11 +99,8 @@ class BackgroundPerturbation(RenderPerturbation):
     def distances(self, test: TestSet, task: Task) -> Floats:
         """The same to all test tasks: whether any shows one of the images, whatever it shows it on."""
         shown = _images_of(test)
-        overlaps = any(
-            textures.normalise(covering.texture) in shown or covering.sha256 in textures.test_images()
-            for covering in self.coverings
-        )
-        return np.full(len(test.of("background")), 0.0 if overlaps else 1.0)
+        known = (textures.normalise(c.texture) in shown or c.sha256 in textures.test_images() for c in self.coverings)
+        return np.full(len(test.of("background")), 0.0 if any(known) else 1.0)
 
     def apart(self, others: Sequence[BackgroundPerturbation]) -> Floats:
         """0 where both show one of the images, else 1."""
@@ -168,39 +153,22 @@ class BackgroundAxis(Axis):
         }
 
     def _draw_covering(self, rng: np.random.Generator, part: Part, own_colours: bool) -> Covering:
-        kinds = _offered(self.sources)
-        if part == "surface" and own_colours and kinds.data_maps and rng.random() < self.map_share:
-            texture = pick(rng, kinds.data_maps)
-        elif kinds.images and (rng.random() < self.image_share or not kinds.colour_maps):
-            texture = pick(rng, kinds.images)
+        colour_maps, data_maps, images = (_offered(self.sources, (*kind,)) for kind in (COLOUR_MAPS, DATA_MAPS, [None]))
+        if part == "surface" and own_colours and data_maps and rng.random() < self.map_share:
+            texture = pick(rng, data_maps)
+        elif images and (rng.random() < self.image_share or not colour_maps):
+            texture = pick(rng, images)
         else:
-            texture = pick(rng, kinds.colour_maps)
+            texture = pick(rng, colour_maps)
         keep(texture)
-        return Covering(
-            part=part,
-            texture=texture.name,
-            licence=texture.licence,
-            sha256=texture.sha256,
-            quarter_turns=int(rng.integers(4)),
-        )
-
-
-class Kinds(NamedTuple):
-    """Textures by what is drawn from together: procedural ones of two kinds, and images."""
-
-    colour_maps: list[Texture]
-    data_maps: list[Texture]
-    images: list[Texture]
+        shown = {"texture": texture.name, "licence": texture.licence, "sha256": texture.sha256}
+        return Covering(part=part, **shown, quarter_turns=int(rng.integers(4)))
 
 
 @cache
-def _offered(sources: tuple[Source, ...]) -> Kinds:
-    offered = textures.catalogue(sources).values()
-    return Kinds(
-        colour_maps=[texture for texture in offered if texture.family in COLOUR_MAPS],
-        data_maps=[texture for texture in offered if texture.family in DATA_MAPS],
-        images=[texture for texture in offered if texture.family is None],
-    )
+def _offered(sources: tuple[Source, ...], families: tuple[str | None, ...]) -> list[Texture]:
+    """The textures of some families, all images being of the family None."""
+    return [texture for texture in textures.catalogue(sources).values() if texture.family in families]
 
 
 @cache

@@ -161,13 +161,7 @@ def _both_ways(low: float, high: float) -> Angles:
 class DistanceRange(Frozen):
     """The test set's scales are 1.15 and 1.19 to 2.00."""
 
-    distance_scale: ByLevel[Scales] = (
-        ((1.08, 1.2),),
-        ((1.2, 1.4),),
-        ((1.4, 1.6),),
-        ((1.6, 1.8),),
-        ((1.8, 2.0),),
-    )
+    distance_scale: ByLevel[Scales] = (((1.08, 1.2),), ((1.2, 1.4),), ((1.4, 1.6),), ((1.6, 1.8),), ((1.8, 2.0),))
 
 
 class SphericalRange(Frozen):
@@ -259,9 +253,7 @@ class CameraAxis(Axis):
         return self
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
-        chosen = pick(
-            rng, [range_ for range_ in (self.distance, self.spherical, self.orientation) if range_ is not None]
-        )
+        chosen = pick(rng, [one for one in (self.distance, self.spherical, self.orientation) if one is not None])
         level = self.draw_level(rng)
         component: Component
         match chosen:
@@ -270,10 +262,8 @@ class CameraAxis(Axis):
                 drawn = {"distance_scale": draw(rng, chosen.distance_scale[level - 1])}
             case SphericalRange():
                 component = "spherical"
-                drawn = {
-                    "azimuth_deg": draw(rng, chosen.azimuth_deg[level - 1]),
-                    "elevation_deg": draw(rng, chosen.elevation_deg),
-                }
+                azimuth_deg = draw(rng, chosen.azimuth_deg[level - 1])
+                drawn = {"azimuth_deg": azimuth_deg, "elevation_deg": draw(rng, chosen.elevation_deg)}
             case OrientationRange():
                 component = "orientation"
                 large, small = ("yaw_deg", "pitch_deg") if rng.random() < 0.5 else ("pitch_deg", "yaw_deg")

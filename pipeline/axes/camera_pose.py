@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from pipeline.axes.camera import ORBIT_CENTRE_M, CameraPerturbation
+from pipeline.axes.camera import ORBIT_CENTRE_M, PARAMETERS, CameraPerturbation
 from pipeline.libero.bddl import Arena
 from pipeline.types import Floats
 
@@ -29,10 +29,7 @@ def moved_to(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
     """The change of the agent view that leads to a pose; None where it was not moved.
 
     A roll, which no test camera has, is left out: the distance to a test camera is then the least that it can be.
-
-    Args:
-        extrinsics: (4, 4) from the camera (z forward, y down) to the world.
-        arena: whose own agent view the pose is compared with.
+    ``extrinsics`` (4, 4) lead from the camera (z forward, y down) to the world.
     """
     own_m, own_wxyz = (np.array(part) for part in AGENT_VIEWS[arena])
     offset_m, own_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, own_m - ORBIT_CENTRE_M
@@ -44,16 +41,9 @@ def moved_to(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
     turned = Rotation.from_matrix(extrinsics[:3, :3] * [1.0, -1.0, -1.0])
     in_place = turned * (Rotation.from_euler("z", azimuth) * Rotation.from_euler("y", -elevation) * own).inv()
     yaw, pitch, _ = in_place.as_euler("zyx")
-    azimuth_deg, elevation_deg, yaw_deg, pitch_deg = np.rad2deg([azimuth, elevation, yaw, -pitch]).tolist()
     scale = float(radius_m / own_radius_m)
-    if max(map(abs, (azimuth_deg, elevation_deg, yaw_deg, pitch_deg, np.rad2deg(np.log(scale))))) < UNMOVED:
+    moved = np.rad2deg([azimuth, elevation, np.log(scale), yaw, -pitch]).tolist()
+    if max(map(abs, moved)) < UNMOVED:
         return None
-    return CameraPerturbation(
-        component="spherical",
-        level=1,
-        azimuth_deg=azimuth_deg,
-        elevation_deg=elevation_deg,
-        distance_scale=scale,
-        yaw_deg=yaw_deg,
-        pitch_deg=pitch_deg,
-    )
+    changes = dict(zip(PARAMETERS, moved, strict=True)) | {"distance_scale": scale}
+    return CameraPerturbation.model_validate({"component": "spherical", "level": 1, **changes})

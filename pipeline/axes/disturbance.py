@@ -13,6 +13,7 @@ from pydantic import Field
 from pipeline.axes.base import Axis, ByLevel, Intervals, PhysicsPerturbation, pick
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
+from pipeline.libero.starts import kept_actions
 from pipeline.types import Demo, Floats, Push, RollOut, Scene, Task
 
 STEP_S = 1 / SCHEMA.fps_hz
@@ -56,14 +57,9 @@ class DisturbancePerturbation(PhysicsPerturbation):
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the push; where it starts stays as it is.
 
-        Steps are counted in the demonstration without its no-ops, as it is replayed by default.
-
-        Raises:
-            RefusedError: ``push_at_grasp`` when it is too near to where the gripper opens or closes,
-                ``push_after_end`` when the demonstration ends before it does.
-        """
-        from pipeline.scenes.noops import kept_actions  # loads MuJoCo, which a plan does without
-
+        Steps are counted in the demonstration without its no-ops, as it is replayed by default. RefusedError:
+        ``push_at_grasp`` when it is too near to where the gripper opens or closes, ``push_after_end`` when the
+        demonstration ends before it does."""
         gripper = demo.actions[kept_actions(demo.actions, "drop"), 6]
         end = self.first_step + self.steps
         if end + self.away_steps > len(gripper):
@@ -81,14 +77,8 @@ class DisturbancePerturbation(PhysicsPerturbation):
 
     def apart(self, others: Sequence[DisturbancePerturbation]) -> Floats:
         """Compared with the pushes that begin at the same step."""
-        return np.array(
-            [
-                float(np.linalg.norm(self.impulse_n_s - other.impulse_n_s))
-                if self.first_step == other.first_step
-                else math.nan
-                for other in others
-            ]
-        )
+        apart_n_s = [float(np.linalg.norm(self.impulse_n_s - other.impulse_n_s)) for other in others]
+        return np.where([self.first_step == other.first_step for other in others], apart_n_s, math.nan)
 
 
 class DisturbanceAxis(Axis):
@@ -113,8 +103,8 @@ class DisturbanceAxis(Axis):
         level = self.draw_level(rng)
         steps, first_step = _step(rng, self.steps), _step(rng, self.first_step)
         bearing_rad, rise = rng.uniform(-math.pi, math.pi), rng.uniform(-RISE, RISE)
-        level_part = math.sqrt(1 - rise**2)
-        direction = np.array([level_part * math.cos(bearing_rad), level_part * math.sin(bearing_rad), rise])
+        flat = math.sqrt(1 - rise**2)
+        direction = np.array([flat * math.cos(bearing_rad), flat * math.sin(bearing_rad), rise])
         force_n = direction * self.impulse_n_s[level - 1] / (steps * STEP_S)
         return DisturbancePerturbation(
             level=level,

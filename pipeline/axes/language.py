@@ -46,12 +46,9 @@ MAX_WORDS_AND_MARKS, MAX_CHARACTERS = 38, 172
 """SmolVLA and pi0 keep the first 48 tokens of an instruction and cut the rest without a warning.
 
 Two of the 48 are not free: pi0's tokenizer puts a token at the beginning, and both policies a line break at the end.
-A common word or a punctuation mark is one token, a rare word two or more. Their tokenizers (SmolVLM's with 49,152
-entries, PaliGemma's with 257,152) could not be had, so three public ones were measured on the bank: GPT-2's (50,257
-entries), Mistral's (32,000) and its successor (131,072). By none has a rewrite more than 8 tokens beyond its words and
-marks, hence 46 - 8; the bound on characters is for sentences with more rare words than the bank's. The longest rewrite
-has 42, 43 and 41 tokens of the 46. Passages of this length, cut from the rewrites of one class in a row, have 47, 48
-and 48 at most, and over 46 in less than 1 of 100. The smaller a vocabulary, the more words it splits.
+Their tokenizers could not be had, so three public ones were measured on the bank: GPT-2's, Mistral's and its successor.
+By none has a rewrite more than 8 tokens beyond its words and marks, hence 46 - 8; the longest has 43 of the 46. The
+bound on characters is for sentences with more rare words than the bank's.
 """
 LENGTH = (
     f"at least {MIN_WORDS} words, at most {MAX_WORDS_AND_MARKS} words and punctuation marks together, "
@@ -112,9 +109,7 @@ class LanguageAxis(Axis):
         """Among objects that the layout axis adds: of the classes ``NAMED`` only.
 
         Names stay unambiguous there as far as the added objects are of categories that the scene does not have.
-
-        Raises:
-            ValueError: when none of ``classes`` is left.
+        ValueError when none of ``classes`` is left.
         """
         if not (classes := self._classes(axes)):
             raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")
@@ -127,21 +122,14 @@ class LanguageAxis(Axis):
         """The rewrite at ``place`` of the task's list, which starts again once all were drawn.
 
         Independent draws would repeat, so neighbouring places are different wordings and ``rng`` is left alone.
-
-        Raises:
-            PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
+        PipelineError when the task has no rewrites, or one of them does not pass ``lint``.
         """
         rewrites = deal(task, self.classes, self.levels, self.bank)
         return rewrites[place % len(rewrites)]
 
     def wordings(self, task: Task, axes: Collection[str], test: TestSet) -> tuple[str, ...]:
         """All that it can draw for a task beside other axes, as far as it keeps clear of the benchmark's instructions.
-
-        None where no bank has any.
-
-        Raises:
-            PipelineError: when one of them does not pass ``lint``.
-        """
+        None where no bank has any. PipelineError when one of them does not pass ``lint``."""
         rewrites = _dealt(task, self._classes(axes), self.levels, self.bank)
         return tuple(one.text for one in rewrites if one.nearest(test, task).distance >= one.clearance)
 
@@ -153,11 +141,7 @@ def load_bank(file: Path = BANK_FILE) -> Bank:
 
 
 def read_bank(file: Path) -> Bank:
-    """A bank as stored.
-
-    Raises:
-        PipelineError: when the file does not have the bank's form.
-    """
+    """A bank as stored; PipelineError when the file does not have the bank's form."""
     try:
         return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), yaml.CSafeLoader) or {})
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
@@ -176,10 +160,7 @@ def deal(
     bank: Path | None = None,
 ) -> tuple[LanguagePerturbation, ...]:
     """All rewrites of a task in the order they are drawn: shuffled by task, one class after the other in turn.
-
-    Raises:
-        PipelineError: when there are none, or one of them does not pass ``lint``.
-    """
+    PipelineError when there are none, or one of them does not pass ``lint``."""
     if dealt := _dealt(task, classes, levels, bank):
         return dealt
     raise PipelineError(
@@ -269,11 +250,8 @@ def _test_wordings(test: TestSet, task: Task) -> tuple[NDArray[np.uint8], ...]:
 
 
 def lint(text: str, task: Task, component: Component) -> str | None:
-    """The reason why ``text`` cannot replace the task's instruction; None when it can.
-
-    Raises:
-        PipelineError: when the task's BDDL file cannot be read.
-    """
+    """The reason why ``text`` cannot replace the task's instruction; None when it can. PipelineError when the task's
+    BDDL file cannot be read."""
     words = len(text.split())
     words_and_marks = words + len(_MARK.findall(text))
     if words == 0:

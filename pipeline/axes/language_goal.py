@@ -10,11 +10,15 @@ where they are described; whether a description fits one thing only must be chec
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
-from typing import NamedTuple
+from pathlib import Path
+from typing import Annotated, NamedTuple
 
-from pipeline.axes.language_words import found, pattern, relation_words, thing_words, words
+import yaml
+from pydantic import BeforeValidator
+
+from pipeline.axes.base import Frozen
 from pipeline.libero.task_goal import Aim, TaskGoal, read_goal
 from pipeline.types import Task
 
@@ -37,6 +41,74 @@ _BACK = re.compile(
     r"|the (?:former|latter|other)\b)"
 )
 """What follows a relation to a place that was named before."""
+
+
+Entries = Annotated[tuple[str, ...], BeforeValidator(lambda listed: re.split(r",\s+", listed))]
+"""Regular expressions, in YAML with commas between them."""
+
+
+class Thing(Frozen):
+    """What a kind of thing is called, and how else it can be described."""
+
+    names: Entries
+    hints: Entries
+
+
+class State(Frozen):
+    """How a state is asked for, and how its opposite is."""
+
+    said: Entries
+    opposite: Entries
+
+
+class Words(Frozen):
+    """``language_words.yaml``; every string is a regular expression."""
+
+    things: dict[str, Thing]
+    parts: dict[str, Entries]
+    relations: dict[str, Entries]
+    states: dict[str, State]
+    both: Entries
+
+
+@cache
+def words() -> Words:
+    """The words that are shipped."""
+    return Words.model_validate(yaml.safe_load(Path(__file__).with_name("language_words.yaml").read_text("ascii")))
+
+
+@cache
+def thing_words(scene: tuple[str, ...], hints: bool) -> Mapping[str, tuple[str, ...]]:
+    """Word to the kinds that it may mean in a scene; a kind that is not listed goes by its own name."""
+    meant: dict[str, tuple[str, ...]] = {}
+    for kind in scene:
+        known = words().things.get(kind)
+        names = known.names if known else (kind.replace("_", " "), kind.rpartition("_")[2])
+        for word in dict.fromkeys(names + known.hints if known and hints else names):
+            meant[word] = (*meant.get(word, ()), kind)
+    return meant
+
+
+@cache
+def relation_words() -> Mapping[str, tuple[str, ...]]:
+    return {word: (relation,) for relation, told in words().relations.items() for word in told}
+
+
+def found(plain: str, meant: Mapping[str, tuple[str, ...]]) -> Iterator[tuple[re.Match[str], tuple[str, ...]]]:
+    """The listed words in a text, with what they mean."""
+    for match in pattern(tuple(meant)).finditer(plain):
+        yield match, meant[_longest_first(meant)[(match.lastindex or 0) - 1]]
+
+
+def _longest_first(entries: Iterable[str]) -> list[str]:
+    return sorted(entries, key=len, reverse=True)
+
+
+@cache
+def pattern(entries: tuple[str, ...]) -> re.Pattern[str]:
+    """Any of the entries as whole words; the number of the group is the entry's place among the longest first."""
+    groups = (re.sub(r"\((?!\?)", "(?:", entry) for entry in _longest_first(entries))
+    return re.compile(rf"\b(?:{'|'.join(f'({group})' for group in groups)})(?:s|es)?\b")
 
 
 class Mention(NamedTuple):
@@ -136,14 +208,9 @@ class Demand(NamedTuple):
 
 
 def changed_goal(text: str, task: Task, hints: bool) -> str | None:
-    """What of the task's goal ``text`` does not keep; None when it keeps all that is checked.
-
-    Args:
-        hints: whether things may be described by what one knows of them, and a drawer by exclusion; else by name only.
-
-    Raises:
-        PipelineError: when the task's BDDL file cannot be read.
-    """
+    """What of the task's goal ``text`` does not keep; None when it keeps all that is checked. With ``hints``, things
+    may be described by what one knows of them, and a drawer by exclusion; else by name only. PipelineError when the
+    task's BDDL file cannot be read."""
     reading = Reading(text, read_goal(task.bddl_file).scene, hints)
     return next((demand.fault for demand in demands(task) if not demand.met(reading)), None)
 

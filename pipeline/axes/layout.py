@@ -23,11 +23,7 @@ SHELF = 13
 
 
 class AddedObject(Frozen):
-    """An object of ``pipeline.catalogue.objects``, by name and content.
-
-    Attributes:
-        licence, attribution: what it may be shown under and who made it, so that they go where the data goes.
-    """
+    """An object of ``pipeline.catalogue.objects``, by name and content, with its licence and who made it."""
 
     name: str
     category: str
@@ -41,12 +37,9 @@ class AddedObject(Frozen):
 
 
 class LayoutPerturbation(PhysicsPerturbation):
-    """Objects added to the scene.
+    """Objects added to the scene, as many as the level.
 
-    Attributes:
-        objects: which; as many as the level.
-        seed: keys the places that are tried for them. Where they end is in the trajectory's ``resolved``.
-    """
+    ``seed`` keys the places that are tried for them. Where they end is in the trajectory's ``resolved``."""
 
     axis: Literal["layout"] = "layout"
     component: Literal["objects"] = "objects"
@@ -65,10 +58,8 @@ class LayoutPerturbation(PhysicsPerturbation):
     per_task: ClassVar[bool] = True
 
     def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
-        """By category: infinite where a test task on this LIBERO task adds nothing of the same category.
-
-        The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
-        """
+        """By category: infinite where a test task on this LIBERO task adds nothing of the same category. The rule is
+        stricter than a distance between positions: every position of a shared category counts as 0 m."""
         return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")]
 
     def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:
@@ -120,10 +111,7 @@ class LayoutAxis(Axis):
 
     def offered(self) -> dict[str, int]:
         found = models(self.sources).values()
-        return {
-            "models": len({model.sha256 for model in found}),
-            "categories": len({model.category for model in found}),
-        }
+        return {"models": len({one.sha256 for one in found}), "categories": len({one.category for one in found})}
 
 
 @cache

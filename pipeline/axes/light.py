@@ -8,7 +8,7 @@ black. What is known of LIBERO-Plus's light, and what is not, is in docs/axes.md
 from __future__ import annotations
 
 import colorsys
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,7 @@ they leave much of the scene to the head light: of their shadows nothing shows, 
 
 DARK_LEVEL, DARK_SHARE = 10, 0.6
 BRIGHT_LEVEL, BRIGHT_SHARE = 250, 0.25
+"""A frame is too dark or blown out where more than a share of its pixels have no channel above, or below, a level."""
 
 
 class LightPerturbation(RenderPerturbation):
@@ -119,21 +120,10 @@ class LightRange(Frozen):
     fill_scale: Intervals[Share]
 
 
-def _range(
-    dim: tuple[float, float],
-    bright: tuple[float, float],
-    saturation: tuple[float, float],
-    specular: tuple[float, float],
-    tilt: tuple[float, float],
-    fill: tuple[float, float],
-) -> LightRange:
-    return LightRange(
-        brightness_scale=(dim, bright),
-        saturation=(saturation,),
-        specular_scale=(specular,),
-        tilt_deg=(tilt,),
-        fill_scale=(fill,),
-    )
+def _range(dim: tuple[float, float], bright: tuple[float, float], *others: tuple[float, float]) -> LightRange:
+    """Others are one interval for each of the other fields, in their order."""
+    intervals = [(dim, bright), *((interval,) for interval in others)]
+    return LightRange.model_validate(dict(zip(LightRange.model_fields, intervals, strict=True)))
 
 
 class LightAxis(Axis):
@@ -152,9 +142,7 @@ class LightAxis(Axis):
 
     draws: ClassVar = (LightPerturbation,)
 
-    components: Annotated[tuple[Component, ...], Field(min_length=1)] = (
-        *("diffuse", "direction", "specular", "shadows", "combined"),
-    )
+    components: Annotated[tuple[Component, ...], Field(min_length=1)] = get_args(Component)
     combined_share: float = Field(default=0.6, ge=0.0, le=1.0)
     ranges: tuple[LightRange, LightRange, LightRange, LightRange, LightRange] = (
         _range((0.7, 0.8), (1.25, 1.4), (0.25, 0.3), (3, 4), (8, 11), (0.24, 0.3)),
@@ -197,21 +185,15 @@ class LightAxis(Axis):
             case "specular":
                 return {"specular_scale": draw(rng, ranges.specular_scale)}
             case "direction":
-                return {
-                    "tilt_deg": draw(rng, ranges.tilt_deg),
-                    "tilt_azimuth_deg": draw(rng, TILT_AZIMUTH_DEG),
-                }
+                return {"tilt_deg": draw(rng, ranges.tilt_deg), "tilt_azimuth_deg": draw(rng, TILT_AZIMUTH_DEG)}
             case _:
                 return {"shadows": True, "fill_scale": draw(rng, ranges.fill_scale)}
 
 
 def exposure(frame: Frame) -> str | None:
-    """Why a clean frame (H, W, 3) shows too little to learn from; None when it shows enough.
+    """Why a clean frame (H, W, 3) shows too little to learn from, ``too_dark`` or ``blown_out``; None when it does not.
 
-    ``too_dark`` when more than 60 % of its pixels have no channel above 10, ``blown_out`` when more than 25 % have
-    no channel below 250. LIBERO's own first frames, both views in all
-    arenas, have at most 11 % and 1 % of these.
-    """
+    LIBERO's own first frames, both views in all arenas, have at most 11 % and 1 % of such pixels."""
     if (frame.max(axis=2) <= DARK_LEVEL).mean() > DARK_SHARE:
         return "too_dark"
     if (frame.min(axis=2) >= BRIGHT_LEVEL).mean() > BRIGHT_SHARE:

@@ -27,10 +27,7 @@ E = TypeVar("E", Motion, Gaussian, Zoom, Fog, Glass)
 class NoisePerturbation(PixelPerturbation):
     """One corruption at one strength for a whole episode.
 
-    Attributes:
-        effect: the corruption and its parameters.
-        level: the row of the axis's grid that ``effect`` is.
-        seed: with the index of the frame, the key of everything drawn in :meth:`apply`.
+    ``effect`` is that of the axis's grid at ``level``; ``seed`` and the index of a frame key all that is drawn for it.
     """
 
     axis: Literal["noise"] = "noise"
@@ -50,13 +47,8 @@ class NoisePerturbation(PixelPerturbation):
         return self
 
     def apply(self, frame: Frame, frame_index: int) -> Frame:
-        """A corrupted copy of one frame.
-
-        Args:
-            frame: (H, W, 3) RGB in the raw orientation of the simulator, *before* the rotation by 180 degrees:
-                there the benchmark corrupts, and motion, fog and glass are not symmetric under that rotation.
-            frame_index: place of the frame in its episode; each index has draws of its own.
-        """
+        """A corrupted copy of a frame (H, W, 3) *before* its rotation by 180 degrees: there the benchmark corrupts, and
+        motion, fog and glass are not symmetric under that rotation. Each index in the episode has draws of its own."""
         return self.effect.apply(frame, seeding.rng(self.seed, "noise", frame_index))
 
     def distances(self, test: TestSet, task: Task) -> Floats:
@@ -69,7 +61,6 @@ class NoisePerturbation(PixelPerturbation):
         return np.abs(severities - self.severity(test)) if tested else severities
 
     def apart(self, others: Sequence[NoisePerturbation]) -> Floats:
-        """To the strengths of the same component, on the scale of the benchmark's severities."""
         test = benchmark.load()
         severities = [other.severity(test) if other.component == self.component else np.nan for other in others]
         return np.abs(np.array(severities) - self.severity(test))

@@ -8,6 +8,7 @@ from functools import cache
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
@@ -22,7 +23,6 @@ Norm = Annotated[float, Field(ge=0.0001, le=np.pi)]
 LIMIT_MARGIN_RAD = 0.05
 """How far from its limits every joint must start."""
 
-
 Component = Literal["initial_joints", "controller_posture"]
 
 
@@ -36,10 +36,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
     The offset is added to the same of the clean twin: ``initial_joints`` to the recorded start, which LIBERO's reset
     scattered by 0.02 to 0.10 rad about home, ``controller_posture`` to the posture of the reset. Only so is the change
-    as large as its level says, and no offset the clean twin.
-
-    Attributes:
-        joint_offsets_rad: base to wrist.
+    as large as its level says, and no offset the clean twin. ``joint_offsets_rad``: base to wrist.
     """
 
     axis: Literal["robot"] = "robot"
@@ -53,18 +50,15 @@ class RobotPerturbation(PhysicsPerturbation):
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the arm turned and at rest, or with the controller's posture; all else stays as it is.
-
-        Raises:
-            RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot
-                is put where it touches what it did not touch before, ``test_posture`` when recorded start and offset
-                happen to add up to a posture of the test set.
-        """
-        from pipeline.scenes.compiled import CompiledScene
+        RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot is
+        put where it touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add
+        up to a posture of the test set."""
+        from pipeline.scenes.compiled import ARM, CompiledScene
 
         compiled = CompiledScene(scene)
         data, model = compiled.data, compiled.model
         before = compiled.touching().keys()
-        joints = [model.joint(f"robot0_joint{n}") for n in range(1, 8)]
+        joints = [model.joint(name) for name in ARM]
         arm = [joint.qposadr[0] for joint in joints]
         pulled = self.component == "controller_posture" and scene.posture_rad is not None
         posture = (scene.posture_rad if pulled else data.qpos[arm]) + np.array(self.joint_offsets_rad)
@@ -90,23 +84,20 @@ class RobotPerturbation(PhysicsPerturbation):
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """To the offsets of all robot tasks; the arm is the same in all, so ``task`` does not matter."""
-        ids = [int(tested.parameters["id"]) - 1 for tested in test.of("robot")]
-        distances_rad: Floats = np.linalg.norm(benchmark_offsets_rad()[ids] - self.joint_offsets_rad, axis=1)
-        return distances_rad
+        return self._apart_rad(benchmark_offsets_rad())[[int(one.parameters["id"]) - 1 for one in test.of("robot")]]
 
     def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
-        """To the offsets of all, as the arm is the same in all tasks."""
-        offsets_rad = np.array([other.joint_offsets_rad for other in others])
-        apart_rad: Floats = np.linalg.norm(offsets_rad - self.joint_offsets_rad, axis=1)
-        return apart_rad
+        return self._apart_rad([other.joint_offsets_rad for other in others])
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450; the arm is the same in all
-        tasks, so ``task`` does not matter."""
+        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450."""
         compared = len(test.of("robot"))
-        if not compared:
-            return Nearest(np.inf, 0)
-        return Nearest(float(np.linalg.norm(benchmark_offsets_rad() - self.joint_offsets_rad, axis=1).min()), compared)
+        return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()) if compared else np.inf, compared)
+
+    def _apart_rad(self, offsets_rad: ArrayLike) -> Floats:
+        """(N,) from offsets (N, 7)."""
+        distances_rad: Floats = np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1)
+        return distances_rad
 
 
 @cache

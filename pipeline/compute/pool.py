@@ -14,9 +14,8 @@ from queue import Empty, Queue
 from typing import Any, Generic, Protocol, TypeVar
 
 from pipeline.compute.cluster import Workplace, in_place, workplace_of
-from pipeline.compute.local import local_cluster
 from pipeline.compute.progress import progress_of
-from pipeline.compute.slurm import slurm_cluster
+from pipeline.compute.workers import ended, local_cluster, slurm_cluster
 from pipeline.config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
@@ -165,19 +164,15 @@ def _limited(fn: Expendable[Item, Result], item: Item) -> Result:
 
 @dataclass(frozen=True)
 class _Workers:
-    """Work on a client's workers.
-
-    Attributes:
-        client: of the cluster.
-        workplace: what workers elsewhere have to have in common with the run.
-        refill: brings back workers that are missing.
-        patience_s: how long to wait for a worker where none is left.
-    """
+    """Work on the workers of a cluster's client."""
 
     client: Any
     workplace: Workplace | None = None
+    """What workers elsewhere have to have in common with the run."""
     refill: Callable[[], None] = lambda: None
+    """Brings back workers that are missing."""
     patience_s: float = ALONE_S
+    """How long to wait for a worker where none is left."""
 
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         from distributed import KilledWorker
@@ -239,11 +234,7 @@ class _Workers:
                 self.client.cancel([future for future in futures if future.key in numbers])
 
     def _next(self, done: Queue[Any]) -> Any:
-        """The next future that is done.
-
-        Raises:
-            PipelineError: when nobody is left who could do one.
-        """
+        """The next future that is done; PipelineError when nobody is left who could do one."""
         alone_s, last_came_s = 0, 0.0
         while True:
             try:
@@ -275,12 +266,8 @@ def _result(outcome: Result | Exception) -> Result:
     from distributed import KilledWorker
 
     if isinstance(outcome, KilledWorker):
-        raise PipelineError(
-            f"one piece of work ended {outcome.allowed_failures + 1} workers",
-            where=f"the last was {outcome.last_worker.address}",
-            expected="workers that live: the system may have ended them because memory ran out",
-            remedy=f"see the system's log, use fewer workers, and {GO_ON}",
-        )
+        what = f"one piece of work ended {outcome.allowed_failures + 1} workers"
+        raise ended(what, f"the last was {outcome.last_worker.address}")
     if isinstance(outcome, Exception):
         raise outcome
     return outcome

@@ -18,7 +18,7 @@ from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
 from pipeline.libero.tasks import find_task
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.replay import roll_out
 from pipeline.planning import plan
 from pipeline.types import Demo, Scene, Task
 

@@ -14,12 +14,11 @@ from pipeline.evaluation.policies import Look, Wanted
 from pipeline.evaluation.simulator import Simulator
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import StarterSource
-from pipeline.libero.starts import recorded_start
+from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import DUMMY_ACTION
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Hand, Route, follow
-from pipeline.scenes.noops import kept_actions
 from pipeline.types import Floats
 
 

@@ -15,12 +15,11 @@ from pipeline.axes import Perturbation
 from pipeline.errors import RefusedError
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
-from pipeline.physics.quality import ARM, FINGERS
 from pipeline.physics.stepping import ControlStep
 from pipeline.planning.streams import Stream
-from pipeline.rendering.frames import changes_of, frames_of
-from pipeline.rendering.last_scene import LastScene
-from pipeline.scenes.compiled import proprioception
+from pipeline.rendering.render import frames_of
+from pipeline.rendering.renderer import LastScene
+from pipeline.scenes.compiled import ARM, FINGERS, proprioception
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
 
@@ -231,7 +230,7 @@ class Picture:
         renderer, stream = self._opened.renderer(self._scene), Stream(view, tuple(self._perturbations))
         if self._changes is None:
             self._changes = ExitStack()
-            self._changes.enter_context(renderer.perturbed(changes_of(stream)))
+            self._changes.enter_context(renderer.perturbed(stream.changes))
         state = np.concatenate([[0.0], observed.qpos, np.zeros(renderer.model.nv)])
         return frames_of(renderer, state, observed.site_alpha, [stream], step)[0]
 

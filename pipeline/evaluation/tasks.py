@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from pipeline import seeding
-from pipeline.axes.language_words import pattern, words
+from pipeline.axes.language_goal import pattern, words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
 from pipeline.files import replaced

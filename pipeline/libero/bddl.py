@@ -51,7 +51,6 @@ class Bddl:
 
     @property
     def arena(self) -> Arena:
-        """Where the scene is."""
         return arena(self.problem)
 
     @property
@@ -100,8 +99,7 @@ class Bddl:
         return self.things_named(self.of_interest)
 
     def things_named(self, names: Iterable[str]) -> tuple[str, ...]:
-        """The ``things`` among some names. A region, such as a drawer of a cabinet or the burner of a stove, stands for
-        the thing that it belongs to."""
+        """The ``things`` among some names; a region, such as a drawer, stands for the thing that it belongs to."""
         named = [f"{name}_" for name in names]
         return tuple(thing for thing in self.things if any(name.startswith(f"{thing}_") for name in named))
 
@@ -114,11 +112,7 @@ class Bddl:
 
 @cache
 def read(path: Path) -> Bddl:
-    """Read a task's file, once a process.
-
-    Raises:
-        PipelineError: when it cannot be read or does not define a task.
-    """
+    """Read a task's file, once a process; PipelineError when it cannot be read or does not define a task."""
     try:
         return parse(path.read_text(), path)
     except (OSError, UnicodeDecodeError) as error:
@@ -126,11 +120,7 @@ def read(path: Path) -> Bddl:
 
 
 def parse(text: str, where: object) -> Bddl:
-    """Read a BDDL file's text; ``where`` is what an error names.
-
-    Raises:
-        PipelineError: when it does not define a task.
-    """
+    """Read a BDDL file's text; ``where`` is what an error names. PipelineError when it does not define a task."""
     expected = "a BDDL problem with :language, :objects, :init and :goal"
     try:
         _, (_, problem), *rest = scan_tokens(string=text)
@@ -153,10 +143,7 @@ def parse(text: str, where: object) -> Bddl:
 
 def heading(text: str, where: object) -> tuple[str, str]:
     """``problem`` and ``language`` of a BDDL file's text; of 10,030 test tasks, most need no more, and parsing is slow.
-
-    Raises:
-        PipelineError: when it has no problem or no instruction.
-    """
+    PipelineError when it has no problem or no instruction."""
     text = text.lower()
     problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
     if problem is None or language is None:
@@ -165,19 +152,13 @@ def heading(text: str, where: object) -> tuple[str, str]:
 
 
 def arena(problem: str) -> Arena:
-    """The arena of a scene's class, by its name in lower case, such as libero_kitchen_tabletop_manipulation.
-
-    LIBERO-Plus's names go on after that.
-
-    Raises:
-        PipelineError: when the name has none.
-    """
+    """The arena of a scene's class, by its name in lower case, such as libero_kitchen_tabletop_manipulation
+    (LIBERO-Plus's names go on after that); PipelineError when the name has none."""
     match = _ARENA.match(problem)
     if match is None:
         raise PipelineError(
             f"the scene class {problem!r} names no known arena",
-            expected=f"libero_<arena>_manipulation or libero_<arena>_tabletop_manipulation, <arena> being one of "
-            f"{', '.join(get_args(Arena))}",
+            expected=f"libero_<arena>_[tabletop_]manipulation, <arena> being one of {', '.join(get_args(Arena))}",
         )
     return cast(Arena, match[1])
 
@@ -197,15 +178,10 @@ def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:
 def _declared(listed: list[str]) -> dict[str, str]:
     """Name to category, of ``a_1 a_2 - kind b_1 - other``."""
     categories: dict[str, str] = {}
-    names: list[str] = []
-    words = iter(listed)
-    for word in words:
-        if word == "-":
-            category = next(words)
-            categories |= dict.fromkeys(names, category)
-            names = []
-        else:
-            names.append(word)
+    while "-" in listed:
+        end = listed.index("-")
+        categories |= dict.fromkeys(listed[:end], listed[end + 1])
+        listed = listed[end + 2 :]
     return categories
 
 

@@ -30,12 +30,7 @@ HUMAN, EXPANDED = "human", "expanded"
 
 @dataclass(frozen=True)
 class DemoEntry:
-    """A demonstration in a source's index: all that planning needs, without its arrays.
-
-    Attributes:
-        task, key, source, origin, sha256: as in ``Demo``.
-        steps: number of actions, 20 a second.
-    """
+    """A demonstration in a source's index: what planning needs of it; ``steps`` are its actions, 20 a second."""
 
     task: Task
     key: str
@@ -53,21 +48,14 @@ class DemoEntry:
         return cls(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
 
 
-@dataclass(frozen=True)
-class Problem:
-    """Something in a source that cannot be used.
-
-    Attributes:
-        name: a demonstration's id, or ``<suite>/<task>`` when its whole file is unusable.
-        error: why, and what to do.
-    """
+class Problem(NamedTuple):
+    """What of a source cannot be used, a demonstration or ``<suite>/<task>`` for a whole file, and why."""
 
     name: str
     error: PipelineError
 
 
-@dataclass(frozen=True)
-class DemoIndex:
+class DemoIndex(NamedTuple):
     """What a source holds. Every entry was read and checked once, so it can be loaded."""
 
     entries: list[DemoEntry]
@@ -81,36 +69,28 @@ class DemoSource(Protocol):
         """The first ``per_task`` usable demonstrations of each task (all by default), and what was unusable."""
 
     def load(self, demo_id: str) -> Demo:
-        """One demonstration, by ``<suite>/<task>/<key>``.
-
-        Raises:
-            PipelineError: when it is not there or cannot be used.
-        """
+        """One demonstration, by ``<suite>/<task>/<key>``; PipelineError when it is not there or cannot be used."""
 
 
 class StarterSource:
-    """One human LIBERO demonstration for each of the 130 tasks, carried by the package ``robouse``.
-
-    Actions are rounded to six decimals; of the states only the first is there, and the scene's model is not.
-    """
+    """One human LIBERO demonstration for each of the 130 tasks, carried by the package ``robouse``. Actions are rounded
+    to six decimals; of the states only the first is there, and the scene's model is not."""
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         del per_task  # There is one for each task, and a count is at least one.
         return DemoIndex([DemoEntry.of(self.of(task)) for task in wanted], [])
 
     def load(self, demo_id: str) -> Demo:
-        task, key = _parse(demo_id)
-        demo = self.of(task)
-        if demo.key != key:
+        demo = self.of(_parse(demo_id)[0])
+        if demo.demo_id != demo_id:
             raise PipelineError(f"the starter set has no {demo_id}", expected=demo.demo_id)
         return demo
 
     def of(self, task: Task) -> Demo:
         """The task's one demonstration."""
         if task.suite not in SUITES:
-            raise PipelineError(
-                f"the starter set has no demonstration of {task.suite}/{task.name}", expected="a LIBERO task"
-            )
+            what = f"the starter set has no demonstration of {task.suite}/{task.name}"
+            raise PipelineError(what, expected="a LIBERO task")
         group = "libero-90" if task.suite == "libero_90" else "libero"
         name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
         folder = package_folder("robouse") / "bundled_tasks" / group / name
@@ -133,20 +113,15 @@ class StarterSource:
 
 @dataclass(frozen=True)
 class HDF5Source:
-    """LIBERO's demonstrations as published: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file.
-
-    Attributes:
-        root: the folder that holds the suites.
-    """
+    """LIBERO's demonstrations as published: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file; ``root`` holds the
+    suites."""
 
     root: Path
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
-        wanted = list(wanted)
-        entries: list[DemoEntry] = []
-        problems = [
-            stray for suite in dict.fromkeys(task.suite for task in wanted) for stray in self._files_of_no_task(suite)
-        ]
+        wanted, entries = list(wanted), []
+        suites_of_them = dict.fromkeys(task.suite for task in wanted)
+        problems = [stray for suite in suites_of_them for stray in self._files_of_no_task(suite)]
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
             name, usable = f"{task.suite}/{task.name}", 0
@@ -157,9 +132,8 @@ class HDF5Source:
                             break
                         try:
                             entry = DemoEntry.of(self._read(task, key, data))
-                            first = first_with.setdefault(entry.sha256, entry)
-                            if first is not entry:
-                                # Episodes are identified by content: two copies would make two rows with one id.
+                            # Episodes are identified by content: two copies would make two rows with one id.
+                            if (first := first_with.setdefault(entry.sha256, entry)) is not entry:
                                 raise PipelineError(
                                     f"holds the same actions, states and model as {first.demo_id}",
                                     where=f"{self._path(task)} data/{key}",
@@ -215,7 +189,7 @@ class HDF5Source:
             # Of the places that name the task, only this one was corrected for publication; the tasks' earlier names
             # stay in env_args. A name that no task has counts as one of those.
             recorded = PurePosixPath(hdf5.text(data, "bddl_file_name", f"{path} data")).stem
-            if recorded != task.name and recorded in _task_names():
+            if recorded != task.name and any(recorded == other.name for suite in suites() for other in tasks(suite)):
                 raise PipelineError(
                     f"named after one task but recorded for another, {recorded!r} (bddl_file_name)",
                     where=path,
@@ -257,11 +231,7 @@ class _Recorded(NamedTuple):
     model_file: str | None
 
     def checked(self, where: str) -> Demo:
-        """The demonstration.
-
-        Raises:
-            PipelineError: when it cannot be used.
-        """
+        """The demonstration; PipelineError when it cannot be used."""
         actions, states = self.actions, self.states
         fault = None
         if actions.ndim != 2 or actions.shape[1] != 7 or len(actions) == 0:
@@ -295,7 +265,3 @@ def _parse(demo_id: str) -> tuple[Task, str]:
     if len(parts) != 3:
         raise PipelineError(f"not a demonstration's id: {demo_id!r}", expected="<suite>/<task>/<key>")
     return find_task(parts[0], parts[1]), parts[2]
-
-
-def _task_names() -> frozenset[str]:
-    return frozenset(task.name for suite in suites() for task in tasks(suite))

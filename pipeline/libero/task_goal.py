@@ -1,17 +1,22 @@
 """What a task asks for, as its BDDL file defines it: what goes where, and what is opened, closed, turned on or off.
 
-And what one calls the things and places of it, in plain words."""
+And what one calls the things and places of it, in plain words, and whether what those words say still holds."""
 
 from __future__ import annotations
 
+import math
+import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from pipeline.libero.bddl import Bddl, Fact, read
+from pipeline.types import Floats, Task
 
 PARTS = ("top", "middle", "bottom", "left", "right", "front", "back", "center")
 """Words in the names of regions that say which drawer, compartment, side or spot."""
@@ -39,17 +44,18 @@ SIDES = ("left", "right", "front", "back", "middle")
 INSIDE = {"cabinet": "drawer", "caddy": "compartment"}
 """What a part of a thing is called."""
 
+NEXT_TO_M = 0.17
+"""Distance of centres up to which things stand next to each other; in LIBERO it is 0.12 to 0.13 m."""
+
+BETWEEN = 0.25
+"""Share of the way between two things that still counts as at one of them, and as beside the line between them."""
+
 
 class Aim(NamedTuple):
-    """Where something is to be, or is at first.
+    """Where a kind of thing is to be, or is at first.
 
-    Attributes:
-        relation: ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the place; None where the
-            part is enough.
-        thing: its kind.
-        place: kind of what it is put on, in, next to; None where the part is enough.
-        part: which of ``PARTS`` of the place, or which of several places of that kind.
-    """
+    ``relation`` is ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the kind of place; both are
+    None where the ``part`` is enough: which of ``PARTS`` of the place, or which of several places of that kind."""
 
     relation: str | None
     thing: str
@@ -86,11 +92,7 @@ class TaskGoal:
 
 @cache
 def read_goal(bddl_file: Path) -> TaskGoal:
-    """The goal of a task.
-
-    Raises:
-        PipelineError: when the file cannot be read or does not define a task.
-    """
+    """The goal of a task; PipelineError when the file cannot be read or does not define a task."""
     bddl = read(bddl_file)
     scene = _Scene(bddl)
     facts = [fact for fact in bddl.goal if fact not in bddl.start]
@@ -181,3 +183,45 @@ class _Scene:
             kinds = [kind for kind in self.kinds.values() if called in kind.split("_")]
             if kinds:
                 yield max(kinds, key=lambda kind: len({*kind.split("_")} & {*words}))
+
+
+@cache
+def _alike(task: Task, thing: str) -> tuple[str, ...]:
+    """The other objects of the category of ``thing``."""
+    objects = read(task.bddl_file).objects
+    return tuple(name for name, category in objects.items() if category == objects[thing] and name != thing)
+
+
+@cache
+def _anchors(task: Task, thing: str) -> tuple[str, ...]:
+    """The one thing that an object starts next to, or the two that it starts between; none where neither is said."""
+    places = read(task.bddl_file).places
+    # Such as main_table_between_plate_ramekin_region: the plate starts in main_table_plate_region.
+    found = re.fullmatch(r"(\w+?)_(?:next_to_([a-z]+)|between_([a-z]+)_([a-z]+))_region", places.get(thing, ""))
+    if found is None:
+        return ()
+    surface, *words = (word for word in found.groups() if word)
+    at = {region: name for name, region in places.items()}
+    return tuple(at[f"{surface}_{word}_region"] for word in words)
+
+
+def relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:
+    """Whether the target still stands where the instruction's words place it.
+
+    Next to something: within ``NEXT_TO_M`` of it, and no like object nearer to it. Between two things: its foot on the
+    line between them in the middle half, and off that line by at most a quarter of its length.
+    """
+    own = xy_m(target)
+    match _anchors(task, target):
+        case (anchor,):
+            away = np.linalg.norm(own - xy_m(anchor))
+            nearest_alike = min(
+                (np.linalg.norm(xy_m(other) - xy_m(anchor)) for other in _alike(task, target)), default=math.inf
+            )
+            return bool(away <= min(NEXT_TO_M, nearest_alike))
+        case (first, second):
+            line = xy_m(second) - xy_m(first)
+            dx, dy = own - xy_m(first)
+            along, beside = np.array([dx * line[0] + dy * line[1], dx * line[1] - dy * line[0]]) / (line @ line)
+            return bool(BETWEEN <= along <= 1 - BETWEEN and abs(beside) <= BETWEEN)
+    return True

@@ -18,17 +18,12 @@ from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
-
 OWN = Path("tasks")
 """Tasks of one's own: ``<suite>/<task>.bddl`` below this folder of the one that a run is started in, as workers are."""
 
 
 def suites() -> tuple[str, ...]:
-    """LIBERO's suites, then those of one's own.
-
-    Raises:
-        PipelineError: when one of one's own has a name that cannot be used.
-    """
+    """LIBERO's suites, then those of one's own; PipelineError when one of one's own has a name that cannot be used."""
     own = sorted(folder.name for folder in OWN.glob("*") if any(folder.glob("*.bddl")))
     for name in own:
         # Datasets are called after the suite without libero_, some with val at the end, and OpenVLA-OFT takes
@@ -46,10 +41,7 @@ def suites() -> tuple[str, ...]:
 
 def tasks(suite: str) -> tuple[Task, ...]:
     """A suite's tasks, in the order of LIBERO's list; those of one's own by name, with the instruction of their file.
-
-    Raises:
-        PipelineError: when there is no such suite.
-    """
+    PipelineError when there is no such suite."""
     if suite in SUITES:
         return _listed(suite)
     if suite not in suites():
@@ -61,7 +53,9 @@ def tasks(suite: str) -> tuple[Task, ...]:
 @cache
 def _listed(suite: str) -> tuple[Task, ...]:
     folder = libero_folder() / "bddl_files" / suite
-    return tuple(Task(suite, name, _instruction(name), folder / f"{name}.bddl") for name in _names()[suite])
+    # LIBERO words an instruction as the task's name without its scene.
+    worded = {name: re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ") for name in _names()[suite]}
+    return tuple(Task(suite, name, text, folder / f"{name}.bddl") for name, text in worded.items())
 
 
 @cache
@@ -70,17 +64,8 @@ def _names() -> Any:
     return run_path(str(libero_folder() / "benchmark" / "libero_suite_task_map.py"))["libero_task_map"]
 
 
-def _instruction(name: str) -> str:
-    """As LIBERO words it: the task's name without its scene."""
-    return re.sub(r"^[A-Z_]*SCENE\d+_", "", name).replace("_", " ")
-
-
 def find_task(suite: str, name: str) -> Task:
-    """The task of that name.
-
-    Raises:
-        PipelineError: when the suite has none, naming the closest.
-    """
+    """The task of that name; PipelineError when the suite has none, naming the closest."""
     by_name = {task.name: task for task in tasks(suite)}
     if name not in by_name:
         closest = difflib.get_close_matches(name, by_name, cutoff=0)
@@ -89,11 +74,8 @@ def find_task(suite: str, name: str) -> Task:
 
 
 def select_tasks(patterns: Iterable[str]) -> list[Task]:
-    """The tasks whose ``<suite>/<task>`` matches any of the shell-style patterns, in LIBERO's order.
-
-    Raises:
-        PipelineError: when a pattern matches nothing.
-    """
+    """The tasks whose ``<suite>/<task>`` matches any of the shell-style patterns, in LIBERO's order; PipelineError when
+    a pattern matches nothing."""
     known = {f"{task.suite}/{task.name}": task for suite in suites() for task in tasks(suite)}
     chosen: set[str] = set()
     for pattern in patterns:

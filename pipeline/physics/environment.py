@@ -42,25 +42,15 @@ class UnusableSceneError(PipelineError):
 class Environment:
     """One task's environment; every ``restore`` forgets what happened before it.
 
-    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task.
-
-    Args:
-        scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
-        scene_xml: absolute path of another file for the arena.
+    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task. It may have another
+    ``floor_style`` and ``wall_style`` than the task's arena, or another file for it, by its absolute path.
     """
 
     def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
         self.task = task
-        build = partial(
-            control_env(),
-            bddl_file_name=str(task.bddl_file),
-            has_renderer=False,
-            has_offscreen_renderer=False,
-            use_camera_obs=False,
-            ignore_done=True,
-            scene_properties=scene_properties,
-            scene_xml=scene_xml,
-        )
+        unseen = dict.fromkeys(("has_renderer", "has_offscreen_renderer", "use_camera_obs"), False)
+        arena = {"scene_properties": scene_properties, "scene_xml": scene_xml}
+        build = partial(control_env(), bddl_file_name=str(task.bddl_file), ignore_done=True, **unseen, **arena)
         with seeded(0):
             self._env = until_placed(build, task)
         self._control_step = ControlStep(self._env.env)
@@ -115,10 +105,8 @@ class Environment:
     def restore(self, scene: Scene) -> None:
         """Put the environment where a scene starts; nothing from before has an effect on what follows.
 
-        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms.
-
-        Raises:
-            UnusableSceneError: when MuJoCo or LIBERO refuses the scene, or the state is not of its model.
+        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms. UnusableSceneError when MuJoCo or
+        LIBERO refuses the scene, or the state is not of its model.
         """
         env = self._env.env
         if scene.model_xml != self._scene:
@@ -207,11 +195,8 @@ class Environment:
             raise UnusableSceneError("state_mismatch", what, self.task)
 
     def step(self, action: Floats) -> None:
-        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1].
-
-        Raises:
-            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
-        """
+        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1]. RefusedError: ``simulation_unstable``
+        when the numbers grow beyond what can be computed with."""
         self._act_from_outside()
         try:
             self._control_step(action)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from pipeline.episode_schema import SCHEMA
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Bddl
-from pipeline.scenes.compiled import CompiledScene
+from pipeline.scenes.compiled import ARM, FINGERS, CompiledScene
 from pipeline.types import Floats, Quality, State, Task, Trajectory
 
 MOVED_M = 0.001
@@ -20,16 +20,10 @@ MOVED_M = 0.001
 IDLE_M, IDLE_DEG = 0.0005, 0.25
 """A step is idle where hand and fingers move less: 1 cm/s and 5 degrees/s."""
 
-ARM = tuple(f"robot0_joint{number}" for number in range(1, 8))
-FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
-
 
 def measure(trajectory: Trajectory, task: Task) -> Quality:
-    """Measure a trajectory with at least one action; 0.3 ms a step, where the scene is compiled already.
-
-    Raises:
-        ValueError: when MuJoCo refuses the scene.
-    """
+    """Measure a trajectory with at least one action; 0.3 ms a step, where the scene is compiled already. ValueError
+    when MuJoCo refuses the scene."""
     scene = CompiledScene(trajectory.scene)
     model, data = scene.model, scene.data
     named = of_goal(bddl.read(task.bddl_file))
@@ -41,8 +35,8 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
         grip = data.site("gripper0_grip_site")
         positions.append(grip.xpos.copy())
         turns.append(grip.xmat.reshape(3, 3).copy())
-        roots = model.body_rootid[model.geom_bodyid[data.contact.geom[data.contact.dist <= 0]]]
-        touched += step > 0 and any(robot in pair and not allowed & {*pair} for pair in roots.tolist())
+        roots = model.body_rootid[scene.contacts].tolist()
+        touched += step > 0 and any(robot in pair and not allowed & {*pair} for pair in roots)
     hand, qpos = np.stack(positions), np.stack([State.of(state, model.nq).qpos for state in trajectory.states])
     steps_m: Floats = np.linalg.norm(np.diff(hand, axis=0), axis=1)
     asked = hand[:-1] + SCHEMA.action.unit_m * np.clip(trajectory.actions[:, :3], -1, 1)
@@ -59,6 +53,12 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
         joint_margin_rad=_single(np.minimum(arm - low, high - arm).min()),
         lag_m=_single(np.linalg.norm(hand[1:] - asked, axis=1).max()),
     )
+
+
+def smoothness(trajectory: Trajectory, task: Task) -> dict[str, float]:
+    """Its steps, and path and jerk of its ``Quality``, which is measured where nobody has."""
+    quality = trajectory.quality or measure(trajectory, task)
+    return {"steps": len(trajectory.actions), "path_m": quality.path_m, "jerk_rms_m_s3": quality.jerk_rms_m_s3}
 
 
 def of_goal(known: Bddl) -> Set[str]:

@@ -78,16 +78,6 @@ class Reference:
     def __len__(self) -> int:
         return len(self.actions)
 
-    @property
-    def shape(self) -> dict[str, float]:
-        """How the hand moved: control steps, length of its path in m, root mean square of its jerk in m a step^3."""
-        travelled, jerks = np.diff(self.positions_m, axis=0), np.diff(self.positions_m, n=3, axis=0)
-        return {
-            "steps": float(len(self)),
-            "path_m": float(np.linalg.norm(travelled, axis=1).sum()),
-            "jerk": float(np.sqrt((jerks**2).sum(axis=1).mean())),
-        }
-
 
 def _contacts(
     model: mujoco.MjModel,

@@ -1,10 +1,14 @@
-"""Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory with a verdict out."""
+"""Replay of demonstrations through LIBERO's environment at 20 Hz: a Demo in, a Trajectory with a verdict out.
+
+And where a scene and a demonstration's actions in it lead, for whoever looks before the replay.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,13 +17,11 @@ from pipeline.axes import PhysicsPerturbation
 from pipeline.config import ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
-from pipeline.libero.starts import recorded_start
-from pipeline.physics.environment import Environment, UnusableSceneError
+from pipeline.libero.starts import kept_actions, recorded_start
+from pipeline.physics.environment import Environment, UnusableSceneError, shared
 from pipeline.physics.reference import Reference
-from pipeline.physics.roll_out import roll_out
 from pipeline.physics.tracking import Route, follow
-from pipeline.scenes.noops import kept_actions
-from pipeline.types import Demo, Floats, Scene, Trajectory, Verdict
+from pipeline.types import Demo, Floats, Scene, Task, Trajectory, Verdict
 
 
 # Six arguments: what is replayed, its name, how, under what changes, and what tracking follows.
@@ -34,12 +36,8 @@ def replay(
     """Replay a demonstration from its first state, or a perturbed one, once that has settled, in the configured mode.
 
     A demonstration whose scene or state cannot be simulated makes a trajectory that is dropped, not an error.
-
-    Args:
-        environment: of the demonstration's task.
-        perturbations: what to change before the first step.
-        reference: gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
-            ``tracked``; the result says how its actions came about.
+    ``reference`` gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
+    ``tracked``; the result says how its actions came about.
     """
     try:
         scene, refused = _perturbed(environment, demo, config, perturbations)
@@ -68,11 +66,8 @@ def replay(
 def _execute(
     environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
 ) -> tuple[Floats, Floats, NDArray[np.float32], Verdict]:
-    """Let a scene settle, and then take the actions that ``policy`` makes from there.
-
-    Returns:
-        States, actions, opacity of sites and verdict, as in ``Trajectory``.
-    """
+    """Let a scene settle, and then take the actions that ``policy`` makes from there: states, actions, opacity of sites
+    and verdict, as in ``Trajectory``."""
     environment.restore(scene)
     # What has no first look is dropped with the state that it was put in.
     states, alphas = [environment.state], [environment.site_alpha]
@@ -116,12 +111,8 @@ def _perturbed(
 
 
 def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
-    """Judge a replay: the task's goal must hold after the last executed action.
-
-    Args:
-        states: (K+1, S) states before each executed action and after the last.
-        succeeded: (K,) LIBERO's success check after each executed action.
-    """
+    """Judge a replay by its states (K+1, S) and LIBERO's success check after each executed action (K,): the task's goal
+    must hold after the last one."""
     if len(succeeded) < SCHEMA.min_steps:
         return Verdict(False, "too_short")
     if not np.isfinite(states).all():
@@ -129,3 +120,35 @@ def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
     if succeeded[-1]:
         return Verdict(True, "kept")
     return Verdict(False, "goal_lost" if succeeded.any() else "goal_not_reached")
+
+
+def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
+    """(K+1, S) states that the demonstration's actions lead through from ``scene``, once that has settled. ``config``:
+    how the replay that follows settles, and which actions it leaves out. RefusedError: ``simulation_unstable``."""
+    actions = demo.actions[kept_actions(demo.actions, config.noops)]
+    return _states_from(scene, demo.task, actions, config)
+
+
+def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
+    """(S,) what the first frame of a replay shows: the state in which ``scene`` has settled. RefusedError:
+    ``simulation_unstable``."""
+    state: Floats = _states_from(scene, task, np.empty(0), config)[0]
+    return state
+
+
+def _states_from(scene: Scene, task: Task, actions: Floats, config: ReplayConfig) -> Floats:
+    # All that a replay depends on of the scene, which itself can be no key.
+    start = scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad, scene.push
+    return _states(task, actions.tobytes(), config.settle_steps, *start)
+
+
+@lru_cache(maxsize=4)
+def _states(task: Task, actions: bytes, settle_steps: int, model_xml: str, state: bytes, *acting: Any) -> Floats:
+    environment = shared(task)
+    environment.restore(Scene(model_xml, np.frombuffer(state), {}, *acting))
+    environment.settle(settle_steps)
+    states = [environment.state]
+    for action in np.frombuffer(actions).reshape(-1, 7):
+        environment.step(action)
+        states.append(environment.state)
+    return np.stack(states)

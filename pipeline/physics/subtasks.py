@@ -54,13 +54,8 @@ class _Deed(NamedTuple):
 
 
 def subtasks(trajectory: Trajectory, task: Task) -> tuple[Subtask, ...]:
-    """The subtasks of a trajectory, the first from step 0; none where it leaves alone what the goal names.
-
-    Takes 0.3 ms a step, where the scene is compiled already.
-
-    Raises:
-        ValueError: when MuJoCo refuses the scene.
-    """
+    """The subtasks of a trajectory, the first from step 0; none where it leaves alone what the goal names. Takes 0.3 ms
+    a step, where the scene is compiled already. ValueError when MuJoCo refuses the scene."""
     known, seen = bddl.read(task.bddl_file), _Seen(trajectory)
     found: list[Subtask] = []
     begin = 0
@@ -84,8 +79,7 @@ class _Seen:
         self.pairs = []
         for state in trajectory.states:
             scene.restore(state)
-            contact = scene.data.contact
-            self.pairs.append(self.model.geom_bodyid[contact.geom[contact.dist <= 0]])
+            self.pairs.append(scene.contacts)
         self.robot = self._below(self.model.body("robot0_base").id)
 
     def deeds(self, known: Bddl, fact: Fact) -> Iterator[_Deed]:

@@ -13,12 +13,8 @@ from pipeline.seeding import digest
 
 @dataclass(frozen=True)
 class Stream:
-    """One view under the perturbations that show in it.
-
-    Attributes:
-        view: ``image`` or ``wrist_image``.
-        perturbations: render and pixel layers, in the order they apply.
-    """
+    """One view, ``image`` or ``wrist_image``, under the perturbations that show in it: those of the render and pixel
+    layers, in the order in which they apply."""
 
     view: str
     perturbations: tuple[Perturbation, ...]
@@ -28,15 +24,18 @@ class Stream:
         return digest("stream", self.view, to_json(self.perturbations))[:16]
 
     @property
+    def changes(self) -> tuple[RenderPerturbation, ...]:
+        """The perturbations that change its scene."""
+        return of_layer(self.perturbations, RenderPerturbation)
+
+    @property
     def geometry(self) -> Stream:
         """The view under what changes its surfaces alone: streams that have it in common share their geometry."""
-        changes = (p for p in self.perturbations if isinstance(p, RenderPerturbation))
-        return Stream(self.view, tuple(p for p in changes if p.sees_otherwise))
+        return Stream(self.view, tuple(change for change in self.changes if change.sees_otherwise))
 
     def scene(self, textures: bool = True) -> str:
         """What streams have in common that show the same scene, or the same one but for its textures."""
-        changes = of_layer(self.perturbations, RenderPerturbation)
-        return to_json([change for change in changes if textures or not change.paints])
+        return to_json([change for change in self.changes if textures or not change.paints])
 
 
 @lru_cache(maxsize=65536)

@@ -1,23 +1,25 @@
-"""A trajectory to frames: each frame comes from a stored state, so one replay is rendered under many perturbations."""
+"""A trajectory to frames: each frame comes from a stored state, so one replay is rendered under many perturbations.
+
+A frame takes five steps: perturb, restore, render, add noise, turn.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.axes import RenderPerturbation
+from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
 from pipeline.config import RenderConfig
-from pipeline.episode_schema import named
-from pipeline.images.jpeg import encode
+from pipeline.episode_schema import SCHEMA, named
+from pipeline.images.jpeg import encode, to_policy
 from pipeline.planning.streams import Stream
-from pipeline.rendering.frames import changes_of, frames_of
-from pipeline.rendering.geometry import see
-from pipeline.rendering.instances import Instances
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.geometry import Instances, see
+from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.sight import FirstFrame
 from pipeline.scenes.compiled import proprioception
-from pipeline.types import Rendered, Task, Trajectory
+from pipeline.types import Floats, Frame, Rendered, Task, Trajectory
 
 
 def render(
@@ -44,7 +46,7 @@ def render(
     rejected: dict[str, str] = {}
     scenes: dict[tuple[RenderPerturbation, ...], list[Stream]] = {}
     for stream in streams:
-        scenes.setdefault(changes_of(stream), []).append(stream)
+        scenes.setdefault(stream.changes, []).append(stream)
     for changes, scene in scenes.items():
         with renderer.perturbed(changes):
             if fault := first_frame.fault(scene):
@@ -67,3 +69,26 @@ def render(
         instances=instances.names if instances else (),
         quality=trajectory.quality,
     )
+
+
+def frames_of(
+    renderer: Renderer, state: Floats, site_alpha: NDArray[np.float32], streams: Sequence[Stream], step: int
+) -> list[Frame]:
+    """One frame (H, W, 3) uint8 RGB for each stream, turned by 180 degrees as policies see it.
+
+    A view is rendered once: streams that differ in noise alone share its clean frame. Whoever renders many steps keeps
+    the scene perturbed meanwhile (``Renderer.perturbed``). ``streams`` are one at least, all with the same render
+    perturbations. Random noise depends on ``step``.
+    """
+    with renderer.perturbed(streams[0].changes):
+        renderer.restore(state, site_alpha)
+        views = dict.fromkeys(stream.view for stream in streams)
+        clean = {view: renderer.frame(SCHEMA.views[view].camera) for view in views}
+    return [to_policy(_noisy(clean[stream.view], stream, step)) for stream in streams]
+
+
+def _noisy(frame: Frame, stream: Stream, step: int) -> Frame:
+    for noise in of_layer(stream.perturbations, PixelPerturbation):
+        if stream.view in noise.views:
+            frame = noise.apply(frame, step)
+    return frame

@@ -1,7 +1,10 @@
-"""One scene: put into stored states, perturbed, and rendered."""
+"""One scene: put into stored states, perturbed, and rendered; the last one stays open for the next piece of work."""
 
 from __future__ import annotations
 
+import atexit
+import copy
+import functools
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
@@ -17,12 +20,8 @@ from pipeline.types import Frame, State
 
 
 class Renderer:
-    """Renders one scene; close it before the next is made.
-
-    Args:
-        scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
-        drawing: renders the model already; by default one is made.
-    """
+    """Renders one scene, of its MJCF or a compiled model, which belongs to the renderer from then on; close it before
+    the next is made. ``drawing`` renders the model already; by default one is made."""
 
     def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None):
         self.model = compiled(scene) if isinstance(scene, str) else scene
@@ -51,10 +50,8 @@ class Renderer:
 
     @contextmanager
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
-        """Apply render-layer perturbations to the model, and undo them at the end.
-
-        Entered again inside itself with the same perturbations, it does nothing.
-        """
+        """Apply render-layer perturbations to the model, and undo them at the end. Entered again inside itself with the
+        same perturbations, it does nothing."""
         if tuple(perturbations) == self._perturbations:
             yield
             return
@@ -79,3 +76,53 @@ class Renderer:
 
     def close(self) -> None:
         self.drawing.close()
+
+
+class LastScene:
+    """Holds one open renderer at a time.
+
+    The next request for the same scene gets the same renderer. A request for another scene gets a new one, which takes
+    over the drawing and its OpenGL context if the drawing can ``adopt`` the scene.
+    """
+
+    def __init__(self) -> None:
+        self._renderer: Renderer | None = None
+        self._scene: str | mujoco.MjModel | None = None
+
+    def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
+        """The renderer of a scene, by its MJCF or by a compiled model, which must not change meanwhile.
+
+        It is no longer to be used when another scene was asked for. PipelineError when nothing renders on this machine.
+        ValueError when MuJoCo refuses the scene or one of its images.
+        """
+        same = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
+        if self._renderer is not None and same:
+            return self._renderer
+        model = compiled(scene) if isinstance(scene, str) else copy.copy(scene)
+        try:
+            adopted = self._renderer is not None and self._renderer.drawing.adopt(model)
+        except BaseException:
+            # It holds parts of both scenes now.
+            self.close()
+            raise
+        if self._renderer is not None and adopted:
+            self._renderer = Renderer(model, self._renderer.drawing)
+        else:
+            self.close()
+            self._renderer = Renderer(model)
+            # If the process ends with the scene open, this runs before MuJoCo's own exit handler shuts OpenGL down.
+            atexit.register(self.close)
+        self._scene = scene
+        return self._renderer
+
+    def close(self) -> None:
+        if self._renderer is not None:
+            atexit.unregister(self.close)
+            self._renderer.close()
+            self._renderer = self._scene = None
+
+
+@functools.cache
+def scene_of_process() -> LastScene:
+    """The one of this process, open from one piece of work to the next; whoever has no more work closes it."""
+    return LastScene()

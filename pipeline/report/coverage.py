@@ -15,9 +15,8 @@ from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.language import CLASSES, distance
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoisePerturbation
-from pipeline.axes.pose import PosePerturbation
+from pipeline.axes.pose import PosePerturbation, ScenePerturbation, displacements
 from pipeline.axes.robot import RobotPerturbation, benchmark_offsets_rad
-from pipeline.axes.scene import ScenePerturbation, displacements
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.planning import leakage

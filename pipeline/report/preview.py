@@ -27,12 +27,11 @@ from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
 from pipeline.physics.environment import shared
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay
-from pipeline.physics.roll_out import first_look, roll_out
+from pipeline.physics.replay import first_look, replay, roll_out
 from pipeline.planning.plan import Draws
 from pipeline.planning.streams import Stream
-from pipeline.rendering.frames import frames_of
-from pipeline.rendering.last_scene import LastScene, scene_of_process
+from pipeline.rendering.render import frames_of
+from pipeline.rendering.renderer import LastScene, scene_of_process
 from pipeline.report.sheets import Tile, describe, sheet, side_by_side
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet

@@ -25,9 +25,8 @@ from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.layout import LayoutPerturbation
 from pipeline.axes.noise import NoisePerturbation
-from pipeline.axes.pose import PosePerturbation
+from pipeline.axes.pose import PosePerturbation, ScenePerturbation, Shifts, displacements
 from pipeline.axes.robot import RobotPerturbation
-from pipeline.axes.scene import ScenePerturbation, Shifts, displacements
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import decode

@@ -13,11 +13,7 @@ from pipeline.run.stage import locked
 
 
 class Part(NamedTuple):
-    """Files and folders of a run's folder that belong together.
-
-    Attributes:
-        made_by: the stages that make them, in words.
-    """
+    """Files and folders of a run's folder that belong together; ``made_by`` names the stages that make them."""
 
     names: tuple[str, ...]
     made_by: str
@@ -55,11 +51,7 @@ def found(data: Path, parts: Iterable[str]) -> dict[str, float]:
 
 
 def delete(data: Path, parts: Iterable[str]) -> None:
-    """Delete parts of a run's folder.
-
-    Raises:
-        PipelineError: when a stage of the run is running.
-    """
+    """Delete parts of a run's folder; PipelineError when a stage of the run is running."""
     with locked(data):
         for part in parts:
             for name in PARTS[part].names:

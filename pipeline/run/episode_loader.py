@@ -22,11 +22,7 @@ from pipeline.types import Episode, Extra, Subtask
 @dataclass(frozen=True)
 class EpisodeLoader:
     """Loads rendered episodes by id; small enough to send to a worker, which reads the plan once for itself.
-
-    Attributes:
-        extras: ``outcome`` for failures.
-        rewrites: episode id to other wordings of its task, where episodes come with them and with their subtasks.
-    """
+    ``rewrites`` has each episode's other wordings, where episodes come with them and with their subtasks."""
 
     data: Path
     config: RenderConfig
@@ -41,7 +37,7 @@ class EpisodeLoader:
         rendered = store.load(row.trajectory_id, [s.stream_id for s in shown.values()], set(geometry.values()))
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
         known |= asdict(rendered.quality) if rendered.quality else {}
-        known |= {f"{name}_version": versions()[name] for name in ("mujoco", "robosuite", "pipeline")}
+        known |= {f"{name}_version": version for name, version in versions().items()}
         if "outcome" in self.extras:
             verdict = TrajectoryStore(self.data / "trajectories").load(row.trajectory_id).verdict
             known |= {"success": verdict.kept, "reason": verdict.reason}

@@ -13,6 +13,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from pipeline.axes import Axes
@@ -24,19 +25,20 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.identity import DISTRIBUTION, refuse_unasked
 from pipeline.libero import hdf5
 from pipeline.libero.demonstrations import DemoEntry
-from pipeline.physics.reference import Reference
+from pipeline.libero.tasks import find_task
+from pipeline.physics.quality import smoothness
 from pipeline.planning import plan
 from pipeline.run.replay_stage import Replays
-from pipeline.scenes.compiled import CompiledScene, proprioception
+from pipeline.scenes.compiled import CompiledScene, physics_to_read, proprioception
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Floats, Scene, Task, Trajectory
+from pipeline.types import Floats, Scene, State, Task, Trajectory
 
 RESERVE = 2.0
 """Candidates drawn beyond those wanted, as a share: poses that collide are refused, and not every replay succeeds."""
 
-ROUGH = {"steps": 1.5, "path_m": 1.5, "jerk": 2.0}
-"""Largest multiples of the human's episode length, path length and jerk (root mean square) that count as smooth."""
+ROUGH = {"steps": 1.5, "path_m": 1.5, "jerk_rms_m_s3": 2.0}
+"""Largest multiples of the human's episode length, path length and jerk that count as smooth."""
 
 APART_RAD, APART_M = 0.05, 0.005
 """Two demonstrations of a task are the same when their arms start closer than this, and every object of theirs does."""
@@ -48,12 +50,7 @@ settles as they want."""
 
 @dataclass
 class Expansion:
-    """What came of it.
-
-    Attributes:
-        dropped: reason to number of candidates.
-        short: task to the number of demonstrations that no candidate was left for.
-    """
+    """What came of it: candidates dropped by reason, and how many demonstrations no candidate was left for by task."""
 
     files: list[Path] = field(default_factory=list)
     written: int = 0
@@ -62,17 +59,12 @@ class Expansion:
 
 
 def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: int, workers: Workers) -> Expansion:
-    """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
+    """Make ``per_task`` demonstrations of each task from ``rows``, which ``candidates`` or ``resets`` drew for as many,
+    and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
-    A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those
-    before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was.
-
-    Args:
-        demos: what the candidates are made from.
-        rows: what ``candidates`` or ``resets`` drew for as many demonstrations.
-
-    Raises:
-        PipelineError: when a demonstration cannot be read, or finished replays would be made anew unasked.
+    A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those before
+    it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was. PipelineError when a
+    demonstration cannot be read, or finished replays would be made anew unasked.
     """
     store = TrajectoryStore(out / ".replays")
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
@@ -135,9 +127,9 @@ def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: Trajec
     accepted: dict[tuple[str, str], list[_Motion]] = defaultdict(list)
     faults: dict[str, str] = {}
     for row in rows:
-        motion, human = (_motion(store, trajectory_id) for trajectory_id in (row.trajectory_id, twins[row.demo_id]))
-        before = accepted[row.suite, row.task]
-        if any(motion.shape[name] > limit * human.shape[name] for name, limit in ROUGH.items()):
+        task, before = find_task(row.suite, row.task), accepted[row.suite, row.task]
+        motion, human = (_motion(store, one, task) for one in (row.trajectory_id, twins[row.demo_id]))
+        if any(motion.smoothness[name] > limit * human.smoothness[name] for name, limit in ROUGH.items()):
             faults[row.episode_id] = "not_smooth"
         elif any(motion.starts_like(other) for other in before):
             faults[row.episode_id] = "duplicate"
@@ -148,9 +140,9 @@ def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: Trajec
 
 @dataclass(frozen=True)
 class _Motion:
-    """What candidates are compared by: see ``Reference.shape``; arm joints (7,) in rad and objects (N, 3) in m."""
+    """What candidates are compared by; where the arm (7,) in rad and objects (N, 3) in m start."""
 
-    shape: Mapping[str, float]
+    smoothness: Mapping[str, float]
     joints_rad: Floats
     objects_m: Floats
 
@@ -161,19 +153,18 @@ class _Motion:
 
 
 @cache
-def _motion(store: TrajectoryStore, trajectory_id: str) -> _Motion:
+def _motion(store: TrajectoryStore, trajectory_id: str, task: Task) -> _Motion:
     trajectory = store.load(trajectory_id)
-    reference = Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
-    objects_m = np.array([pose[0, :3] for pose in reference.poses.values()]).reshape(-1, 3)
-    # After the time, a flattened state has the arm's seven joints.
-    return _Motion(reference.shape, trajectory.states[0, 1:8], objects_m)
+    model = physics_to_read(trajectory.model_xml)
+    qpos = State.of(trajectory.states[0], model.nq).qpos
+    free = model.jnt_qposadr[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE]
+    # A state begins with the arm's seven joints.
+    return _Motion(smoothness(trajectory, task), qpos[:7], qpos[free[:, None] + np.arange(3)])
 
 
 def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
-    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin.
-
-    As in LIBERO's files, states are those before each action and observations those after it.
-    """
+    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin. As in
+    LIBERO's files, states are those before each action and observations those after it."""
     compiled = CompiledScene(Scene(trajectory.model_xml, trajectory.states[0]))
     robot, state, joints = [], [], []
     for number, flattened in enumerate(trajectory.states):

@@ -26,18 +26,15 @@ from pipeline.stores.store import TABLE
 from pipeline.stores.trajectory_store import TrajectoryStore
 
 FOLDER = ".finished"
+FRAMES = f"frames/{TABLE}"
 SEEN = Path(__file__).parents[1] / "testset" / "seen.json"
 """What a policy sees in test tasks, which the report shows beside what it sees in the run."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What a stage's outputs were made from.
-
-    Attributes:
-        made_by: the fingerprint of its inputs and recipe; None where an input has changed since it was recorded.
-        outputs: files or folders of ``data``.
-    """
+    """What a stage's ``outputs``, files or folders of ``data``, were made from: ``made_by`` is the fingerprint of its
+    inputs and recipe, None where an input has changed since it was recorded."""
 
     data: Path
     stage: str
@@ -62,9 +59,7 @@ class Memory:
         return self.data / FOLDER / f"{self.stage}.json"
 
     def _now(self) -> dict[str, Any]:
-        listed = [file for name in self.outputs for file in _files(self.data / name)]
-        sums = {file.relative_to(self.data).as_posix(): checksum(file) for file in listed}
-        return {"made_by": self.made_by, "outputs": sums}
+        return {"made_by": self.made_by, "outputs": _contents([self.data / name for name in self.outputs], self.data)}
 
 
 def of_validate(config: Config) -> Memory:
@@ -72,11 +67,8 @@ def of_validate(config: Config) -> Memory:
     names = ("plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "inputs.json")
     formats = recorded(config.data, config.export, config.render.extras)
     stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
-    files = [
-        *(config.data / name for name in names),
-        *(store.root / TABLE for store in stores),
-        *(one.record_file for one in formats),
-    ]
+    files = [config.data / name for name in names] + [store.root / TABLE for store in stores]
+    files += [one.record_file for one in formats]
     whole = all(store.untouched() for store in stores) and all(untouched(one) for one in formats)
     sections = [settings_of(section) for section in (config.render, config.export, config.plan.axes)]
     settings = [*sections, checksum(BANK_FILE)]
@@ -94,35 +86,37 @@ def of_doctor(config: Config, device: str) -> Memory:
 
 def of_summary(config: Config) -> Memory:
     """Of the contact sheets and previews."""
-    frames = FrameStore(config.data / "frames", config.render)
-    files = [*(config.data / name for name in ("plan.parquet", "manifest.parquet", "inputs.json")), frames.root / TABLE]
-    made_by = fingerprint("pictures", *_drawn_by(config), _contents(files, config.data)) if frames.untouched() else None
-    return Memory(config.data, "summary", made_by, ["sheets", "previews"])
+    names = ("plan.parquet", "manifest.parquet", "inputs.json", FRAMES)
+    return _of_pictures(config, "summary", ["sheets", "previews"], _drawn_by(config), names)
 
 
 def of_previews(config: Config) -> Memory:
     """Of the previews alone, which show no episode: what is kept and exported changes none."""
-    made_by = fingerprint("pictures", *_drawn_by(config), _contents([config.data / "inputs.json"], config.data))
-    return Memory(config.data, "previews", made_by, ["previews"])
+    return _of_pictures(config, "previews", ["previews"], _drawn_by(config), ["inputs.json"])
+
+
+def of_report(config: Config) -> Memory:
+    """Of the report."""
+    names = ("plan.parquet", "manifest.parquet", "leakage.json", "inputs.json", FRAMES, "sheets", "previews")
+    settings = [settings_of(config, {"compute", "folder"}), checksum(SEEN)]
+    return _of_pictures(config, "report", ["report.html"], settings, names)
+
+
+def _of_pictures(
+    config: Config, stage: str, outputs: Sequence[str], settings: Sequence[object], names: Sequence[str]
+) -> Memory:
+    whole = FRAMES not in names or FrameStore(config.data / "frames", config.render).untouched()
+    contents = _contents([config.data / name for name in names], config.data)
+    return Memory(config.data, stage, fingerprint("pictures", *settings, contents) if whole else None, outputs)
 
 
 def _drawn_by(config: Config) -> list[dict[str, Any]]:
     return [settings_of(section) for section in (config.demos, config.plan, config.replay)]
 
 
-def of_report(config: Config) -> Memory:
-    """Of the report."""
-    frames = FrameStore(config.data / "frames", config.render)
-    names = ("plan.parquet", "manifest.parquet", "leakage.json", "inputs.json")
-    pictures = [file for name in ("sheets", "previews") for file in _files(config.data / name)]
-    files = [*(config.data / name for name in names), frames.root / TABLE, *pictures]
-    settings = [settings_of(config, {"compute", "folder"}), checksum(SEEN)]
-    made_by = fingerprint("pictures", *settings, _contents(files, config.data)) if frames.untouched() else None
-    return Memory(config.data, "report", made_by, ["report.html"])
-
-
-def _contents(files: Sequence[Path], data: Path) -> Mapping[str, str]:
-    return {file.relative_to(data).as_posix(): checksum(file) for file in files if file.exists()}
+def _contents(paths: Sequence[Path], data: Path) -> Mapping[str, str]:
+    files = (file for path in paths for file in _files(path) if file.exists())
+    return {file.relative_to(data).as_posix(): checksum(file) for file in files}
 
 
 def settings_of(section: BaseModel, but: Set[str] = frozenset()) -> dict[str, Any]:

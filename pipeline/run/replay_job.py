@@ -13,25 +13,20 @@ from pipeline.compute.pool import LOST
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
-from pipeline.libero.starts import LEFT_OUT_STEPS
+from pipeline.libero.starts import LEFT_OUT_STEPS, kept_actions
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.quality import measure
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay
 from pipeline.planning.plan import Row
-from pipeline.scenes.noops import kept_actions
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Demo, Scene, Trajectory, Verdict
 
 
 @dataclass(frozen=True)
 class ReplayJob:
-    """One trajectory's replay, as it is sent to a worker.
-
-    Attributes:
-        row: a row of the plan that has this trajectory.
-        twin: trajectory of the same demonstration without perturbations, which tracking follows.
-    """
+    """The replay of a row's trajectory, as it is sent to a worker; tracking follows the trajectory ``twin``, that of
+    the same demonstration without perturbations."""
 
     row: Row
     twin: str
@@ -40,11 +35,8 @@ class ReplayJob:
     folder: Path
 
     def __call__(self) -> Verdict:
-        """Replay, judge and store; returns the verdict.
-
-        Raises:
-            PipelineError: when the demonstration is not there, or another than the plan was drawn for.
-        """
+        """Replay, judge and store; returns the verdict. PipelineError when the demonstration is not there, or another
+        than the plan was drawn for."""
         demo = self.demos.open().load(self.row.demo_id)
         if demo.sha256 != self.row.demo_sha256:
             raise PipelineError(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import fcntl
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -16,7 +15,7 @@ import yaml
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import exit_status
-from pipeline.files import remove_leftovers, write_json
+from pipeline.files import read_json, remove_leftovers, write_json
 from pipeline.identity import REMAKE
 
 OWNER = "configuration.json"
@@ -52,10 +51,7 @@ def claimed(file: Path) -> Config:
     """Load a configuration that is about to be run; a run's folder that is new belongs to it from now on.
 
     A stage deletes what its plan does not name, so two configurations must never share a folder. The same file may
-    change as it likes.
-
-    Raises:
-        PipelineError: when the configuration is not valid, or the folder belongs to another file.
+    change as it likes. PipelineError when the configuration is not valid, or the folder belongs to another file.
     """
     config = load(file)
     _refuse_other_folder(config, file)
@@ -74,10 +70,8 @@ def claimed(file: Path) -> Config:
 def locked(folder: Path) -> Iterator[None]:
     """Keep other stages out of a run's folder, and clear what killed ones left in it.
 
-    The system ends the lock with this process, however it ends.
-
-    Raises:
-        PipelineError: when a stage runs there, or nothing can say whether one does.
+    The system ends the lock with this process, however it ends. PipelineError when a stage runs there, or nothing can
+    say whether one does.
     """
     with (folder / LOCK).open("a") as file:
         try:
@@ -101,11 +95,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def owned(file: Path) -> Config:
-    """Load a configuration whose finished run is to be read; nothing is written.
-
-    Raises:
-        PipelineError: as ``claimed``.
-    """
+    """Load a configuration whose finished run is to be read; nothing is written. PipelineError as ``claimed``."""
     config = load(file)
     if (config.data / OWNER).exists():
         _refuse_foreign(config, file)
@@ -126,14 +116,7 @@ def _refuse_other_folder(config: Config, file: Path) -> None:
 
 def _refuse_foreign(config: Config, file: Path) -> None:
     mark, own = config.data / OWNER, _named(file)
-    try:
-        owner = str(json.loads(mark.read_text())["configuration"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise PipelineError(
-            f"cannot read which configuration the folder belongs to ({error})",
-            where=mark,
-            remedy=f"delete the file if the folder is that of {own}",
-        ) from error
+    owner = read_json(mark, f"call this again, if the folder is that of {own}").get("configuration")
     if owner != own:
         raise PipelineError(
             f"the folder belongs to {owner}, and {own} has the same name: {config.name}",

@@ -14,14 +14,16 @@ from pipeline.types import Floats, Scene, State
 
 Joints = NDArray[np.intp]
 
+ARM = tuple(f"robot0_joint{number}" for number in range(1, 8))
+FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
+"""The robot's joints, base to wrist, and those of its gripper."""
+
 
 def compiled(model_xml: str) -> mujoco.MjModel:
     """A scene's model, images included.
 
-    Compiled in 0.6 s, and in 2 to 3 by a process that has not read its files before.
-
-    Raises:
-        ValueError: when MuJoCo refuses the scene.
+    Compiled in 0.6 s, and in 2 to 3 by a process that has not read its files before. ValueError when MuJoCo refuses the
+    scene.
     """
     model = mujoco.MjModel.from_xml_string(model_xml)
     # MuJoCo keeps what it read last, images included, until it reads something else: 300 MB.
@@ -34,9 +36,7 @@ def physics_to_read(model_xml: str) -> mujoco.MjModel:
     """A scene's model, with plain colours for images: nothing is rendered with it, and images are half of the work.
 
     The same for all who ask, and not to be written into: compiling takes 0.2 to 0.4 s, a copy 0.05 s and 100 MB.
-
-    Raises:
-        ValueError: when MuJoCo refuses the scene.
+    ValueError when MuJoCo refuses the scene.
     """
     scene = ET.fromstring(model_xml)
     for texture in scene.iterfind("asset/texture[@name][@file]"):
@@ -74,6 +74,12 @@ class CompiledScene:
         first = int(self.model.joint(f"{name}_joint0").qposadr[0])
         return State.of(state, self.model.nq).qpos[first : first + 7]
 
+    @property
+    def contacts(self) -> NDArray[np.intp]:
+        """(C, 2) the bodies in contact."""
+        contact = self.data.contact
+        return np.asarray(self.model.geom_bodyid[contact.geom[contact.dist <= 0]], np.intp)
+
     def touching(self) -> dict[tuple[int, int], float]:
         """Each pair of bodies of different things in contact, and the gap in m: deepest, negative."""
         contact = self.data.contact
@@ -110,7 +116,6 @@ def proprioception(data: mujoco.MjData) -> tuple[NDArray[np.float32], NDArray[np
     """State (8,) and joint state (7,) of a restored scene; names and units in ``schemas/episode.json``."""
     position = data.site("gripper0_grip_site").xpos
     w, *xyz = data.body("robot0_right_hand").xquat
-    fingers = [data.joint(f"gripper0_finger_joint{n}").qpos[0] for n in (1, 2)]
-    joints = [data.joint(f"robot0_joint{n}").qpos[0] for n in range(1, 8)]
+    fingers, joints = ([data.joint(name).qpos[0] for name in names] for names in (FINGERS, ARM))
     state = np.concatenate([position, axis_angle(w, np.array(xyz)), fingers])
     return state.astype(np.float32), np.array(joints, np.float32)

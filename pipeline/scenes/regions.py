@@ -16,11 +16,7 @@ from pipeline.types import Floats
 
 
 class Region(NamedTuple):
-    """A rectangle of the working surface.
-
-    Attributes:
-        x_m, y_m: bounds in the world; x points from the robot to the camera.
-    """
+    """A rectangle of the working surface, by its bounds in the world; x points from the robot to the camera."""
 
     x_m: tuple[float, float]
     y_m: tuple[float, float]
@@ -31,17 +27,12 @@ class Region(NamedTuple):
 
 
 class Regions(NamedTuple):
-    """The regions of an arena.
-
-    Attributes:
-        front: on the camera's side.
-        back: beside and behind what the task is about.
-        front_share: how often an object is put in front.
-    """
+    """The regions of an arena: in front, on the camera's side, and beside and behind what the task is about."""
 
     front: Region
     back: Region
     front_share: float
+    """How often an object is put in front."""
 
     def order(self, rng: np.random.Generator) -> tuple[Region, Region]:
         """The region for an object, and the one to try where it does not fit there."""

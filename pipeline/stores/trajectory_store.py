@@ -19,14 +19,8 @@ from pipeline.types import Push, Quality, Scene, Trajectory, Verdict
 
 
 class TrajectoryStore(Store):
-    """Trajectories under one folder.
-
-    The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (how the actions came about), ``steps``
-    (how many were executed), ``resolved`` (JSON of what physics perturbations did in the scene), and those of
-    ``Quality``.
-
-    A file holds no path of the machine, so that it is the same, and can be read, wherever the packages are installed.
-    """
+    """Trajectories under one folder; its table has verdict, executed steps, ``Quality`` and more of each. A file holds
+    no path of the machine, so that it is the same, and can be read, wherever the packages are installed."""
 
     step, stage = "physics", "render"
     columns: ClassVar = {
@@ -40,60 +34,49 @@ class TrajectoryStore(Store):
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
-        return {
-            "kept": file.attributes["kept"],
-            "reason": file.attributes["reason"],
-            "mode": file.attributes["mode"],
-            "steps": file.length("actions"),
-            "resolved": file.attributes["resolved"],
-            **(file.attributes["quality"] or {}),
-        }
+        told = {name: file.attributes[name] for name in ("kept", "reason", "mode", "resolved")}
+        return {**told, "steps": file.length("actions"), **(file.attributes["quality"] or {})}
 
     def save(self, trajectory: Trajectory) -> None:
+        scene = trajectory.scene
         attributes = {
+            **asdict(trajectory.verdict),
             "mode": trajectory.mode,
-            "kept": bool(trajectory.verdict.kept),
-            "reason": trajectory.verdict.reason,
             "resolved": trajectory.resolved,
             "quality": asdict(trajectory.quality) if trajectory.quality else None,
-            "gripper": trajectory.scene.gripper,
-            "posture_rad": trajectory.scene.posture_rad,
-        }
-        if trajectory.scene.push is not None:
+            "gripper": scene.gripper,
+            "posture_rad": scene.posture_rad,
             # Others' files stay what they were before there were pushes.
-            attributes["push"] = trajectory.scene.push
+            **({} if scene.push is None else {"push": scene.push}),
+        }
         with self.created(trajectory.trajectory_id, attributes) as file:
             file["model_xml"] = np.frombuffer(portable(trajectory.model_xml).encode(), np.uint8)
-            file["start"] = trajectory.scene.state
+            file["start"] = scene.state
             file["states"] = trajectory.states
             file["actions"] = trajectory.actions
             file.create_dataset("site_alpha", data=trajectory.site_alpha, compression="gzip")
 
     def load(self, trajectory_id: str) -> Trajectory:
-        """Read a trajectory back.
-
-        Raises:
-            PipelineError: when its file is missing, damaged or not current, or what its scene is made of is not here.
-        """
+        """Read a trajectory back; PipelineError when its file is missing, damaged or not current, or what its scene is
+        made of is not here."""
         with self.opened(trajectory_id) as file:
-            posture_rad, push = file.attributes["posture_rad"], file.attributes.get("push")
+            told = file.attributes
+            posture_rad, push, quality = told["posture_rad"], told.get("push"), told["quality"]
             scene = Scene(
                 model_xml=located(file.array("model_xml").tobytes().decode(), self.path(trajectory_id)),
                 state=file.array("start"),
-                resolved=json.loads(file.attributes["resolved"]),
-                gripper=file.attributes["gripper"],
+                resolved=json.loads(told["resolved"]),
+                gripper=told["gripper"],
                 posture_rad=None if posture_rad is None else tuple(posture_rad),
                 push=None if push is None else Push(push[0], tuple(push[1]), *push[2:]),
             )
             return Trajectory(
-                trajectory_id=trajectory_id,
-                mode=file.attributes["mode"],
-                scene=scene,
-                states=file.array("states"),
-                actions=file.array("actions"),
-                site_alpha=file.array("site_alpha"),
-                verdict=Verdict(file.attributes["kept"], file.attributes["reason"]),
-                quality=Quality(**quality) if (quality := file.attributes["quality"]) else None,
+                trajectory_id,
+                told["mode"],
+                scene,
+                **{name: file.array(name) for name in ("states", "actions", "site_alpha")},
+                verdict=Verdict(told["kept"], told["reason"]),
+                quality=None if quality is None else Quality(**quality),
             )
 
 

@@ -1,7 +1,7 @@
 """Some episodes rendered anew: is what the store and the datasets have the right picture, and the right way up?
 
 The process is another than the one that rendered the frames, and the pictures are made from the trajectory's states.
-Noise and turning are done here once more, by other code than that of the run (``rendering/frames.py``).
+Noise and turning are done here once more, by other code than that of the run (``rendering/render.py``).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import decode, encode
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import LastScene
 from pipeline.types import Frame
 from pipeline.validation.checks import Case
 

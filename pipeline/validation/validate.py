@@ -25,7 +25,7 @@ from pipeline.formats.registry import failures_of, formats_of, recorded
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
 from pipeline.planning import plan
-from pipeline.rendering.last_scene import scene_of_process
+from pipeline.rendering.renderer import scene_of_process
 from pipeline.run import manifest, outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader

@@ -18,8 +18,7 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.replay import replay, roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
 from pipeline.stores.trajectory_store import TrajectoryStore

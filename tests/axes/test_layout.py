@@ -22,8 +22,7 @@ from pipeline.libero.starts import HOME_RAD, recorded_start
 from pipeline.libero.tasks import tasks
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.replay import replay, roll_out
 from pipeline.rendering.renderer import Renderer
 from pipeline.rendering.sight import Sight
 from pipeline.scenes.placement import CLEARANCE_M, HIDDEN, SEEN_PX, enough_seen, place

@@ -14,16 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from pipeline.axes import from_json, to_json
 from pipeline.axes.base import Level
-from pipeline.axes.pose import PoseAxis, PosePerturbation
-from pipeline.axes.scene import BASE_M, Move, ScenePerturbation
+from pipeline.axes.pose import BASE_M, Move, PoseAxis, PosePerturbation, ScenePerturbation
 from pipeline.config import ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task, select_tasks
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
-from pipeline.physics.replay import replay
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.replay import replay, roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -175,7 +173,7 @@ def test_a_target_in_mid_air_is_still_moved(scenes: Scenes) -> None:
 
 def test_nearest_compares_moves_of_the_same_object() -> None:
     def tested(task: Task, target: str, dx_m: float, dy_m: float) -> TestTask:
-        found: dict[str, str | int | float] = {"level": 1, "sample": 1, "target": target, "dx_m": dx_m, "dy_m": dy_m}
+        found: dict[str, str | int | float] = {"level": 1, "sample": 1, "moves": f"{target}:{dx_m},{dy_m}"}
         return TestTask(task.suite, task.name, "name", "pose", "pose", found)
 
     test = TestSet(
@@ -193,19 +191,13 @@ def test_nearest_compares_moves_of_the_same_object() -> None:
 
 
 def test_nearest_knows_each_of_several_objects_that_a_test_task_moves() -> None:
-    moves: dict[str, str | int | float] = {"target": "moka_pot_1", "dx_m": 0.01, "dy_m": 0.02}
-    both = moves | {"others": "moka_pot_2:-0.03,0.04;plate_1:1e-05,0"}
-    test = TestSet(
-        (
-            TestTask(POTS.suite, POTS.name, "both", "pose", "pose", both),
-            TestTask(POTS.suite, POTS.name, "one", "pose", "pose", moves | {"dx_m": 0.05}),
-        )
-    )
+    moves = {"both": "moka_pot_1:0.01,0.02;moka_pot_2:-0.03,1e-05;flat_stove_1:0,0", "one": "moka_pot_1:0.05,0.02"}
+    test = TestSet(tuple(TestTask(POTS.suite, POTS.name, k, "pose", "pose", {"moves": m}) for k, m in moves.items()))
     assert moved("moka_pot_1", 0.01, 0.02).nearest(test, POTS) == (0, 2)
-    assert moved("moka_pot_1", -0.03, 0.04).nearest(test, POTS).distance > 0.04, "that is how the other one moves"
-    assert moved("moka_pot_2", -0.03, 0.04).nearest(test, POTS) == (0, 1)
-    assert moved("moka_pot_2", -0.03, 0.05).nearest(test, POTS) == pytest.approx((0.01, 1))
-    assert moved("plate_1", 0.0, 0.0).nearest(test, POTS) == pytest.approx((1e-5, 1))
+    assert moved("moka_pot_1", -0.03, 0.0).nearest(test, POTS).distance > 0.04, "that is how the other one moves"
+    assert moved("moka_pot_2", -0.03, 0.0).nearest(test, POTS) == pytest.approx((1e-5, 1))
+    assert moved("moka_pot_2", -0.03, 0.01).nearest(test, POTS) == pytest.approx((0.00999, 1))
+    assert moved("flat_stove_1", 0.0, 0.0).nearest(test, POTS) == (math.inf, 0), "no target of the task"
 
 
 def test_the_replay_starts_there(plate_environment: Environment) -> None:

@@ -17,8 +17,7 @@ from pipeline.libero.assets import relocate
 from pipeline.libero.starts import HOME_RAD, recorded_start
 from pipeline.physics.control_env import seeded
 from pipeline.physics.environment import Environment
-from pipeline.physics.replay import replay
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.replay import replay, roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
 from pipeline.testset.benchmark import TestSet, TestTask

@@ -37,8 +37,8 @@ from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
+from pipeline.libero.starts import kept_actions
 from pipeline.run.export import export
-from pipeline.scenes.noops import kept_actions
 from pipeline.types import Episode, Floats
 
 pytestmark = pytest.mark.slow

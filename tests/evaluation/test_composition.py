@@ -15,7 +15,7 @@ from pipeline.axes.pose import PosePerturbation
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.errors import RefusedError
 from pipeline.physics.environment import Environment
-from pipeline.physics.roll_out import roll_out
+from pipeline.physics.replay import roll_out
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.types import Demo, Floats, Scene
 

@@ -23,12 +23,12 @@ from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import HDF5Source
+from pipeline.libero.starts import NOOP_NORM, kept_actions
 from pipeline.physics.environment import Environment, shared
 from pipeline.physics.replay import replay, verdict
 from pipeline.planning import plan
 from pipeline.run.replay_job import ReplayJob
 from pipeline.run.replay_stage import Replays
-from pipeline.scenes.noops import NOOP_NORM, kept_actions
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task, Trajectory, Verdict

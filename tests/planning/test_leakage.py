@@ -23,9 +23,8 @@ from pipeline import seeding
 from pipeline.axes import AXES, Perturbation, from_json, to_json
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.noise import NoiseAxis
-from pipeline.axes.pose import PoseAxis
+from pipeline.axes.pose import PoseAxis, displacements
 from pipeline.axes.robot import benchmark_offsets_rad
-from pipeline.axes.scene import displacements
 from pipeline.errors import PipelineError
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks

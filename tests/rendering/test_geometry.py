@@ -30,10 +30,9 @@ from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream
-from pipeline.rendering.instances import COMMON
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.geometry import COMMON
 from pipeline.rendering.render import render
-from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import export
 from pipeline.run.render_stage import render_plan

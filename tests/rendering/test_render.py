@@ -28,9 +28,8 @@ from pipeline.config import RenderConfig  # noqa: E402
 from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.images.jpeg import decode, encode, to_policy  # noqa: E402
 from pipeline.planning.streams import Stream, streams_of  # noqa: E402
-from pipeline.rendering.last_scene import LastScene  # noqa: E402
 from pipeline.rendering.render import render  # noqa: E402
-from pipeline.rendering.renderer import Renderer  # noqa: E402
+from pipeline.rendering.renderer import LastScene, Renderer  # noqa: E402
 from pipeline.rendering.sight import LEAST_PX, MOST_OUTSIDE, Sight  # noqa: E402
 from pipeline.scenes.compiled import proprioception  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402

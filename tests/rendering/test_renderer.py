@@ -17,9 +17,8 @@ from arenas import TASKS, frames
 from pipeline.axes.light import LightPerturbation
 from pipeline.physics.environment import Environment
 from pipeline.rendering.drawing import PlainDrawing
-from pipeline.rendering.last_scene import LastScene
 from pipeline.rendering.opengl import calls
-from pipeline.rendering.renderer import Renderer
+from pipeline.rendering.renderer import LastScene, Renderer
 from pipeline.rendering.software.drawing import SoftwareDrawing
 from pipeline.types import Floats, Frame
 
@@ -138,7 +137,7 @@ def test_a_scene_after_one_that_failed_half_way_is_shown_as_it_is(tmp_path: Path
 
 
 LEFT_OPEN = '''
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import LastScene
 
 scene = """
 <mujoco>

@@ -16,7 +16,6 @@ from pipeline import gl
 from pipeline.rendering import savings
 from pipeline.rendering.drawing import PlainDrawing
 from pipeline.rendering.renderer import Renderer
-from pipeline.rendering.software import trial
 from pipeline.rendering.software.drawing import SoftwareDrawing
 from pipeline.rendering.software.skins import SkinnedMeshes
 
@@ -69,8 +68,8 @@ def test_a_scene_that_shares_no_context_is_drawn_plainly(caplog: pytest.LogCaptu
 def test_other_pixels_of_the_small_scene_draw_plainly(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(trial, "SCENE", trial.SCENE.replace('pos="0.2 0.1 0.1"', 'pos="0.2 0.1 0.2"'))
-    assert trial.fault() is None
+    monkeypatch.setattr(savings, "SCENE", savings.SCENE.replace('pos="0.2 0.1 0.1"', 'pos="0.2 0.1 0.2"'))
+    assert savings.fault() is None
     put = SkinnedMeshes.put
 
     def wrong(*arguments: object) -> object:

@@ -276,7 +276,7 @@ def test_the_same_pixels_with_fewer_faces(shadows: bool) -> None:
 def test_display_lists_may_be_numbered_downwards(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mesa 22 counts on, Mesa 25 fills gaps, so that a later block may have lower numbers."""
     gl.prepare()
-    functions, lowest = opengl._functions(), 0
+    functions, lowest = opengl._FUNCTIONS, 0
     upwards = functions.glGenLists
 
     def downwards(count: int) -> int:

@@ -27,8 +27,8 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.environment import Environment
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
-from pipeline.rendering.last_scene import scene_of_process
 from pipeline.rendering.render import render
+from pipeline.rendering.renderer import scene_of_process
 from pipeline.report import preview, sheets
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet

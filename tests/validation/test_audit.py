@@ -21,7 +21,7 @@ from synthetic import IDS, NAME, episode, loop
 
 from pipeline.__main__ import main
 from pipeline.axes.camera_pose import AGENT_VIEWS, moved_to
-from pipeline.axes.scene import ROBOT_X_M
+from pipeline.axes.pose import ROBOT_X_M
 from pipeline.errors import PipelineError
 from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.episodes import Episodes, Known

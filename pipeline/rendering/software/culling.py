@@ -32,7 +32,7 @@ SHADOW_MARGIN_M = 0.05
 
 
 class Lamp(NamedTuple):
-    """For a light with shadows: (ngeom,) which geoms cast shadows into the picture, and which it may light there."""
+    """Of a light with shadows, (ngeom,) which geoms cast shadows into the picture, and which it may light there."""
 
     casts: NDArray[np.bool_]
     lights: NDArray[np.bool_]
@@ -49,7 +49,7 @@ class Picture(NamedTuple):
         lamps: lights with shadows, in MuJoCo's order.
         sites: (nsite,) sites that may show.
         projection: for the choice of single faces, or None where all are rendered.
-        underlaid: whether the picture may be composed of underlays (``still.py``).
+        underlaid: whether the picture may be composed of underlays (``Still``).
     """
 
     opaque: NDArray[np.bool_]
@@ -65,10 +65,7 @@ class Picture(NamedTuple):
 
 class Culling:
     """Tests the bounding boxes of a model's geoms against a camera's view. All planes must have bounds.
-
-    Args:
-        hidden_groups: groups of geoms that are not rendered.
-    """
+    ``hidden_groups``: groups of geoms that are not rendered."""
 
     def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int]):
         self._model, self.shown = model, ~np.isin(model.geom_group, list(hidden_groups))
@@ -176,10 +173,8 @@ class Culling:
         return np.asarray(self.shown & (opacity < 1))
 
     def _sites(self, shadows: bool) -> NDArray[np.bool_]:
-        """(nsite,) which sites may show.
-
-        robosuite hides some by a negative opacity: MuJoCo renders them, and only where lamps cast shadows they show.
-        """
+        """(nsite,) which sites may show. robosuite hides some by a negative opacity: MuJoCo renders them, and only
+        where lamps cast shadows they show."""
         return np.asarray((self._model.site_rgba[:, 3] > 0) | shadows)
 
 

@@ -2,7 +2,7 @@
 
 * Geoms outside of the view are not rendered (``culling.py``).
 * Of large meshes, only faces that cover a sample are rendered (``skins.py``, ``samples.py``).
-* What stands still before a camera is rendered once, and its colour and depth are kept as an underlay (``still.py``).
+* What stands still before a camera is rendered once, and its colour and depth are kept as an underlay (``Still``).
 * Meshes and textures that a scene shares with the one before stay in the context.
 """
 
@@ -26,7 +26,6 @@ from pipeline.rendering.software.mujoco_3_2_7.skins import Skins
 from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay
 from pipeline.rendering.software.samples import SAMPLES
 from pipeline.rendering.software.skins import SkinnedMeshes
-from pipeline.rendering.software.still import Still
 from pipeline.types import Frame
 
 LOOK = tuple(name for name in FIELDS if name != "tex_data")
@@ -34,6 +33,9 @@ LOOK = tuple(name for name in FIELDS if name != "tex_data")
 
 CULLED = mujoco.mjNGROUP - 1
 """A group of geoms and sites that LIBERO does not use and that is never rendered."""
+
+LONGEST_WAIT = 16
+"""Pictures that a geom must stand still, at most, before it joins the underlay."""
 
 
 class Shot(NamedTuple):
@@ -44,12 +46,45 @@ class Shot(NamedTuple):
     picture: Picture
 
 
-class SoftwareDrawing(PlainDrawing):
-    """Renders models that are ``possible``.
+class Still:
+    """Chooses the geoms of one camera's underlay.
 
-    Raises:
-        PipelineError: when OpenGL does not do what is asked of it.
+    An underlay has to be rendered anew when one of its geoms moves, and an object at rest moves by a millionth now and
+    then. So each time a geom leaves the underlay, it has to stand still for twice as many pictures to join again. Geoms
+    join once rendering them beside the underlay has cost more faces than a new underlay would have.
     """
+
+    def __init__(self, model: mujoco.MjModel):
+        meshes = np.where(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH, model.geom_dataid, -1)
+        self._faces = np.where(meshes >= 0, np.append(model.mesh_facenum, 0)[meshes], 12)
+        self._wait: NDArray[np.intp] = np.ones(model.ngeom, np.intp)
+        self._view = b""
+
+    def geoms(self, view: bytes, places: NDArray[np.float32], rendered: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(ngeom,) the geoms of the underlay for the next picture of those that are to be ``rendered`` (ngeom,).
+
+        ``view`` is what a picture depends on beside the geoms: the camera, and where the lamps are. ``places`` (ngeom,
+        12) are positions and rotations of the geoms, as they are rendered."""
+        if view != self._view:
+            self._view, self._places = view, places
+            self._geoms: NDArray[np.bool_] = np.zeros(len(places), np.bool_)
+            self._age: NDArray[np.intp] = np.zeros(len(places), np.intp)
+            self._beside = 0
+            return self._geoms
+        stood = (places == self._places).all(axis=1)
+        self._places = places
+        left = self._geoms & ~stood
+        self._wait[left] = np.minimum(2 * self._wait[left], LONGEST_WAIT)
+        self._age = np.where(stood, self._age + 1, 0)
+        ready = rendered & (self._age >= self._wait)
+        self._beside += int(self._faces[ready & ~self._geoms].sum())
+        if left.any() or self._beside > self._faces[ready].sum():
+            self._geoms, self._beside = ready, 0
+        return self._geoms
+
+
+class SoftwareDrawing(PlainDrawing):
+    """Renders models that are ``possible``; PipelineError when OpenGL does not do what is asked of it."""
 
     def __init__(self, model: mujoco.MjModel):
         # The context is made for what all scenes have in common, and then goes on with this model.
@@ -127,12 +162,8 @@ class SoftwareDrawing(PlainDrawing):
         self._draw(shot, opaque & ~still, underlay)
 
     def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
-        """Render opaque geoms (ngeom,) of a picture over an underlay.
-
-        Args:
-            last: whether this completes the picture, with what is in no underlay: mirror, transparent geoms, sites,
-                shadows and sky.
-        """
+        """Render opaque geoms (ngeom,) of a picture over an underlay. ``last``: whether this completes the picture,
+        with what is in no underlay: mirror, transparent geoms, sites, shadows and sky."""
         model, picture, flags = self._model, shot.picture, self._scene.flags
         rendered, passes = opaque, [Pass(Purpose.CAMERA, picture.seen & opaque)]
         if last:

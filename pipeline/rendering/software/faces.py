@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 ROUND = 0.8
 """Least cosine between a corner's normal and its face's: else MuJoCo takes the face's (``mjr_uploadMesh``)."""
 
-
 PARTS = {
     "vert": ("vert",),
     "normal": ("normal",),
@@ -25,11 +24,9 @@ class Faces(NamedTuple):
     """A mesh by its vertices, each a place with what is rendered there; faces that meet mostly differ in the normal.
 
     Attributes:
-        vertices_m, normals: (V, 3) in the frame of the mesh's geoms.
-        texture: (V, 2) place in a texture, or None where the mesh has no such places.
+        vertices_m, normals, texture: (V, 3), (V, 3) and (V, 2); None where the mesh has no places in a texture.
         corners: (F, 3) vertices of each face, in the mesh's order.
-        places_m: (P, 3) each place once.
-        place_of_corner: (F, 3) the place of each face's corners.
+        places_m, place_of_corner: (P, 3) each place once, and (F, 3) the place of each face's corners.
     """
 
     vertices_m: NDArray[np.float32]
@@ -47,10 +44,8 @@ def faces_of(model: mujoco.MjModel, mesh: int) -> Faces:
     normals = _of(model, mesh, "normal")[model.mesh_facenormal[first:last]]
     columns = [vertices_m.reshape(-1, 3)]
     if model.mesh_texcoordadr[mesh] >= 0:
-        columns += [
-            normals.reshape(-1, 3),
-            _of(model, mesh, "texcoord")[model.mesh_facetexcoord[first:last]].reshape(-1, 2),
-        ]
+        texture = _of(model, mesh, "texcoord")[model.mesh_facetexcoord[first:last]]
+        columns += [normals.reshape(-1, 3), texture.reshape(-1, 2)]
     else:
         columns.append(_flattened(vertices_m, normals).reshape(-1, 3))
     rendered = np.ascontiguousarray(np.concatenate(columns, axis=1, dtype=np.float32))

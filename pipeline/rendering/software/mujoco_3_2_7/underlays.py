@@ -49,10 +49,7 @@ class Underlay:
     def __init__(self, context: mujoco.MjrContext, height: int, width: int):
         opengl = calls()
         self._buffer, self._height, self._width = context.offFBO, height, width
-        self._textures = [
-            self._texture(context.offColor, context.offSamples),
-            self._texture(context.offDepthStencil, context.offSamples),
-        ]
+        self._textures = [self._texture(of, context.offSamples) for of in (context.offColor, context.offDepthStencil)]
         self._kept = opengl.glGenFramebuffers(1)
         opengl.glBindFramebuffer(opengl.GL_FRAMEBUFFER, self._kept)
         places = opengl.GL_COLOR_ATTACHMENT0, opengl.GL_DEPTH_STENCIL_ATTACHMENT
@@ -83,14 +80,8 @@ class Underlay:
     def _draw(self) -> None:
         opengl = calls()
         opengl.glPushAttrib(opengl.GL_ALL_ATTRIB_BITS)
-        for setting in (
-            opengl.GL_ALPHA_TEST,
-            opengl.GL_BLEND,
-            opengl.GL_CULL_FACE,
-            opengl.GL_POLYGON_OFFSET_FILL,
-            opengl.GL_STENCIL_TEST,
-        ):
-            opengl.glDisable(setting)
+        for setting in ("ALPHA_TEST", "BLEND", "CULL_FACE", "POLYGON_OFFSET_FILL", "STENCIL_TEST"):
+            opengl.glDisable(getattr(opengl, f"GL_{setting}"))
         opengl.glEnable(opengl.GL_DEPTH_TEST)
         # MuJoCo's depth grows towards the camera.
         opengl.glDepthFunc(opengl.GL_GEQUAL)

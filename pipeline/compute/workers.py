@@ -1,0 +1,156 @@
+"""Starts workers: processes of this machine, or jobs of SLURM, which sit in its queue until it has room."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import ComputeConfig, SlurmConfig
+from pipeline.errors import PipelineError
+from pipeline.exit_status import GO_ON
+from pipeline.machine_code import SETTINGS, in_shell
+
+STARTS = 2
+"""How often workers are started, where they end before all have started."""
+
+
+@contextmanager
+def local_cluster(
+    workers: int | None, opengl: Callable[[], Callable[[int], None]] | None
+) -> Iterator[tuple[Any, Callable[[], None]]]:
+    """A client of so many workers, one for each core when left out, and what brings back those that died. ``opengl`` is
+    that of ``runner``. PipelineError when the workers end while they start."""
+    from dask.system import CPU_COUNT
+    from distributed import Client
+
+    workers = workers or CPU_COUNT
+    # So would software GL; where workers are fewer than cores, it uses the others.
+    os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
+    with _ended(_started(workers)) as cluster, Client(cluster) as client:
+        client.run(_leave_interrupts_to_the_run)
+        if opengl is not None:
+            _have_called(opengl(), client)
+        # A worker that dies while it starts is not replaced by Dask alone.
+        yield client, partial(cluster.scale, workers)
+
+
+def _started(workers: int) -> Any:
+    """Worker processes on this machine, started once more where one dies and Dask ends all, before all have started."""
+    from distributed import LocalCluster
+
+    # An error reaches the user once, from here.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for _ in range(STARTS):
+        try:
+            return LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=":0",
+                memory_limit=None,
+                silence_logs=logging.CRITICAL,
+            )
+        except RuntimeError as error:
+            failure = error
+    raise ended(f"worker processes ended while they started, {STARTS} times") from failure
+
+
+def ended(what: str, where: str | None = None) -> PipelineError:
+    """The error that workers ended, and nothing says why."""
+    expected = "workers that live: the system may have ended them because memory ran out"
+    return PipelineError(
+        what, where=where, expected=expected, remedy=f"see the system's log, use fewer workers, and {GO_ON}"
+    )
+
+
+@contextmanager
+def _ended(cluster: Any) -> Iterator[Any]:
+    """End the workers. On a busy machine they may take longer than Dask waits: they then end with this process, and
+    what they finished counts."""
+    try:
+        yield cluster
+    finally:
+        with suppress(TimeoutError):
+            cluster.close()
+
+
+def _have_called(prepare: Callable[[int], None], client: Any) -> None:
+    """Have each worker of this machine call a function with its number, also those that come later."""
+    from distributed import Worker, WorkerPlugin
+
+    class Prepared(WorkerPlugin):  # type: ignore[misc]
+        def setup(self, worker: Worker) -> None:
+            prepare(int(worker.name))
+
+    client.register_plugin(Prepared())
+
+
+def _leave_interrupts_to_the_run() -> None:
+    """In a worker: Ctrl-C reaches all processes of a terminal, and the run ends its workers itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+LOGS = Path(".work") / "slurm"
+"""Where a run's folder keeps what the jobs print."""
+
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
+
+
+@contextmanager
+def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
+    """A scheduler in this process and a job for each worker; when the block ends, so do the jobs.
+
+    What a site needs beyond ``SlurmConfig``, such as the network interface, dask-jobqueue reads from its own file,
+    ``~/.config/dask/jobqueue.yaml``. The work writes into ``folder``, which the nodes must see too. PipelineError when
+    SLURM takes no job.
+    """
+    from dask_jobqueue.slurm import SLURMCluster
+
+    job = config.slurm or SlurmConfig()
+    logs = (folder / LOGS).absolute()
+    logs.mkdir(parents=True, exist_ok=True)
+    cluster = SLURMCluster(
+        cores=1,
+        processes=1,
+        memory=f"{job.memory_gb}GB",
+        queue=job.partition,
+        account=job.account,
+        walltime=job.walltime,
+        job_extra_directives=list(job.options),
+        # Not every site hands on the environment that a job is asked for in.
+        job_script_prologue=[f"export {in_shell(SETTINGS | dict.fromkeys(ONE_THREAD, '1'))}"],
+        log_directory=str(logs),
+        # SLURM watches memory itself.
+        worker_extra_args=["--memory-limit", "0"],
+        scheduler_options={"dashboard_address": ":0"},
+    )
+    with cluster:
+        _try(cluster.job_script())
+        cluster.scale(config.workers)
+        print(f"{config.workers} jobs wait in SLURM's queue; what they print is in {logs}", file=sys.stderr)
+        yield cluster
+
+
+def _try(script: str) -> None:
+    """Have SLURM look at a job without starting it: Dask would wait for ever for one that is refused. PipelineError in
+    SLURM's words."""
+    try:
+        looked = subprocess.run(["sbatch", "--test-only"], input=script, capture_output=True, text=True, check=False)
+        refusal = looked.stderr.strip() if looked.returncode else ""
+    except FileNotFoundError as error:
+        refusal = str(error)
+    if refusal:
+        raise PipelineError(
+            f"takes no job ({refusal})",
+            where="sbatch",
+            expected="a machine from which SLURM's jobs can be started, and options that it knows",
+            remedy="mend compute.slurm, or set compute.cluster: local",
+        )
