@@ -276,8 +276,11 @@ class Config(Frozen):
 
 
 def load(path: Path) -> Config:
-    """Read and validate a configuration; PipelineError naming the file, every field that is wrong, and what would have
-    worked."""
+    """Read and validate a configuration.
+
+    Raises:
+        PipelineError: naming the file, every field that is wrong, and what would have worked.
+    """
     try:
         return Config.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
     except (OSError, UnicodeDecodeError) as error:

@@ -112,8 +112,11 @@ class ActionSpec(VectorSpec):
 
 
 class EpisodeSchema(Frozen):
-    """Names, shapes, units and signs that all writers read. ``provenance``: what each episode says of itself, as the
-    manifest's column of that name does, to its type."""
+    """Names, shapes, units and signs that all writers read.
+
+    Attributes:
+        provenance: what each episode says of itself, as the manifest's column of that name does, to its type.
+    """
 
     fps_hz: int
     robot_type: str
@@ -159,7 +162,10 @@ def named(extras: Collection[Extra]) -> bool:
 
 def check(episode: Episode, extras: Collection[Extra] = ()) -> None:
     """Refuse an episode that training would misread or choke on; it must have the ``extras`` beside the frames.
-    PipelineError naming the episode and the field."""
+
+    Raises:
+        PipelineError: naming the episode and the field.
+    """
     steps = len(episode)
     if steps < SCHEMA.min_steps:
         expected = f"at least {SCHEMA.min_steps}, the chunk policies predict"

@@ -31,8 +31,11 @@ class PipelineError(Exception):
 
 
 class RefusedError(Exception):
-    """A perturbation that does not go with its scene. ``reason``: short and in snake_case, such as
-    ``robot_in_collision``."""
+    """A perturbation that does not go with its scene.
+
+    Args:
+        reason: short and in snake_case, such as ``robot_in_collision``.
+    """
 
     def __init__(self, reason: str):
         super().__init__(reason)

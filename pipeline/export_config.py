@@ -186,8 +186,14 @@ class ExportConfig(Frozen):
         return self.model_copy(update=formats)
 
     def refuse_too_few(self, demonstrations: int) -> None:
-        """Refuse a validation split that nothing could be in. ``demonstrations``: of the task that has most of them.
-        PipelineError when a share holds none of them out."""
+        """Refuse a validation split that nothing could be in.
+
+        Args:
+            demonstrations: of the task that has most of them.
+
+        Raises:
+            PipelineError: when a share holds none of them out.
+        """
         for name, options in self.formats.items():
             if options.validation and not held_out(options.validation, demonstrations):
                 raise too_few(options.validation, f"export.{name}.validation")

@@ -33,13 +33,21 @@ class Edition(NamedTuple):
 
 
 def edition(path: Path) -> Edition:
-    """The file as it lies there now; its path absolute. OSError when it is not there."""
+    """The file as it lies there now; its path absolute.
+
+    Raises:
+        OSError: when it is not there.
+    """
     status = path.stat()
     return Edition(path.resolve(), status.st_ino, status.st_size, status.st_mtime_ns)
 
 
 def checksum(file: Path) -> str:
-    """SHA-256 of a file's content, as ``sha256sum`` prints it; OSError when it cannot be read."""
+    """SHA-256 of a file's content, as ``sha256sum`` prints it.
+
+    Raises:
+        OSError: when it cannot be read.
+    """
     with file.open("rb") as content:
         return file_digest(content, "sha256").hexdigest()
 
@@ -51,7 +59,11 @@ def checksum_of(version: Edition) -> str:
 
 
 def read_json(file: Path, remedy: str = "dvc repro") -> dict[str, Any]:
-    """A JSON object that a stage wrote; PipelineError when the file is missing, or is something else."""
+    """A JSON object that a stage wrote.
+
+    Raises:
+        PipelineError: when the file is missing, or is something else.
+    """
     try:
         content = json.loads(file.read_bytes())
         if not isinstance(content, dict):
@@ -125,8 +137,10 @@ def _sync(path: Path) -> None:
 
 
 def keep_below(folder: Path, files: set[Path]) -> None:
-    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one. Such
-    as shards of an earlier plan, and temporaries of a killed run."""
+    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one.
+
+    Such as shards of an earlier plan, and temporaries of a killed run.
+    """
     if not folder.is_dir():
         return
     on_the_way = {parent for file in files for parent in file.parents}

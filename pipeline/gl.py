@@ -66,8 +66,10 @@ def choose() -> GlChoice:
     """Try what is there in short subprocesses (0.7 s each), set the environment, return the choice for printing.
 
     ``MUJOCO_GL`` and ``MUJOCO_EGL_DEVICE_ID`` are respected where they are set. A worker of this machine takes over
-    what the run's own process chose (``WorkerSetup``). PipelineError when ``MUJOCO_GL`` names something that does not
-    render here, or when nothing does.
+    what the run's own process chose (``WorkerSetup``).
+
+    Raises:
+        PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does.
     """
     if _of_the_run is not None:
         return _of_the_run

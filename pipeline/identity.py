@@ -102,12 +102,14 @@ def made_with(step: Step) -> dict[str, str]:
 
 
 def fingerprint(step: Step, *settings: object) -> str:
-    """A short name for what makes the files of a step, 16 hex digits; PipelineError when NumPy computes with other
-    machine code than is fixed.
+    """A short name for what makes the files of a step, 16 hex digits.
 
     Args:
         step: the last step of the file; those that it builds on count as well.
         settings: JSON-serialisable, what else the bytes depend on.
+
+    Raises:
+        PipelineError: when NumPy computes with other machine code than is fixed.
     """
     return digest(_parts(step), *settings)[:16]
 
@@ -127,13 +129,15 @@ ALLOW = f"`{REMAKE}=1 dvc repro`, or --remake behind one stage's command"
 
 
 def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None:
-    """Say what is made anew, and stop unless that was asked for; PipelineError when there is any, and the environment
-    does not allow it. Nothing was changed.
+    """Say what is made anew, and stop unless that was asked for.
 
     Args:
         found: what and why, to the number of files.
         where: they lie.
         allow: how, in words.
+
+    Raises:
+        PipelineError: when there is any, and the environment does not allow it. Nothing was changed.
     """
     if not found:
         return

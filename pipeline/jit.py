@@ -18,8 +18,10 @@ Result = TypeVar("Result")
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """``numba.njit(cache=True)``, but Numba is not imported before it is needed. Its import takes over a second, and
-    every process of a run imports the axes, most of them without such a loop."""
+    """``numba.njit(cache=True)``, but Numba is not imported before it is needed.
+
+    Its import takes over a second, and every process of a run imports the axes, most of them without such a loop.
+    """
 
     @cache
     def dispatcher() -> Any:

@@ -52,8 +52,11 @@ def machine_code() -> str:
 
 
 def fixed_machine_code() -> str:
-    """``machine_code``, for what is stored or read; PipelineError when NumPy was imported before this package and
-    computes with other machine code than is fixed."""
+    """``machine_code``, for what is stored or read.
+
+    Raises:
+        PipelineError: when NumPy was imported before this package and computes with other machine code than is fixed.
+    """
     if fault := _fault():
         raise fault
     return machine_code()

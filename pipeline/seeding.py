@@ -18,6 +18,8 @@ def digest(*key: object) -> str:
 
 
 def rng(first: Key, *more: Key) -> np.random.Generator:
-    """A Philox generator keyed by values such as ``(seed, axis, demo_id, variant)``. There is no default: a generator
-    without a key cannot be asked for, so nothing runs unseeded."""
+    """A Philox generator keyed by values such as ``(seed, axis, demo_id, variant)``.
+
+    There is no default: a generator without a key cannot be asked for, so nothing runs unseeded.
+    """
     return np.random.Generator(np.random.Philox(key=int(digest(first, *more)[:32], 16)))

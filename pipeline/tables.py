@@ -49,8 +49,11 @@ def write_table(table: pa.Table, path: Path) -> None:
 
 
 def read_table(path: Path, columns: Collection[str], remedy: str) -> pa.Table:
-    """A table as it was written, with these columns at least; ``remedy`` tells how it is made again. PipelineError when
-    it is missing or damaged, or lacks columns."""
+    """A table as it was written, with these columns at least; ``remedy`` tells how it is made again.
+
+    Raises:
+        PipelineError: when it is missing or damaged, or lacks columns.
+    """
     if not path.is_file():
         raise PipelineError("not there", where=path, remedy=remedy)
     try:

@@ -31,7 +31,13 @@ class Frozen(BaseModel):
 
 
 class State(NamedTuple):
-    """A flattened MuJoCo state (S,), taken apart: time in s, positions (nq,) and velocities (nv,) of the joints."""
+    """A flattened MuJoCo state (S,), taken apart.
+
+    Attributes:
+        time: in s.
+        qpos: (nq,) positions and rotations of the joints.
+        qvel: (nv,) their velocities.
+    """
 
     time: float
     qpos: Floats
@@ -53,9 +59,14 @@ class State(NamedTuple):
 
 @dataclass(frozen=True)
 class Task:
-    """One task of a suite, such as ``libero_goal``; its name is the stem of its BDDL file, with scene and goal.
+    """One LIBERO task.
 
-    The instruction has the wording of LIBERO's task list, as policies are prompted with it."""
+    Attributes:
+        suite: ``libero_spatial``, ``libero_object``, ``libero_goal`` or ``libero_10``.
+        name: LIBERO's task name, the stem of its BDDL file.
+        instruction: the wording of LIBERO's task list, as policies are prompted with it.
+        bddl_file: where the scene and the goal are defined.
+    """
 
     suite: str
     name: str
@@ -148,8 +159,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Quality:
-    """How well a trajectory was moved (``physics/quality.py``): columns of the manifest, with what they mean. Another
-    object is one that the goal does not name, and that stands on or in nothing that the goal moves."""
+    """How well a trajectory was moved (``physics/quality.py``): columns of the manifest, with what they mean.
+
+    Another object is one that the goal does not name, and that stands on or in nothing that the goal moves.
+    """
 
     non_target_moved_m: Annotated[float, "largest displacement of another object at any step, from the first look"]
     non_target_left_m: Annotated[float, "largest displacement of another object after the last step"]
@@ -215,13 +228,14 @@ class Rendered:
     """Everything that a policy may see of one trajectory.
 
     Attributes:
-        replay_mode, quality: the trajectory's.
-        state, joint_state, action: (K, 8), (K, 7) and (K, 7) float32.
+        replay_mode: how the trajectory's actions came about.
+        state: (K, 8), joint_state: (K, 7), action: (K, 7); see ``schemas/episode.json``.
         streams: stream id to K encoded frames.
         rejected: stream id to the reason why it was not rendered.
         geometry: id of a stream's geometry to what it is.
         object_poses: (K, 24, 7) float32, None where they were not asked for.
         instances: names of the things that segmentation and poses number; none without those.
+        quality: the trajectory's.
     """
 
     replay_mode: str
@@ -249,10 +263,14 @@ class Episode:
 
     Attributes:
         episode_id: identity by content, joins RLDS, LeRobot and manifest.
-        frames, geometry: by view (``image``, ``wrist_image``): T JPEG files, already rotated; where it is seen from.
+        frames: view name (``image``, ``wrist_image``) to T JPEG files, already rotated.
         state, joint_state, action: (T, 8), (T, 7) and (T, 7) float32.
+        instruction: the text the policy is prompted with.
+        provenance: the columns named in ``schemas/episode.json``.
+        geometry: view name to where it is seen from.
         object_poses, instances: as in ``Rendered``.
-        rewrites, subtasks: other wordings of its task; what is done one after the other; none where not asked for.
+        rewrites: other wordings of its task, for training; none where they were not asked for.
+        subtasks: what is done one after the other; none where they were not asked for.
     """
 
     episode_id: str

@@ -69,8 +69,11 @@ Kind = TypeVar("Kind", bound=Perturbation)
 
 
 def axes_of(name: str) -> tuple[str, ...]:
-    """The axes that a name such as ``language+camera`` joins, in the order in which they apply; ValueError when one of
-    them is no axis, or is named twice."""
+    """The axes that a name such as ``language+camera`` joins, in the order in which they apply.
+
+    Raises:
+        ValueError: when one of them is no axis, or is named twice.
+    """
     axes = name.split("+")
     if unknown := [axis for axis in axes if axis not in AXES]:
         raise ValueError(f"{name!r} names no axis with {unknown[0]!r}, expected {', '.join(AXES)}, or some joined by +")
@@ -95,8 +98,11 @@ def to_json(perturbations: Iterable[Perturbation]) -> str:
 
 
 def from_json(text: str) -> tuple[Perturbation, ...]:
-    """Read perturbations back, in the order in which they apply; PipelineError when they were recorded by a version of
-    this project with other axes or parameters."""
+    """Read perturbations back, in the order in which they apply.
+
+    Raises:
+        PipelineError: when they were recorded by a version of this project with other axes or parameters.
+    """
     try:
         return _LIST.validate_json(text)
     except ValidationError as error:

@@ -51,9 +51,15 @@ _DARKEST, _BRIGHTEST = 40.0, 205.0
 
 
 class Covering(Frozen):
-    """A texture, by its name in ``pipeline.catalogue.textures``, on one part of the scene, turned counter-clockwise.
+    """A texture on one part of the scene.
 
-    A part that the scene does not have is left out. Where the floor is worked on, it is the surface."""
+    Attributes:
+        part: where; a part that the scene does not have is left out. Where the floor is worked on, it is the surface.
+        texture: name in the sources of :mod:`pipeline.catalogue.textures`.
+        licence: as the texture's source states it.
+        sha256: of the texture.
+        quarter_turns: how often it is turned by 90 degrees, counter-clockwise.
+    """
 
     part: Part
     texture: str
@@ -80,8 +86,11 @@ class BackgroundPerturbation(RenderPerturbation):
     clearance: ClassVar[float] = 1.0
 
     def apply(self, model: mujoco.MjModel) -> None:
-        """Write the coverings into the model's textures; PipelineError when a texture is not there any more, or nothing
-        in the scene is known by its material."""
+        """Write the coverings into the model's textures.
+
+        Raises:
+            PipelineError: when a texture is not there any more, or nothing in the scene is known by its material.
+        """
         # By texture, as two parts may be one: the last then stands for both.
         skins = ((covering, skin_of(model, covering.part)) for covering in self.coverings)
         shown = {skin.texture: (covering, skin) for covering, skin in skins if skin}

@@ -85,8 +85,10 @@ class Perturbation(Frozen):
     per_task: ClassVar[bool] = False
 
     def distances(self, test: TestSet, task: Task) -> Floats:
-        """The distance to each of the axis's test tasks (N,), in their order, for an episode of ``task``. NaN where
-        there is nothing to compare, such as the wordings of another task."""
+        """The distance to each of the axis's test tasks (N,), in their order, for an episode of ``task``.
+
+        NaN where there is nothing to compare, such as the wordings of another task.
+        """
         distances = np.full(len(test.of(self.axis)), np.nan)
         if self.per_task:
             distances[_on_task(test, task, self.axis)] = self.distances_on_task(test, task)
@@ -131,12 +133,16 @@ class Axis(Frozen):
 
     def applies(self, task: Task) -> bool:
         """Whether the axis can change anything that ``task`` has; its episodes are spread over the tasks that it can.
-        What cannot be known before the scene is built is refused when the perturbation is applied."""
+
+        What cannot be known before the scene is built is refused when the perturbation is applied.
+        """
         return True
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> Perturbation:
-        """One draw for a task that the axis applies to; what is random comes from ``rng`` alone. ``place`` counts a
-        demonstration's draws, for axes that take the entries of a list in turn."""
+        """One draw for a task that the axis applies to; what is random comes from ``rng`` alone.
+
+        ``place`` counts a demonstration's draws, for axes that take the entries of a list in turn.
+        """
         raise NotImplementedError
 
     def draw_level(self, rng: np.random.Generator) -> Level:
@@ -236,9 +242,14 @@ class PhysicsPerturbation(Perturbation):
     layer: ClassVar[Layer] = Layer.PHYSICS
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The changed ``scene``, in which ``demo`` is replayed. ``roll_out`` gives the states that the demonstration's
-        actions lead to from a scene; it costs a whole replay. RefusedError when the change cannot be made here; its
-        reason is written into the manifest."""
+        """The changed ``scene``, in which ``demo`` is replayed.
+
+        Args:
+            roll_out: gives the states that the demonstration's actions lead to from a scene; costs a whole replay.
+
+        Raises:
+            RefusedError: when the change cannot be made here; its reason is written into the manifest.
+        """
         raise NotImplementedError
 
 

@@ -29,7 +29,10 @@ def moved_to(extrinsics: Floats, arena: Arena) -> CameraPerturbation | None:
     """The change of the agent view that leads to a pose; None where it was not moved.
 
     A roll, which no test camera has, is left out: the distance to a test camera is then the least that it can be.
-    ``extrinsics`` (4, 4) lead from the camera (z forward, y down) to the world.
+
+    Args:
+        extrinsics: (4, 4) from the camera (z forward, y down) to the world.
+        arena: whose own agent view the pose is compared with.
     """
     own_m, own_wxyz = (np.array(part) for part in AGENT_VIEWS[arena])
     offset_m, own_offset_m = extrinsics[:3, 3] - ORBIT_CENTRE_M, own_m - ORBIT_CENTRE_M

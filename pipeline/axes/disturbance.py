@@ -57,9 +57,12 @@ class DisturbancePerturbation(PhysicsPerturbation):
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the push; where it starts stays as it is.
 
-        Steps are counted in the demonstration without its no-ops, as it is replayed by default. RefusedError:
-        ``push_at_grasp`` when it is too near to where the gripper opens or closes, ``push_after_end`` when the
-        demonstration ends before it does."""
+        Steps are counted in the demonstration without its no-ops, as it is replayed by default.
+
+        Raises:
+            RefusedError: ``push_at_grasp`` when it is too near to where the gripper opens or closes,
+                ``push_after_end`` when the demonstration ends before it does.
+        """
         gripper = demo.actions[kept_actions(demo.actions, "drop"), 6]
         end = self.first_step + self.steps
         if end + self.away_steps > len(gripper):

@@ -109,7 +109,9 @@ class LanguageAxis(Axis):
         """Among objects that the layout axis adds: of the classes ``NAMED`` only.
 
         Names stay unambiguous there as far as the added objects are of categories that the scene does not have.
-        ValueError when none of ``classes`` is left.
+
+        Raises:
+            ValueError: when none of ``classes`` is left.
         """
         if not (classes := self._classes(axes)):
             raise ValueError(f"language with added objects needs {' or '.join(NAMED)} among axes.language.classes")
@@ -122,14 +124,21 @@ class LanguageAxis(Axis):
         """The rewrite at ``place`` of the task's list, which starts again once all were drawn.
 
         Independent draws would repeat, so neighbouring places are different wordings and ``rng`` is left alone.
-        PipelineError when the task has no rewrites, or one of them does not pass ``lint``.
+
+        Raises:
+            PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
         """
         rewrites = deal(task, self.classes, self.levels, self.bank)
         return rewrites[place % len(rewrites)]
 
     def wordings(self, task: Task, axes: Collection[str], test: TestSet) -> tuple[str, ...]:
         """All that it can draw for a task beside other axes, as far as it keeps clear of the benchmark's instructions.
-        None where no bank has any. PipelineError when one of them does not pass ``lint``."""
+
+        None where no bank has any.
+
+        Raises:
+            PipelineError: when one of them does not pass ``lint``.
+        """
         rewrites = _dealt(task, self._classes(axes), self.levels, self.bank)
         return tuple(one.text for one in rewrites if one.nearest(test, task).distance >= one.clearance)
 
@@ -141,7 +150,11 @@ def load_bank(file: Path = BANK_FILE) -> Bank:
 
 
 def read_bank(file: Path) -> Bank:
-    """A bank as stored; PipelineError when the file does not have the bank's form."""
+    """A bank as stored.
+
+    Raises:
+        PipelineError: when the file does not have the bank's form.
+    """
     try:
         return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), yaml.CSafeLoader) or {})
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
@@ -160,7 +173,10 @@ def deal(
     bank: Path | None = None,
 ) -> tuple[LanguagePerturbation, ...]:
     """All rewrites of a task in the order they are drawn: shuffled by task, one class after the other in turn.
-    PipelineError when there are none, or one of them does not pass ``lint``."""
+
+    Raises:
+        PipelineError: when there are none, or one of them does not pass ``lint``.
+    """
     if dealt := _dealt(task, classes, levels, bank):
         return dealt
     raise PipelineError(
@@ -250,8 +266,11 @@ def _test_wordings(test: TestSet, task: Task) -> tuple[NDArray[np.uint8], ...]:
 
 
 def lint(text: str, task: Task, component: Component) -> str | None:
-    """The reason why ``text`` cannot replace the task's instruction; None when it can. PipelineError when the task's
-    BDDL file cannot be read."""
+    """The reason why ``text`` cannot replace the task's instruction; None when it can.
+
+    Raises:
+        PipelineError: when the task's BDDL file cannot be read.
+    """
     words = len(text.split())
     words_and_marks = words + len(_MARK.findall(text))
     if words == 0:

@@ -208,9 +208,14 @@ class Demand(NamedTuple):
 
 
 def changed_goal(text: str, task: Task, hints: bool) -> str | None:
-    """What of the task's goal ``text`` does not keep; None when it keeps all that is checked. With ``hints``, things
-    may be described by what one knows of them, and a drawer by exclusion; else by name only. PipelineError when the
-    task's BDDL file cannot be read."""
+    """What of the task's goal ``text`` does not keep; None when it keeps all that is checked.
+
+    Args:
+        hints: whether things may be described by what one knows of them, and a drawer by exclusion; else by name only.
+
+    Raises:
+        PipelineError: when the task's BDDL file cannot be read.
+    """
     reading = Reading(text, read_goal(task.bddl_file).scene, hints)
     return next((demand.fault for demand in demands(task) if not demand.met(reading)), None)
 

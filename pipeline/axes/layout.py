@@ -23,7 +23,11 @@ SHELF = 13
 
 
 class AddedObject(Frozen):
-    """An object of ``pipeline.catalogue.objects``, by name and content, with its licence and who made it."""
+    """An object of ``pipeline.catalogue.objects``, by name and content.
+
+    Attributes:
+        licence, attribution: what it may be shown under and who made it, so that they go where the data goes.
+    """
 
     name: str
     category: str
@@ -37,9 +41,12 @@ class AddedObject(Frozen):
 
 
 class LayoutPerturbation(PhysicsPerturbation):
-    """Objects added to the scene, as many as the level.
+    """Objects added to the scene.
 
-    ``seed`` keys the places that are tried for them. Where they end is in the trajectory's ``resolved``."""
+    Attributes:
+        objects: which; as many as the level.
+        seed: keys the places that are tried for them. Where they end is in the trajectory's ``resolved``.
+    """
 
     axis: Literal["layout"] = "layout"
     component: Literal["objects"] = "objects"
@@ -58,8 +65,10 @@ class LayoutPerturbation(PhysicsPerturbation):
     per_task: ClassVar[bool] = True
 
     def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
-        """By category: infinite where a test task on this LIBERO task adds nothing of the same category. The rule is
-        stricter than a distance between positions: every position of a shared category counts as 0 m."""
+        """By category: infinite where a test task on this LIBERO task adds nothing of the same category.
+
+        The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
+        """
         return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")]
 
     def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:

@@ -191,9 +191,12 @@ class LightAxis(Axis):
 
 
 def exposure(frame: Frame) -> str | None:
-    """Why a clean frame (H, W, 3) shows too little to learn from, ``too_dark`` or ``blown_out``; None when it does not.
+    """Why a clean frame (H, W, 3) shows too little to learn from; None when it shows enough.
 
-    LIBERO's own first frames, both views in all arenas, have at most 11 % and 1 % of such pixels."""
+    ``too_dark`` when more than 60 % of its pixels have no channel above 10, ``blown_out`` when more than 25 % have
+    no channel below 250. LIBERO's own first frames, both views in all
+    arenas, have at most 11 % and 1 % of these.
+    """
     if (frame.max(axis=2) <= DARK_LEVEL).mean() > DARK_SHARE:
         return "too_dark"
     if (frame.min(axis=2) >= BRIGHT_LEVEL).mean() > BRIGHT_SHARE:

@@ -27,7 +27,10 @@ E = TypeVar("E", Motion, Gaussian, Zoom, Fog, Glass)
 class NoisePerturbation(PixelPerturbation):
     """One corruption at one strength for a whole episode.
 
-    ``effect`` is that of the axis's grid at ``level``; ``seed`` and the index of a frame key all that is drawn for it.
+    Attributes:
+        effect: the corruption and its parameters.
+        level: the row of the axis's grid that ``effect`` is.
+        seed: with the index of the frame, the key of everything drawn in :meth:`apply`.
     """
 
     axis: Literal["noise"] = "noise"
@@ -47,8 +50,13 @@ class NoisePerturbation(PixelPerturbation):
         return self
 
     def apply(self, frame: Frame, frame_index: int) -> Frame:
-        """A corrupted copy of a frame (H, W, 3) *before* its rotation by 180 degrees: there the benchmark corrupts, and
-        motion, fog and glass are not symmetric under that rotation. Each index in the episode has draws of its own."""
+        """A corrupted copy of one frame.
+
+        Args:
+            frame: (H, W, 3) RGB in the raw orientation of the simulator, *before* the rotation by 180 degrees:
+                there the benchmark corrupts, and motion, fog and glass are not symmetric under that rotation.
+            frame_index: place of the frame in its episode; each index has draws of its own.
+        """
         return self.effect.apply(frame, seeding.rng(self.seed, "noise", frame_index))
 
     def distances(self, test: TestSet, task: Task) -> Floats:

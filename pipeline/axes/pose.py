@@ -59,10 +59,13 @@ DRAWS = 200
 
 
 class PosePerturbation(PhysicsPerturbation):
-    """One object, by its name in the BDDL file, moved in the horizontal plane and turned on the spot.
+    """One object moved in the horizontal plane and turned on the spot.
 
-    Displacements are along the world's axes from where the demonstration has it, the turn is counter-clockwise about
-    the vertical through its origin."""
+    Attributes:
+        moved: the object's name in the BDDL file.
+        dx_m, dy_m: displacement along the world's axes from where the demonstration has it.
+        dyaw_deg: counter-clockwise turn about the vertical through its origin.
+    """
 
     axis: Literal["pose"] = "pose"
     component: Literal["target", "receptacle"]
@@ -77,8 +80,11 @@ class PosePerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "the norm of the difference between the displacements of the same object"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene with the object moved; its height and velocity and everything else stay as they are. RefusedError
-        as of ``pipeline.scenes.moving.move_one``."""
+        """The scene with the object moved; its height and velocity and everything else stay as they are.
+
+        Raises:
+            RefusedError: see ``pipeline.scenes.moving.move_one``.
+        """
         from pipeline.scenes.moving import move_one
 
         return move_one(scene, demo.task, self.moved, (self.dx_m, self.dy_m), self.dyaw_deg)
@@ -86,8 +92,10 @@ class PosePerturbation(PhysicsPerturbation):
     per_task: ClassVar[bool] = True
 
     def distances_on_task(self, test: TestSet, task: Task) -> Floats:
-        """Compared with the test tasks that move the same object, alone or with others. These move every other thing as
-        well, each its own way, so even at distance zero the scenes would differ."""
+        """Compared with the test tasks that move the same object, alone or with others.
+
+        These move every other thing as well, each its own way, so even at distance zero the scenes would differ.
+        """
         return self._apart_m(_test_moves_m(test, task, self.moved))
 
     def apart(self, others: Sequence[PosePerturbation]) -> Floats:
@@ -124,7 +132,9 @@ class Move(Frozen):
 class ScenePerturbation(PhysicsPerturbation):
     """Every object and fixture moved in the horizontal plane.
 
-    What stands on or in another thing has that one's move; ``moves`` has each thing by its name in the BDDL file."""
+    Attributes:
+        moves: of each thing by its name in the BDDL file. What stands on or in another thing has that one's move.
+    """
 
     axis: Literal["pose"] = "pose"
     component: Literal["scene"] = "scene"
@@ -139,8 +149,11 @@ class ScenePerturbation(PhysicsPerturbation):
     measure: ClassVar[str] = "the largest difference along an axis between the displacements of the same thing"
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
-        """The scene with everything moved; heights, rotations, velocities and joints stay as they are. RefusedError
-        as of ``pipeline.scenes.moving.move``."""
+        """The scene with everything moved; heights, rotations, velocities and joints stay as they are.
+
+        Raises:
+            RefusedError: see ``pipeline.scenes.moving.move``.
+        """
         from pipeline.scenes.moving import move
 
         return move(scene, demo.task, self.shifts)

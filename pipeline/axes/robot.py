@@ -36,7 +36,10 @@ class RobotPerturbation(PhysicsPerturbation):
 
     The offset is added to the same of the clean twin: ``initial_joints`` to the recorded start, which LIBERO's reset
     scattered by 0.02 to 0.10 rad about home, ``controller_posture`` to the posture of the reset. Only so is the change
-    as large as its level says, and no offset the clean twin. ``joint_offsets_rad``: base to wrist.
+    as large as its level says, and no offset the clean twin.
+
+    Attributes:
+        joint_offsets_rad: base to wrist.
     """
 
     axis: Literal["robot"] = "robot"
@@ -50,9 +53,12 @@ class RobotPerturbation(PhysicsPerturbation):
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
         """The scene with the arm turned and at rest, or with the controller's posture; all else stays as it is.
-        RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot is
-        put where it touches what it did not touch before, ``test_posture`` when recorded start and offset happen to add
-        up to a posture of the test set."""
+
+        Raises:
+            RefusedError: ``joint_limit`` when a joint comes too near its limit, ``robot_in_collision`` when the robot
+                is put where it touches what it did not touch before, ``test_posture`` when recorded start and offset
+                happen to add up to a posture of the test set.
+        """
         from pipeline.scenes.compiled import ARM, CompiledScene
 
         compiled = CompiledScene(scene)
@@ -90,7 +96,8 @@ class RobotPerturbation(PhysicsPerturbation):
         return self._apart_rad([other.joint_offsets_rad for other in others])
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
-        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450."""
+        """Compared with all 500 offsets of the benchmark, of which its robot tasks use 450; the arm is the same in all
+        tasks, so ``task`` does not matter."""
         compared = len(test.of("robot"))
         return Nearest(float(self._apart_rad(benchmark_offsets_rad()).min()) if compared else np.inf, compared)
 

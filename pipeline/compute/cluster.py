@@ -35,16 +35,24 @@ SOURCES = (".py", ".yaml", ".json", ".j2")
 
 @dataclass(frozen=True)
 class Workplace:
-    """Where a run works, and with what: absolute paths of the folder that it was started in and of a file that it wrote
-    for its workers to find, and what ``setup()`` is there."""
+    """Where a run works, and with what.
+
+    Attributes:
+        folder: absolute path of the folder that the run was started in, from which its relative paths start.
+        token: absolute path of a file that the run wrote for its workers to find.
+        setup: what ``setup()`` is there.
+    """
 
     folder: Path
     token: Path
     setup: Mapping[str, str]
 
     def enter(self) -> None:
-        """Make sure that this process may work for the run, and forget what it knows of earlier ones; PipelineError
-        when the run's folder is not here, or other code or packages are."""
+        """Make sure that this process may work for the run, and forget what it knows of earlier ones.
+
+        Raises:
+            PipelineError: when the run's folder is not here, or other code or packages are.
+        """
         global _entered
         if _entered == self:
             return
@@ -82,8 +90,10 @@ def in_place(fn: Callable[[Item], Result], workplace: Workplace, item: Item) -> 
 
 @cache
 def setup() -> dict[str, str]:
-    """What a result may depend on beside its input: versions of Python and the packages, code and machine code. A
-    process keeps the code that it imported first, so this is found out once and not again."""
+    """What a result may depend on beside its input: versions of Python and the packages, code and machine code.
+
+    A process keeps the code that it imported first, so this is found out once and not again.
+    """
     # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
@@ -102,7 +112,11 @@ def setup() -> dict[str, str]:
 def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
     """Check every worker that a Dask client has now; later ones are checked when they get their first work.
 
-    The run writes into ``folder``. PipelineError naming every worker that cannot work for this run, and why."""
+    The run writes into ``folder``.
+
+    Raises:
+        PipelineError: naming every worker that cannot work for this run, and why.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     token = folder.absolute() / f".cluster-{uuid4().hex}"
     workplace = Workplace(Path.cwd(), token, setup())

@@ -164,7 +164,14 @@ def _limited(fn: Expendable[Item, Result], item: Item) -> Result:
 
 @dataclass(frozen=True)
 class _Workers:
-    """Work on the workers of a cluster's client."""
+    """Work on a client's workers.
+
+    Attributes:
+        client: of the cluster.
+        workplace: what workers elsewhere have to have in common with the run.
+        refill: brings back workers that are missing.
+        patience_s: how long to wait for a worker where none is left.
+    """
 
     client: Any
     workplace: Workplace | None = None
@@ -234,7 +241,11 @@ class _Workers:
                 self.client.cancel([future for future in futures if future.key in numbers])
 
     def _next(self, done: Queue[Any]) -> Any:
-        """The next future that is done; PipelineError when nobody is left who could do one."""
+        """The next future that is done.
+
+        Raises:
+            PipelineError: when nobody is left who could do one.
+        """
         alone_s, last_came_s = 0, 0.0
         while True:
             try:

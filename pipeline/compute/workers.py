@@ -26,8 +26,13 @@ STARTS = 2
 def local_cluster(
     workers: int | None, opengl: Callable[[], Callable[[int], None]] | None
 ) -> Iterator[tuple[Any, Callable[[], None]]]:
-    """A client of so many workers, one for each core when left out, and what brings back those that died. ``opengl`` is
-    that of ``runner``. PipelineError when the workers end while they start."""
+    """A client of so many workers, one for each core when left out, and what brings back those that died.
+
+    ``opengl`` is that of ``runner``.
+
+    Raises:
+        PipelineError: when the workers end while they start.
+    """
     from dask.system import CPU_COUNT
     from distributed import Client
 
@@ -43,7 +48,8 @@ def local_cluster(
 
 
 def _started(workers: int) -> Any:
-    """Worker processes on this machine, started once more where one dies and Dask ends all, before all have started."""
+    """Worker processes on this machine. Where one of them dies before all have started, Dask ends them; they are
+    started once more."""
     from distributed import LocalCluster
 
     # An error reaches the user once, from here.
@@ -109,8 +115,14 @@ def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
     """A scheduler in this process and a job for each worker; when the block ends, so do the jobs.
 
     What a site needs beyond ``SlurmConfig``, such as the network interface, dask-jobqueue reads from its own file,
-    ``~/.config/dask/jobqueue.yaml``. The work writes into ``folder``, which the nodes must see too. PipelineError when
-    SLURM takes no job.
+    ``~/.config/dask/jobqueue.yaml``.
+
+    Args:
+        config: with ``cluster: slurm``.
+        folder: what the work writes into; the nodes must see it too.
+
+    Raises:
+        PipelineError: when SLURM takes no job.
     """
     from dask_jobqueue.slurm import SLURMCluster
 
@@ -140,8 +152,11 @@ def slurm_cluster(config: ComputeConfig, folder: Path) -> Iterator[Any]:
 
 
 def _try(script: str) -> None:
-    """Have SLURM look at a job without starting it: Dask would wait for ever for one that is refused. PipelineError in
-    SLURM's words."""
+    """Have SLURM look at a job without starting it: Dask would wait for ever for one that is refused.
+
+    Raises:
+        PipelineError: in SLURM's words.
+    """
     try:
         looked = subprocess.run(["sbatch", "--test-only"], input=script, capture_output=True, text=True, check=False)
         refusal = looked.stderr.strip() if looked.returncode else ""

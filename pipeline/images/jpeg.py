@@ -17,8 +17,10 @@ Pixels = TypeVar("Pixels", bound=np.integer)
 
 
 def to_policy(frame: NDArray[Pixels]) -> NDArray[Pixels]:
-    """Turn a raw LIBERO frame by 180 degrees, as OpenVLA trains and evaluates on it. This is the only place where
-    frames are turned. LIBERO's raw frames have their first row at the bottom."""
+    """Turn a raw LIBERO frame by 180 degrees, as OpenVLA trains and evaluates on it.
+
+    This is the only place where frames are turned. LIBERO's raw frames have their first row at the bottom.
+    """
     return np.asarray(cv2.flip(frame, -1), frame.dtype)
 
 

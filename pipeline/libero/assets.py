@@ -23,7 +23,11 @@ _ROBOSUITE, _LIBERO = "/robosuite/models/assets/", "/libero/libero/assets/"
 
 
 def package_folder(package: str) -> Path:
-    """The folder of an installed package; the package is not imported. PipelineError when it is not installed."""
+    """The folder of an installed package; the package is not imported.
+
+    Raises:
+        PipelineError: when it is not installed.
+    """
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         raise PipelineError(f"the package {package} is not installed", remedy=f"pip install {package}")
@@ -31,8 +35,10 @@ def package_folder(package: str) -> Path:
 
 
 def libero_folder() -> Path:
-    """The folder of LIBERO's definitions and initial states. LIBERO's own function for it takes a third of a second to
-    import, and follows a file in the user's home."""
+    """The folder of LIBERO's definitions and initial states.
+
+    LIBERO's own function for it takes a third of a second to import, and follows a file in the user's home.
+    """
     return package_folder("libero") / "libero"
 
 
@@ -45,14 +51,17 @@ def relocate(xml: str, where: str) -> str:
     """Make a recorded model loadable here, and safe to hand to MuJoCo, which reads whatever file a model names.
 
     Every ``file`` attribute ends up as the absolute path of an installed LIBERO or robosuite asset; the compiler's
-    folder attributes, which have no effect on absolute paths, are dropped, and masses are ``as_evaluated``. Every other
-    attribute keeps its text exactly. Only what was checked is written out again, so MuJoCo's parser cannot read the
-    document differently. PipelineError when it is not an MJCF document, names a file outside the two asset folders or
-    one that is not installed, or holds something that can reach other files (includes, plugins, entities).
+    folder attributes, which have no effect on absolute paths, are dropped, and masses are ``as_evaluated``. Every
+    other attribute keeps its text exactly. Only what was checked is written out again, so MuJoCo's parser cannot
+    read the document differently.
 
     Args:
         xml: MJCF as LIBERO records it in ``model_file``.
         where: what to call it in errors.
+
+    Raises:
+        PipelineError: when it is not an MJCF document, names a file outside the two asset folders or one that is
+            not installed, or holds something that can reach other files (includes, plugins, entities).
     """
 
     def refuse(
@@ -130,7 +139,11 @@ def name_of(path: str) -> str | None:
 
 @cache
 def installed(recorded: str) -> str:
-    """The installed asset that a recorded path, or a name, means; ValueError when there is none."""
+    """The installed asset that a recorded path, or a name, means.
+
+    Raises:
+        ValueError: when there is none.
+    """
     # Recordings hold harmless ".." such as scenes/../textures: resolve them first, so that none leads elsewhere later.
     path = posixpath.normpath(recorded)
     for marker, root in _roots().items():

@@ -99,7 +99,8 @@ class Bddl:
         return self.things_named(self.of_interest)
 
     def things_named(self, names: Iterable[str]) -> tuple[str, ...]:
-        """The ``things`` among some names; a region, such as a drawer, stands for the thing that it belongs to."""
+        """The ``things`` among some names. A region, such as a drawer of a cabinet or the burner of a stove, stands for
+        the thing that it belongs to."""
         named = [f"{name}_" for name in names]
         return tuple(thing for thing in self.things if any(name.startswith(f"{thing}_") for name in named))
 
@@ -112,7 +113,11 @@ class Bddl:
 
 @cache
 def read(path: Path) -> Bddl:
-    """Read a task's file, once a process; PipelineError when it cannot be read or does not define a task."""
+    """Read a task's file, once a process.
+
+    Raises:
+        PipelineError: when it cannot be read or does not define a task.
+    """
     try:
         return parse(path.read_text(), path)
     except (OSError, UnicodeDecodeError) as error:
@@ -120,7 +125,11 @@ def read(path: Path) -> Bddl:
 
 
 def parse(text: str, where: object) -> Bddl:
-    """Read a BDDL file's text; ``where`` is what an error names. PipelineError when it does not define a task."""
+    """Read a BDDL file's text; ``where`` is what an error names.
+
+    Raises:
+        PipelineError: when it does not define a task.
+    """
     expected = "a BDDL problem with :language, :objects, :init and :goal"
     try:
         _, (_, problem), *rest = scan_tokens(string=text)
@@ -143,7 +152,10 @@ def parse(text: str, where: object) -> Bddl:
 
 def heading(text: str, where: object) -> tuple[str, str]:
     """``problem`` and ``language`` of a BDDL file's text; of 10,030 test tasks, most need no more, and parsing is slow.
-    PipelineError when it has no problem or no instruction."""
+
+    Raises:
+        PipelineError: when it has no problem or no instruction.
+    """
     text = text.lower()
     problem, language = _PROBLEM.search(text), _LANGUAGE.search(text)
     if problem is None or language is None:
@@ -152,8 +164,13 @@ def heading(text: str, where: object) -> tuple[str, str]:
 
 
 def arena(problem: str) -> Arena:
-    """The arena of a scene's class, by its name in lower case, such as libero_kitchen_tabletop_manipulation
-    (LIBERO-Plus's names go on after that); PipelineError when the name has none."""
+    """The arena of a scene's class, by its name in lower case, such as libero_kitchen_tabletop_manipulation.
+
+    LIBERO-Plus's names go on after that.
+
+    Raises:
+        PipelineError: when the name has none.
+    """
     match = _ARENA.match(problem)
     if match is None:
         raise PipelineError(

@@ -30,7 +30,12 @@ HUMAN, EXPANDED = "human", "expanded"
 
 @dataclass(frozen=True)
 class DemoEntry:
-    """A demonstration in a source's index: what planning needs of it; ``steps`` are its actions, 20 a second."""
+    """A demonstration in a source's index: all that planning needs, without its arrays.
+
+    Attributes:
+        task, key, source, origin, sha256: as in ``Demo``.
+        steps: number of actions, 20 a second.
+    """
 
     task: Task
     key: str
@@ -49,7 +54,12 @@ class DemoEntry:
 
 
 class Problem(NamedTuple):
-    """What of a source cannot be used, a demonstration or ``<suite>/<task>`` for a whole file, and why."""
+    """Something in a source that cannot be used.
+
+    Attributes:
+        name: a demonstration's id, or ``<suite>/<task>`` when its whole file is unusable.
+        error: why, and what to do.
+    """
 
     name: str
     error: PipelineError
@@ -69,12 +79,18 @@ class DemoSource(Protocol):
         """The first ``per_task`` usable demonstrations of each task (all by default), and what was unusable."""
 
     def load(self, demo_id: str) -> Demo:
-        """One demonstration, by ``<suite>/<task>/<key>``; PipelineError when it is not there or cannot be used."""
+        """One demonstration, by ``<suite>/<task>/<key>``.
+
+        Raises:
+            PipelineError: when it is not there or cannot be used.
+        """
 
 
 class StarterSource:
-    """One human LIBERO demonstration for each of the 130 tasks, carried by the package ``robouse``. Actions are rounded
-    to six decimals; of the states only the first is there, and the scene's model is not."""
+    """One human LIBERO demonstration for each of the 130 tasks, carried by the package ``robouse``.
+
+    Actions are rounded to six decimals; of the states only the first is there, and the scene's model is not.
+    """
 
     def index(self, wanted: Iterable[Task], per_task: int | None = None) -> DemoIndex:
         del per_task  # There is one for each task, and a count is at least one.
@@ -113,8 +129,11 @@ class StarterSource:
 
 @dataclass(frozen=True)
 class HDF5Source:
-    """LIBERO's demonstrations as published: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file; ``root`` holds the
-    suites."""
+    """LIBERO's demonstrations as published: ``<root>/<suite>/<task>_demo.hdf5``, 50 in each file.
+
+    Attributes:
+        root: the folder that holds the suites.
+    """
 
     root: Path
 
@@ -231,7 +250,11 @@ class _Recorded(NamedTuple):
     model_file: str | None
 
     def checked(self, where: str) -> Demo:
-        """The demonstration; PipelineError when it cannot be used."""
+        """The demonstration.
+
+        Raises:
+            PipelineError: when it cannot be used.
+        """
         actions, states = self.actions, self.states
         fault = None
         if actions.ndim != 2 or actions.shape[1] != 7 or len(actions) == 0:

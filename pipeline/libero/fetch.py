@@ -21,12 +21,14 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
     """Download whole suites to ``<out>/<suite>/<task>_demo.hdf5``: 10 files of 0.3 to 1 GB for each suite of 10 tasks.
 
     A download that was cut short goes on where it stopped (since huggingface-hub 1 at the start of that file), and
-    files that are there are not fetched again. The revision is fixed. PipelineError for an unknown suite, and when the
-    hub could not be reached or lacks a file.
+    files that are there are not fetched again. The revision is fixed.
 
     Args:
         out: the folder to use as ``demos.root`` afterwards.
         endpoint: address of a mirror of the hub, when not the hub itself.
+
+    Raises:
+        PipelineError: for an unknown suite, and when the hub could not be reached or lacks a file.
     """
     wanted = [f"{task.suite}/{task.name}_demo.hdf5" for suite in suites for task in tasks(suite)]
     remedy = (

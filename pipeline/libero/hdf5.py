@@ -42,7 +42,11 @@ def _undamaged(where: str) -> Iterator[None]:
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """An HDF5 file, open for reading; PipelineError when it is missing or truncated."""
+    """An HDF5 file, open for reading.
+
+    Raises:
+        PipelineError: when it is missing or truncated.
+    """
     if not path.is_file():
         raise PipelineError("no such file", where=path, remedy="download it, or leave its task out of demos.tasks")
     with _undamaged(str(path)):
@@ -135,7 +139,9 @@ class Recording:
 
 def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
     """Write a task's demonstrations the way LIBERO publishes them, so that what can read its files can read this one.
-    The same recordings make the same bytes."""
+
+    The same recordings make the same bytes.
+    """
     bddl = task.bddl_file.read_text()
     (problem,), (language,) = (re.findall(rf"\({key}\s+([^()]+)\)", bddl) for key in ("problem", ":language"))
     bddl_file = f"libero/libero/bddl_files/{task.suite}/{task.name}.bddl"

@@ -52,10 +52,15 @@ BETWEEN = 0.25
 
 
 class Aim(NamedTuple):
-    """Where a kind of thing is to be, or is at first.
+    """Where something is to be, or is at first.
 
-    ``relation`` is ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the kind of place; both are
-    None where the ``part`` is enough: which of ``PARTS`` of the place, or which of several places of that kind."""
+    Attributes:
+        relation: ``on``, ``in``, ``next to``, ``between``, or of ``PARTS`` for a side of the place; None where the
+            part is enough.
+        thing: its kind.
+        place: kind of what it is put on, in, next to; None where the part is enough.
+        part: which of ``PARTS`` of the place, or which of several places of that kind.
+    """
 
     relation: str | None
     thing: str
@@ -92,7 +97,11 @@ class TaskGoal:
 
 @cache
 def read_goal(bddl_file: Path) -> TaskGoal:
-    """The goal of a task; PipelineError when the file cannot be read or does not define a task."""
+    """The goal of a task.
+
+    Raises:
+        PipelineError: when the file cannot be read or does not define a task.
+    """
     bddl = read(bddl_file)
     scene = _Scene(bddl)
     facts = [fact for fact in bddl.goal if fact not in bddl.start]

@@ -23,7 +23,11 @@ OWN = Path("tasks")
 
 
 def suites() -> tuple[str, ...]:
-    """LIBERO's suites, then those of one's own; PipelineError when one of one's own has a name that cannot be used."""
+    """LIBERO's suites, then those of one's own.
+
+    Raises:
+        PipelineError: when one of one's own has a name that cannot be used.
+    """
     own = sorted(folder.name for folder in OWN.glob("*") if any(folder.glob("*.bddl")))
     for name in own:
         # Datasets are called after the suite without libero_, some with val at the end, and OpenVLA-OFT takes
@@ -41,7 +45,10 @@ def suites() -> tuple[str, ...]:
 
 def tasks(suite: str) -> tuple[Task, ...]:
     """A suite's tasks, in the order of LIBERO's list; those of one's own by name, with the instruction of their file.
-    PipelineError when there is no such suite."""
+
+    Raises:
+        PipelineError: when there is no such suite.
+    """
     if suite in SUITES:
         return _listed(suite)
     if suite not in suites():
@@ -65,7 +72,11 @@ def _names() -> Any:
 
 
 def find_task(suite: str, name: str) -> Task:
-    """The task of that name; PipelineError when the suite has none, naming the closest."""
+    """The task of that name.
+
+    Raises:
+        PipelineError: when the suite has none, naming the closest.
+    """
     by_name = {task.name: task for task in tasks(suite)}
     if name not in by_name:
         closest = difflib.get_close_matches(name, by_name, cutoff=0)
@@ -74,8 +85,11 @@ def find_task(suite: str, name: str) -> Task:
 
 
 def select_tasks(patterns: Iterable[str]) -> list[Task]:
-    """The tasks whose ``<suite>/<task>`` matches any of the shell-style patterns, in LIBERO's order; PipelineError when
-    a pattern matches nothing."""
+    """The tasks whose ``<suite>/<task>`` matches any of the shell-style patterns, in LIBERO's order.
+
+    Raises:
+        PipelineError: when a pattern matches nothing.
+    """
     known = {f"{task.suite}/{task.name}": task for suite in suites() for task in tasks(suite)}
     chosen: set[str] = set()
     for pattern in patterns:

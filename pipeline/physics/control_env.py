@@ -49,8 +49,10 @@ def _set_macros() -> None:
 def until_placed(reset: Callable[[], Any], task: Task) -> Any:
     """Call LIBERO's reset, or its constructor, which resets too, until the random draws give every object a place.
 
-    LIBERO's own wrapper repeats a reset without end, whatever went wrong, and its constructor never. PipelineError
-    after ``PLACEMENT_TRIES``.
+    LIBERO's own wrapper repeats a reset without end, whatever went wrong, and its constructor never.
+
+    Raises:
+        PipelineError: after ``PLACEMENT_TRIES``.
     """
     from robosuite.utils.errors import RandomizationError
 

@@ -42,8 +42,11 @@ class UnusableSceneError(PipelineError):
 class Environment:
     """One task's environment; every ``restore`` forgets what happened before it.
 
-    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task. It may have another
-    ``floor_style`` and ``wall_style`` than the task's arena, or another file for it, by its absolute path.
+    Building one takes 1 to 3 s, so keep an environment for all demonstrations of its task.
+
+    Args:
+        scene_properties: ``floor_style`` and ``wall_style``, where they are not those of the task's arena.
+        scene_xml: absolute path of another file for the arena.
     """
 
     def __init__(self, task: Task, scene_properties: Mapping[str, str] | None = None, scene_xml: str | None = None):
@@ -105,8 +108,10 @@ class Environment:
     def restore(self, scene: Scene) -> None:
         """Put the environment where a scene starts; nothing from before has an effect on what follows.
 
-        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms. UnusableSceneError when MuJoCo or
-        LIBERO refuses the scene, or the state is not of its model.
+        A scene is compiled in 0.2 to 0.4 s; restoring the last one again takes 10 ms.
+
+        Raises:
+            UnusableSceneError: when MuJoCo or LIBERO refuses the scene, or the state is not of its model.
         """
         env = self._env.env
         if scene.model_xml != self._scene:
@@ -195,8 +200,11 @@ class Environment:
             raise UnusableSceneError("state_mismatch", what, self.task)
 
     def step(self, action: Floats) -> None:
-        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1]. RefusedError: ``simulation_unstable``
-        when the numbers grow beyond what can be computed with."""
+        """Run one control step (50 ms) with an OSC_POSE action (7,) in [-1, 1].
+
+        Raises:
+            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
+        """
         self._act_from_outside()
         try:
             self._control_step(action)

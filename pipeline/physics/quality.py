@@ -22,8 +22,11 @@ IDLE_M, IDLE_DEG = 0.0005, 0.25
 
 
 def measure(trajectory: Trajectory, task: Task) -> Quality:
-    """Measure a trajectory with at least one action; 0.3 ms a step, where the scene is compiled already. ValueError
-    when MuJoCo refuses the scene."""
+    """Measure a trajectory with at least one action; 0.3 ms a step, where the scene is compiled already.
+
+    Raises:
+        ValueError: when MuJoCo refuses the scene.
+    """
     scene = CompiledScene(trajectory.scene)
     model, data = scene.model, scene.data
     named = of_goal(bddl.read(task.bddl_file))

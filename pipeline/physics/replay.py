@@ -36,8 +36,12 @@ def replay(
     """Replay a demonstration from its first state, or a perturbed one, once that has settled, in the configured mode.
 
     A demonstration whose scene or state cannot be simulated makes a trajectory that is dropped, not an error.
-    ``reference`` gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
-    ``tracked``; the result says how its actions came about.
+
+    Args:
+        environment: of the demonstration's task.
+        perturbations: what to change before the first step.
+        reference: gives what tracking follows. Where it gives nothing, only open-loop replay is left, also in mode
+            ``tracked``; the result says how its actions came about.
     """
     try:
         scene, refused = _perturbed(environment, demo, config, perturbations)
@@ -66,8 +70,11 @@ def replay(
 def _execute(
     environment: Environment, scene: Scene, settle_steps: int, policy: Callable[[], Iterator[Floats]]
 ) -> tuple[Floats, Floats, NDArray[np.float32], Verdict]:
-    """Let a scene settle, and then take the actions that ``policy`` makes from there: states, actions, opacity of sites
-    and verdict, as in ``Trajectory``."""
+    """Let a scene settle, and then take the actions that ``policy`` makes from there.
+
+    Returns:
+        States, actions, opacity of sites and verdict, as in ``Trajectory``.
+    """
     environment.restore(scene)
     # What has no first look is dropped with the state that it was put in.
     states, alphas = [environment.state], [environment.site_alpha]
@@ -111,8 +118,12 @@ def _perturbed(
 
 
 def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
-    """Judge a replay by its states (K+1, S) and LIBERO's success check after each executed action (K,): the task's goal
-    must hold after the last one."""
+    """Judge a replay: the task's goal must hold after the last executed action.
+
+    Args:
+        states: (K+1, S) states before each executed action and after the last.
+        succeeded: (K,) LIBERO's success check after each executed action.
+    """
     if len(succeeded) < SCHEMA.min_steps:
         return Verdict(False, "too_short")
     if not np.isfinite(states).all():
@@ -123,15 +134,24 @@ def verdict(states: Floats, succeeded: NDArray[np.bool_]) -> Verdict:
 
 
 def roll_out(scene: Scene, demo: Demo, config: ReplayConfig = ReplayConfig()) -> Floats:  # noqa: B008 - frozen
-    """(K+1, S) states that the demonstration's actions lead through from ``scene``, once that has settled. ``config``:
-    how the replay that follows settles, and which actions it leaves out. RefusedError: ``simulation_unstable``."""
+    """(K+1, S) states that the demonstration's actions lead through from ``scene``, once that has settled.
+
+    Args:
+        config: how the replay that follows settles, and which actions it leaves out.
+
+    Raises:
+        RefusedError: ``simulation_unstable``.
+    """
     actions = demo.actions[kept_actions(demo.actions, config.noops)]
     return _states_from(scene, demo.task, actions, config)
 
 
 def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
-    """(S,) what the first frame of a replay shows: the state in which ``scene`` has settled. RefusedError:
-    ``simulation_unstable``."""
+    """(S,) what the first frame of a replay shows: the state in which ``scene`` has settled.
+
+    Raises:
+        RefusedError: ``simulation_unstable``.
+    """
     state: Floats = _states_from(scene, task, np.empty(0), config)[0]
     return state
 

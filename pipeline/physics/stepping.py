@@ -24,8 +24,10 @@ class ControlStep:
     comes first when a scene explodes, is part of ``mj_step2``. LIBERO's scenes are integrated by Euler's method.
 
     The controller is robosuite's own and computes the torques; only its ``update`` is replaced here. Observables,
-    rewards and buffers of recent values, which change no state, are left out. ``env``: LIBERO's environment (the one
-    inside ``ControlEnv``), restored; a later reset of it needs a new instance.
+    rewards and buffers of recent values, which change no state, are left out.
+
+    Args:
+        env: LIBERO's environment (the one inside ``ControlEnv``), restored; a later reset of it needs a new instance.
     """
 
     def __init__(self, env: Any):
@@ -49,7 +51,11 @@ class ControlStep:
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
 
     def __call__(self, action: Floats) -> None:
-        """Take the step. ``action``: (7,) OSC_POSE deltas and gripper; the controller clips the deltas to [-1, 1]."""
+        """Take the step.
+
+        Args:
+            action: (7,) OSC_POSE deltas and gripper; the controller clips the deltas to [-1, 1].
+        """
         for _ in self.substeps(action):
             pass
 

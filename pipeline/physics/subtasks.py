@@ -54,8 +54,13 @@ class _Deed(NamedTuple):
 
 
 def subtasks(trajectory: Trajectory, task: Task) -> tuple[Subtask, ...]:
-    """The subtasks of a trajectory, the first from step 0; none where it leaves alone what the goal names. Takes 0.3 ms
-    a step, where the scene is compiled already. ValueError when MuJoCo refuses the scene."""
+    """The subtasks of a trajectory, the first from step 0; none where it leaves alone what the goal names.
+
+    Takes 0.3 ms a step, where the scene is compiled already.
+
+    Raises:
+        ValueError: when MuJoCo refuses the scene.
+    """
     known, seen = bddl.read(task.bddl_file), _Seen(trajectory)
     found: list[Subtask] = []
     begin = 0

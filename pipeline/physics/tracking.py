@@ -60,8 +60,13 @@ Hand = tuple[Floats, Rotation]
 
 @dataclass(frozen=True)
 class Route:
-    """Where the hand should be before each action of a reference and after the last: positions (K+1, 3) and
-    rotations."""
+    """Where the hand should be before each action and after the last.
+
+    Attributes:
+        reference: the rollout.
+        positions_m: (K+1, 3).
+        rotations: K+1.
+    """
 
     reference: Reference
     positions_m: Floats
@@ -71,12 +76,17 @@ class Route:
     def through(cls, reference: Reference, hand: Hand, poses: Mapping[str, Floats]) -> Route:
         """Bend a reference to a scene.
 
-        An object's displacement (about the vertical and along it and across it) is followed from before the hand meets
-        it until it is carried off; then the route returns to the reference on the way to the goal. What objects are put
-        on or in, and what is opened, closed or turned, is followed from before the hand meets it until its last
-        contact. Where several are met at once, what the hand moves comes first, then what it meets for longest.
-        RefusedError: ``object_not_upright`` when an object was tilted, which no bend about the vertical follows. Things
-        and regions that are left out of ``poses`` (7,), those in the scene, have not moved.
+        An object's displacement (about the vertical and along it and across it) is followed from before the hand
+        meets it until it is carried off; then the route returns to the reference on the way to the goal. What objects
+        are put on or in, and what is opened, closed or turned, is followed from before the hand meets it until its
+        last contact. Where several are met at once, what the hand moves comes first, then what it meets for longest.
+
+        Args:
+            hand: where the hand starts.
+            poses: object, fixture or region to its pose (7,) in the scene; those that are left out have not moved.
+
+        Raises:
+            RefusedError: ``object_not_upright`` when an object was tilted, which no bend about the vertical follows.
         """
         positions, rotations = reference.positions_m, reference.rotations
         free: Floats = np.ones(len(reference) + 1)
@@ -143,8 +153,10 @@ def follow(route: Route, hand: Callable[[], Hand], pose: Callable[[str], Floats]
 
 
 def _grasp_offset(reference: Reference, step: int, hand: Hand, pose: Callable[[str], Floats], before: Floats) -> Floats:
-    """(3,) m from where a carried object is in the hand to where it was in the reference's, in the hand's frame. Zero
-    when nothing is carried; ``before`` while it is put down, because contacts then shift it in the hand."""
+    """(3,) m from where a carried object is in the hand to where it was in the reference's, in the hand's frame.
+
+    Zero when nothing is carried; ``before`` while it is put down, because contacts then shift it in the hand.
+    """
     held = [name for name, mask in reference.held.items() if mask[step]]
     carried = [name for name in held if reference.carried[name][step]]
     if not carried:

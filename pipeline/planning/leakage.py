@@ -46,8 +46,11 @@ class Compared:
 class Coverage:
     """How far the test tasks of one component are from the nearest episode, in the axis's measure.
 
-    ``compared`` are those that some episode could be compared with, none where the measure does not tell near from far;
-    90 % of their distances are at most ``p90``. Figures are None when none was compared."""
+    Attributes:
+        test_tasks: the benchmark's tasks of this component.
+        compared: those that some episode could be compared with; 0 where the measure does not tell near from far.
+        smallest, median, p90, largest: of their distances, 90 % are at most ``p90``; None when none was compared.
+    """
 
     test_tasks: int
     compared: int
@@ -63,9 +66,10 @@ class AxisDistance:
 
     Attributes:
         rows: planned episodes that the axis perturbs, reserves among them.
+        test_tasks: the benchmark's tasks of this axis.
         comparisons: pairs of an episode and a test task that were compared.
-        smallest, closest: the least distance of all, and its episode; None when there was nothing to compare with, or
-            nothing similar.
+        smallest: the least distance of all; None when there was nothing to compare with, or nothing similar.
+        closest: the episode it belongs to.
         clearance: the least distance that is allowed, of this episode's kind where the axis has several.
         measure: what the distance is and its unit; of each kind.
         overlaps: episodes that are closer than that.
@@ -172,8 +176,11 @@ def report(findings: dict[str, AxisDistance]) -> Group:
 
 
 def refuse_overlap(findings: dict[str, AxisDistance]) -> None:
-    """Stop a run that would train on test tasks; PipelineError when any episode overlaps, naming for each axis how many
-    and the closest."""
+    """Stop a run that would train on test tasks.
+
+    Raises:
+        PipelineError: when any episode overlaps, naming for each axis how many and the closest.
+    """
     faults = [
         f"{finding.overlaps} of {finding.rows} on the {axis} axis (such as {finding.closest}, distance "
         f"{finding.smallest:.3g}, clearance {finding.clearance:g})"

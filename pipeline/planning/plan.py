@@ -65,8 +65,10 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     """Draw the plan: a clean twin of every demonstration, then each axis's or combination's candidates, task by task.
 
     A draw that comes closer to one of the benchmark's ``test`` tasks than its axis allows is drawn anew. The benchmark
-    perturbs one axis at a time, but so must each part of a combination keep clear. PipelineError when there is nothing
-    to plan from, at all or for an axis.
+    perturbs one axis at a time, but so must each part of a combination keep clear.
+
+    Raises:
+        PipelineError: when there is nothing to plan from, at all or for an axis.
     """
     if not demos:
         raise PipelineError("no demonstrations to plan from", remedy="widen demos.tasks or check demos.root")
@@ -124,8 +126,14 @@ def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
 
 @dataclass(frozen=True)
 class Draws:
-    """What a plan draws from ``axes`` for its episodes of one axis or combination, called as in ``plan.episodes``;
-    draws keep clear of the benchmark's tasks."""
+    """What a plan draws for its episodes of one axis or combination.
+
+    Attributes:
+        name: of the axis or combination, as in ``plan.episodes``.
+        axes: what it draws from.
+        seed: of the plan.
+        test: the benchmark's tasks, of which draws keep clear.
+    """
 
     name: str
     axes: Sequence[Axis]
@@ -133,8 +141,11 @@ class Draws:
     test: TestSet
 
     def of(self, demo_id: str, task: Task) -> Iterator[tuple[Perturbation, ...]]:
-        """Draws for one demonstration, each one perturbation of each axis, variant after variant: all different, and
-        clear of the test set, until no different draw is left."""
+        """Draws for one demonstration, variant after variant: all different, and clear of the test set.
+
+        Yields:
+            One perturbation of each axis, until no different draw is left.
+        """
         first = int(rng(self.seed, self.name, demo_id).integers(2**31))
         drawn: set[tuple[str, ...]] = set()
         for variant in count():
@@ -211,7 +222,11 @@ def write(rows: Sequence[Row], path: Path) -> None:
 
 
 def read(path: Path) -> list[Row]:
-    """Read a plan back; PipelineError when it is missing, damaged or not a plan of this version."""
+    """Read a plan back.
+
+    Raises:
+        PipelineError: when it is missing, damaged or not a plan of this version.
+    """
     names = [column.name for column in fields(Row)]
     columns = read_table(path, names, "dvc repro plan").select(names).to_pydict()
     return [Row(*row) for row in zip(*columns.values(), strict=True)]
@@ -220,8 +235,10 @@ def read(path: Path) -> list[Row]:
 def pending(
     rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
 ) -> list[str]:
-    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given. Reserves come in
-    only where a candidate before them failed, so this is asked again until it is empty."""
+    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given.
+
+    Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
+    """
     found = _verdicts(rows, verdicts, rejected)
     return list(dict.fromkeys(row.trajectory_id for row, verdict in found if verdict is None))
 
@@ -229,8 +246,12 @@ def pending(
 def select(
     rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
 ) -> dict[str, Verdict]:
-    """What became of every row: kept, dropped with a reason, or a reserve that was not needed; by the verdicts of
-    trajectories, and the reasons why episodes' frames were rejected."""
+    """What became of every row: kept, dropped with a reason, or a reserve that was not needed.
+
+    Args:
+        verdicts: trajectory id to its verdict.
+        rejected: episode id to the reason why its frames were rejected.
+    """
     unknown = Verdict(False, "not_replayed")
     return {row.episode_id: verdict or unknown for row, verdict in _verdicts(rows, verdicts, rejected)}
 
@@ -238,8 +259,10 @@ def select(
 def _verdicts(
     rows: Iterable[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None
 ) -> Iterator[tuple[Row, Verdict | None]]:
-    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed. The twins,
-    and each axis or combination, have a quota for each task, which candidates fill in order of rank."""
+    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
+
+    The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
+    """
     quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
     for row in rows:
         quotas[row.axis, row.suite, row.task].append(row)

@@ -13,8 +13,12 @@ from pipeline.seeding import digest
 
 @dataclass(frozen=True)
 class Stream:
-    """One view, ``image`` or ``wrist_image``, under the perturbations that show in it: those of the render and pixel
-    layers, in the order in which they apply."""
+    """One view under the perturbations that show in it.
+
+    Attributes:
+        view: ``image`` or ``wrist_image``.
+        perturbations: render and pixel layers, in the order they apply.
+    """
 
     view: str
     perturbations: tuple[Perturbation, ...]

@@ -24,8 +24,12 @@ MOST_GEOMS = 1000
 
 
 class Surfaces(NamedTuple):
-    """What each pixel (H, W) shows, in the orientation of LIBERO's raw observations: its depth along the axis that the
-    camera looks along, and the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 for none."""
+    """What each pixel shows, in the orientation of LIBERO's raw observations.
+
+    Attributes:
+        depth_m: (H, W) float32, along the axis that the camera looks along.
+        number, kind: (H, W) the geom or site, by its number in the model and ``mujoco.mjtObj``; -1 for none.
+    """
 
     depth_m: NDArray[np.float32]
     number: NDArray[np.int32]
@@ -41,7 +45,12 @@ def texels(model: mujoco.MjModel, tex_data: NDArray[np.uint8] | None = None) -> 
 
 class PlainDrawing:
     """Renders all of a model by ``mjv_updateScene``, ``mjr_render`` and ``mjr_readPixels``, in a context of its own.
-    Close it before another is made. PipelineError when nothing renders on this machine."""
+
+    Close it before another is made.
+
+    Raises:
+        PipelineError: when nothing renders on this machine.
+    """
 
     def __init__(self, model: mujoco.MjModel):
         gl.prepare()
@@ -64,8 +73,10 @@ class PlainDrawing:
         self._option.geomgroup[0] = 0
 
     def adopt(self, model: mujoco.MjModel) -> bool:
-        """Go on with another model in the same OpenGL context, if that is possible; here it is not. If it returns
-        False, nothing has changed. If it raises, the drawing has to be closed."""
+        """Go on with another model in the same OpenGL context, if that is possible; here it is not.
+
+        If it returns False, nothing has changed. If it raises, the drawing has to be closed.
+        """
         return False
 
     def frame(self, data: mujoco.MjData, camera: str) -> Frame:

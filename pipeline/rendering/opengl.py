@@ -46,15 +46,20 @@ _DRIVER = "MUJOCO_GL=osmesa, which renders in software; and report this message 
 
 
 def calls() -> Any:
-    """PyOpenGL's functions and constants for the current context, which is one of MuJoCo's. A function raises
-    PipelineError where OpenGL reports an error of it."""
+    """PyOpenGL's functions and constants for the current context, which is one of MuJoCo's.
+
+    A function raises PipelineError where OpenGL reports an error of it.
+    """
     check(OTHERS)
     return _FUNCTIONS
 
 
 def check(call: str) -> None:
     """Look for errors after a call of MuJoCo's, or of ``OTHERS``; those in ``LEFT`` are logged, once a process.
-    PipelineError for any other, such as GL_OUT_OF_MEMORY."""
+
+    Raises:
+        PipelineError: for any other, such as GL_OUT_OF_MEMORY.
+    """
     # OpenGL keeps one error of each kind.
     for _ in ERRORS:
         # MuJoCo's glGetError; a third of what it takes through PyOpenGL.
@@ -73,8 +78,11 @@ def say_once(error: str, call: str) -> None:
 
 @contextmanager
 def making_context() -> Iterator[None]:
-    """Raise the OpenGL errors that MuJoCo only warns of while it makes a context; PipelineError when it reports any, or
-    makes none."""
+    """Raise the OpenGL errors that MuJoCo only warns of while it makes a context.
+
+    Raises:
+        PipelineError: when it reports any, or makes none.
+    """
     said: list[str] = []
     former = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(said.append)

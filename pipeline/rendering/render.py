@@ -77,8 +77,13 @@ def frames_of(
     """One frame (H, W, 3) uint8 RGB for each stream, turned by 180 degrees as policies see it.
 
     A view is rendered once: streams that differ in noise alone share its clean frame. Whoever renders many steps keeps
-    the scene perturbed meanwhile (``Renderer.perturbed``). ``streams`` are one at least, all with the same render
-    perturbations. Random noise depends on ``step``.
+    the scene perturbed meanwhile (``Renderer.perturbed``).
+
+    Args:
+        renderer: of the scene.
+        state, site_alpha: (S,) and (nsite,) as ``Renderer.restore`` takes them.
+        streams: one at least, all with the same render perturbations.
+        step: of the episode; random noise depends on it.
     """
     with renderer.perturbed(streams[0].changes):
         renderer.restore(state, site_alpha)

@@ -20,8 +20,12 @@ from pipeline.types import Frame, State
 
 
 class Renderer:
-    """Renders one scene, of its MJCF or a compiled model, which belongs to the renderer from then on; close it before
-    the next is made. ``drawing`` renders the model already; by default one is made."""
+    """Renders one scene; close it before the next is made.
+
+    Args:
+        scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
+        drawing: renders the model already; by default one is made.
+    """
 
     def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None):
         self.model = compiled(scene) if isinstance(scene, str) else scene
@@ -50,8 +54,10 @@ class Renderer:
 
     @contextmanager
     def perturbed(self, perturbations: Sequence[RenderPerturbation]) -> Iterator[None]:
-        """Apply render-layer perturbations to the model, and undo them at the end. Entered again inside itself with the
-        same perturbations, it does nothing."""
+        """Apply render-layer perturbations to the model, and undo them at the end.
+
+        Entered again inside itself with the same perturbations, it does nothing.
+        """
         if tuple(perturbations) == self._perturbations:
             yield
             return
@@ -92,8 +98,11 @@ class LastScene:
     def renderer(self, scene: str | mujoco.MjModel) -> Renderer:
         """The renderer of a scene, by its MJCF or by a compiled model, which must not change meanwhile.
 
-        It is no longer to be used when another scene was asked for. PipelineError when nothing renders on this machine.
-        ValueError when MuJoCo refuses the scene or one of its images.
+        It is no longer to be used when another scene was asked for.
+
+        Raises:
+            PipelineError: when nothing renders on this machine.
+            ValueError: when MuJoCo refuses the scene or one of its images.
         """
         same = scene is self._scene or (isinstance(scene, str) and scene == self._scene)
         if self._renderer is not None and same:

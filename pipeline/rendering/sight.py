@@ -26,8 +26,13 @@ MOST_OUTSIDE = 0.25
 
 @dataclass(frozen=True)
 class Sight:
-    """What is seen from one camera: the pixels that show each thing of the task, and each object that the layout axis
-    added; and the share of an episode's steps at which the hand is outside of the frame."""
+    """What is seen from one camera.
+
+    Attributes:
+        things_px: thing to the number of pixels that show it in the restored state.
+        hand_outside: share of an episode's steps at which the hand is outside of the frame.
+        added_px: the same as ``things_px`` for each object that the layout axis added.
+    """
 
     things_px: dict[str, int]
     hand_outside: float
@@ -35,8 +40,10 @@ class Sight:
 
     @classmethod
     def of(cls, renderer: Renderer, task: Task, hand_m: Floats) -> Sight:
-        """What the agent view sees in the restored state, of what LIBERO lists as of interest in the task. ``hand_m``
-        (T, 3) is where the grip site is at each step, in the world."""
+        """What the agent view sees in the restored state, of what LIBERO lists as of interest in the task.
+
+        ``hand_m`` (T, 3) is where the grip site is at each step, in the world.
+        """
         model, data = renderer.model, renderer.data
         seen = renderer.geoms(CAMERA)
         bodies = model.geom_bodyid[seen[seen >= 0]]
@@ -53,8 +60,10 @@ class Sight:
         )
 
     def faults(self, original: Sight) -> list[str]:
-        """Names of what a camera shows too little of; empty when it shows enough. Of the task's things and the hand, no
-        more is asked than the scene's own camera shows."""
+        """Names of what a camera shows too little of; empty when it shows enough.
+
+        Of the task's things and the hand, no more is asked than the scene's own camera shows.
+        """
         least_px = {thing: min(LEAST_PX, px) for thing, px in original.things_px.items()}
         faults = {
             "task_object_not_seen": any(px < least_px[thing] for thing, px in self.things_px.items()),

@@ -13,7 +13,11 @@ from pipeline.run.stage import locked
 
 
 class Part(NamedTuple):
-    """Files and folders of a run's folder that belong together; ``made_by`` names the stages that make them."""
+    """Files and folders of a run's folder that belong together.
+
+    Attributes:
+        made_by: the stages that make them, in words.
+    """
 
     names: tuple[str, ...]
     made_by: str
@@ -51,7 +55,11 @@ def found(data: Path, parts: Iterable[str]) -> dict[str, float]:
 
 
 def delete(data: Path, parts: Iterable[str]) -> None:
-    """Delete parts of a run's folder; PipelineError when a stage of the run is running."""
+    """Delete parts of a run's folder.
+
+    Raises:
+        PipelineError: when a stage of the run is running.
+    """
     with locked(data):
         for part in parts:
             for name in PARTS[part].names:

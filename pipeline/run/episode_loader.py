@@ -22,7 +22,11 @@ from pipeline.types import Episode, Extra, Subtask
 @dataclass(frozen=True)
 class EpisodeLoader:
     """Loads rendered episodes by id; small enough to send to a worker, which reads the plan once for itself.
-    ``rewrites`` has each episode's other wordings, where episodes come with them and with their subtasks."""
+
+    Attributes:
+        extras: ``outcome`` for failures.
+        rewrites: episode id to other wordings of its task, where episodes come with them and with their subtasks.
+    """
 
     data: Path
     config: RenderConfig

@@ -50,7 +50,12 @@ settles as they want."""
 
 @dataclass
 class Expansion:
-    """What came of it: candidates dropped by reason, and how many demonstrations no candidate was left for by task."""
+    """What came of it.
+
+    Attributes:
+        dropped: reason to number of candidates.
+        short: task to the number of demonstrations that no candidate was left for.
+    """
 
     files: list[Path] = field(default_factory=list)
     written: int = 0
@@ -59,12 +64,17 @@ class Expansion:
 
 
 def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: int, workers: Workers) -> Expansion:
-    """Make ``per_task`` demonstrations of each task from ``rows``, which ``candidates`` or ``resets`` drew for as many,
-    and write them to ``<out>/<suite>/<task>_demo.hdf5``.
+    """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
-    A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those before
-    it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was. PipelineError when a
-    demonstration cannot be read, or finished replays would be made anew unasked.
+    A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those
+    before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was.
+
+    Args:
+        demos: what the candidates are made from.
+        rows: what ``candidates`` or ``resets`` drew for as many demonstrations.
+
+    Raises:
+        PipelineError: when a demonstration cannot be read, or finished replays would be made anew unasked.
     """
     store = TrajectoryStore(out / ".replays")
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
@@ -163,8 +173,10 @@ def _motion(store: TrajectoryStore, trajectory_id: str, task: Task) -> _Motion:
 
 
 def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
-    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin. As in
-    LIBERO's files, states are those before each action and observations those after it."""
+    """A replay as LIBERO records demonstrations, without images and the maker's folders, and with its origin.
+
+    As in LIBERO's files, states are those before each action and observations those after it.
+    """
     compiled = CompiledScene(Scene(trajectory.model_xml, trajectory.states[0]))
     robot, state, joints = [], [], []
     for number, flattened in enumerate(trajectory.states):

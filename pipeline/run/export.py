@@ -36,8 +36,10 @@ AnyFormat = Format[Any]
 
 
 def export_run(kind: type[AnyFormat], config: Config) -> None:
-    """Bring a run's dataset of one format up to date, and say what was done. One that is not asked for is left as it
-    is: where there is none, its record is an empty one."""
+    """Bring a run's dataset of one format up to date, and say what was done.
+
+    One that is not asked for is left as it is: where there is none, its record is an empty one.
+    """
     options = config.export.formats.get(kind.name)
     if options is None:
         record = config.data / f"{kind.name}.json"
@@ -187,9 +189,14 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     """Write a dataset, replacing the one before, and go on where a killed call with the same episodes was.
 
     The bytes depend on the episodes, their order, the options and the format's packages alone: not on ``workers``, and
-    not on how often the work was interrupted. ``workers`` do the work, one call for each piece. PipelineError when an
-    episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that are whole stay in the work
-    folder.
+    not on how often the work was interrupted.
+
+    Args:
+        workers: do the work; one call for each piece.
+
+    Raises:
+        PipelineError: when an episode breaks the schema or the ids are unfit. The dataset before stays; the pieces that
+            are whole stay in the work folder.
     """
     pieces = target.pieces(episodes)
     work = target.work / identity(target, episodes)

@@ -33,8 +33,12 @@ SEEN = Path(__file__).parents[1] / "testset" / "seen.json"
 
 @dataclass(frozen=True)
 class Memory:
-    """What a stage's ``outputs``, files or folders of ``data``, were made from: ``made_by`` is the fingerprint of its
-    inputs and recipe, None where an input has changed since it was recorded."""
+    """What a stage's outputs were made from.
+
+    Attributes:
+        made_by: the fingerprint of its inputs and recipe; None where an input has changed since it was recorded.
+        outputs: files or folders of ``data``.
+    """
 
     data: Path
     stage: str

@@ -38,15 +38,20 @@ TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
 
 
 class Speed(NamedTuple):
-    """Seconds of one core for a control step, and for a frame of the trial's scene by the plain renderer."""
+    """How fast this machine is: seconds of one core for a control step, and for a frame of the trial's scene by the
+    plain renderer."""
 
     step_s: float
     frame_s: float
 
 
 class Trial(NamedTuple):
-    """Digests of ten control steps and of a frame of their end, with the device that rendered it; this machine's
-    speed."""
+    """What a trial came to.
+
+    Attributes:
+        digests: of ten control steps and of a frame of their end, and the device that rendered it.
+        speed: of this machine.
+    """
 
     digests: Mapping[str, str]
     speed: Speed
@@ -100,17 +105,23 @@ def known_speed(folder: Path) -> Speed | None:
 
 
 def record(folder: Path, trial: Mapping[str, str]) -> None:
-    """Write what is here, unless the run was begun where the trial came to something else; PipelineError as
-    ``refuse_another``."""
+    """Write what is here, unless the run was begun where the trial came to something else.
+
+    Raises:
+        PipelineError: as ``refuse_another``.
+    """
     refuse_another(folder, trial)
     here = {**made_with("encoding"), "OpenGL device": trial["OpenGL device"]}
     write_json(folder / FILE, {"made with": here, "trials": trials(folder) | _named(trial)})
 
 
 def refuse_another(folder: Path, trial: Mapping[str, str]) -> None:
-    """Compare a trial with those that are recorded; nothing is written. PipelineError when another machine with the
-    same versions and device came to something else, and files were made. They would count as current, so that the run
-    would be of two kinds."""
+    """Compare a trial with those that are recorded; nothing is written.
+
+    Raises:
+        PipelineError: when another machine with the same versions and device came to something else, and files were
+            made. They would count as current, so that the run would be of two kinds.
+    """
     recorded = trials(folder)
     for name, digest in _named(trial).items():
         stores = STORES[name.split(",")[0]]

@@ -53,8 +53,11 @@ class Result:
 
 
 class Settings(Frozen):
-    """What every episode of a run is made under, beside its own row: with both, it can be made again. ``source``:
-    ``starter`` or ``hdf5``; where its files lie differs from machine to machine."""
+    """What every episode of a run is made under, beside its own row: with both, it can be made again.
+
+    Attributes:
+        source: ``starter`` or ``hdf5``; where its files lie differs from machine to machine.
+    """
 
     source: Literal["starter", "hdf5"]
     replay: ReplayConfig
@@ -66,8 +69,11 @@ class Settings(Frozen):
 
 
 def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequence[pa.Field]) -> pa.Table:
-    """Join the plan with what became of it. ``places``: episode id to where it lies in the datasets, for every kept
-    episode."""
+    """Join the plan with what became of it.
+
+    Args:
+        places: episode id to where it lies in the datasets, for every kept episode.
+    """
     own_versions = {version_column(name): version for name, version in versions().items()}
     table = []
     for row in run.rows:
@@ -120,13 +126,20 @@ def write(table: pa.Table, path: Path, settings: Settings) -> None:
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """The rows of a manifest; PipelineError when it is missing, damaged or not a manifest of this version."""
+    """The rows of a manifest.
+
+    Raises:
+        PipelineError: when it is missing, damaged or not a manifest of this version.
+    """
     return list(read_table(path, schema().names, "dvc repro manifest").to_pylist())
 
 
 def settings(path: Path) -> Settings:
-    """What the episodes of a manifest were made under; PipelineError when the file does not say so, or has not the
-    columns of this version."""
+    """What the episodes of a manifest were made under.
+
+    Raises:
+        PipelineError: when the file does not say so, or has not the columns of this version.
+    """
     try:
         found = pq.read_schema(path)
         if lacking := set(schema().names) - set(found.names):

@@ -30,8 +30,14 @@ yields in docs/axes.md."""
 
 @dataclass(frozen=True)
 class Outcome:
-    """The plan, and what replay and rendering made of it: by trajectory its row in the table of replays and what is
-    stored of its frames, and by episode its verdict. ``missed`` are the ids of the failures to write, if asked for."""
+    """The plan, and what replay and rendering made of it.
+
+    Attributes:
+        trajectories: trajectory id to its row in the table of replays.
+        frames: trajectory id to what is stored of its frames.
+        verdicts: episode id to verdict.
+        missed: ids of the failures to write, in the order of the plan; none unless they are asked for.
+    """
 
     rows: Sequence[plan.Row]
     trajectories: Mapping[str, Mapping[str, Any]]
@@ -67,8 +73,14 @@ def replayed(
     rejected: Mapping[str, str] | None = None,
     limits: FilterConfig = FilterConfig(),  # noqa: B008 - frozen
 ) -> dict[str, dict[str, Any]]:
-    """Trajectory id to its row in the table of replays. ``rejected``: episode id to the reason why its frames were
-    rejected. PipelineError when a trajectory that the plan needs is not there, or can no longer be read."""
+    """Trajectory id to its row in the table of replays.
+
+    Args:
+        rejected: episode id to the reason why its frames were rejected.
+
+    Raises:
+        PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
+    """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
     needed = plan.pending(rows, verdicts_of(trajectories, limits), rejected)
@@ -78,8 +90,11 @@ def replayed(
 
 
 def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[str, str]:
-    """Episode id to the reason why one of its streams was not rendered, where that is so. ``frames``: trajectory id to
-    what is stored of its frames."""
+    """Episode id to the reason why one of its streams was not rendered, where that is so.
+
+    Args:
+        frames: trajectory id to what is stored of its frames.
+    """
     reasons: dict[str, str] = {}
     for row in rows:
         if (shown := frames.get(row.trajectory_id)) and shown.rejected:
@@ -90,8 +105,11 @@ def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[st
 
 
 def read(config: Config) -> Outcome:
-    """What became of every row of a run, after the render stage, and what of it ``export.where`` leaves out;
-    PipelineError when a trajectory or a frame that the plan needs is not there, or can no longer be read."""
+    """What became of every row of a run, after the render stage, and what of it ``export.where`` leaves out.
+
+    Raises:
+        PipelineError: when a trajectory or a frame that the plan needs is not there, or can no longer be read.
+    """
     rows = plan.read(config.data / "plan.parquet")
     store = FrameStore(config.data / "frames", config.render)
     frames = shown_of(store.rows())
@@ -136,8 +154,10 @@ def outdated(rows: Sequence[plan.Row], config: Config, device: str | None = None
 
     Counted are finished files of today's plan, with today's settings, that were made with other recipes, packages,
     machine code or another OpenGL device: see ``identity.refuse_unasked``. A changed configuration or plan wants new
-    files, and nobody is asked. ``device``: what renders here, as OpenGL names it; without it, frames of any device
-    count as finished.
+    files, and nobody is asked.
+
+    Args:
+        device: what renders here, as OpenGL names it; without it, frames of any device count as finished.
     """
     planned = dict.fromkeys(row.trajectory_id for row in rows)
     found: Counter[str] = Counter()

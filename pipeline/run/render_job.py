@@ -25,8 +25,12 @@ from pipeline.types import Rendered, Trajectory
 
 @dataclass(frozen=True)
 class RenderJob:
-    """Streams of the trajectory of a row to render into one file, as they are sent to a worker; ``device`` renders the
-    run, as OpenGL names it."""
+    """Streams of one trajectory to render into one file, as they are sent to a worker.
+
+    Attributes:
+        row: a row of the plan that has this trajectory.
+        device: what renders the run, as OpenGL names it.
+    """
 
     row: Row
     streams: tuple[Stream, ...]
@@ -37,7 +41,10 @@ class RenderJob:
 
     def __call__(self) -> None:
         """Store the streams in one file: those that other files of the trajectory hold are copied, others rendered.
-        PipelineError when another device renders here: its pixels differ, and the run would never use them."""
+
+        Raises:
+            PipelineError: when another device renders here: its pixels differ, and the run would never use them.
+        """
         device = gl.choose().device
         if device != self.device:
             raise PipelineError(
@@ -63,8 +70,10 @@ class RenderJob:
         return 1800.0 + 2.0 * self.frames_at_most()
 
     def lost(self) -> None:
-        """Store that no worker survived the streams, unless one stored them before it was lost. They are not tried
-        again while the file is there."""
+        """Store that no worker survived the streams, unless one stored them before it was lost.
+
+        They are not tried again while the file is there.
+        """
         trajectory = self._trajectory()
         action, steps = trajectory.actions.astype(np.float32), len(trajectory.actions)
         state, joint_state = np.zeros((steps, 8), np.float32), np.zeros((steps, 7), np.float32)

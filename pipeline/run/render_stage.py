@@ -33,9 +33,12 @@ Portion = tuple[Row, tuple[Stream, ...]]
 def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tuple[Stream, ...]]:
     """The needed streams of a trajectory, in portions of ``STREAMS_OF_A_JOB`` at most, each to be one file.
 
-    All ``planned`` ones, those of reserves too, are cut, and then those left out that are not needed. So a portion does
-    not change when a stream of another one is rejected and a reserve takes its place. Streams that share a scene are
-    beside each other.
+    All planned ones are cut, and then those left out that are not needed. So a portion does not change when a stream
+    of another one is rejected and a reserve takes its place. Streams that share a scene are beside each other.
+
+    Args:
+        planned: stream id to each stream that an episode of the plan shows, reserves included.
+        needed: ids of those that are to be rendered.
     """
     ordered = sorted(planned.items(), key=lambda item: (item[1].scene(textures=False), item[1].scene(), item[0]))
     cut = [int(end) for end in np.linspace(0, len(ordered), math.ceil(len(ordered) / STREAMS_OF_A_JOB) + 1)]
@@ -44,11 +47,16 @@ def portions(planned: Mapping[str, Stream], needed: Collection[str]) -> list[tup
 
 
 def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder: Path, workers: Workers) -> set[str]:
-    """Render the streams of every kept episode, and of failures where asked for, that ``folder`` does not hold yet; the
-    files that the plan needs, the same ones whatever was rendered before.
+    """Render the streams of every kept episode, and of failures where asked for, that ``folder`` does not hold yet.
 
     Where frames are rejected, reserves take the place of their episodes, so this goes on until nothing is missing that
-    can be made from the trajectories that are there. PipelineError when rendering leaves the same work undone.
+    can be made from the trajectories that are there.
+
+    Returns:
+        The files of ``folder`` that the plan needs: the same ones whatever was rendered before.
+
+    Raises:
+        PipelineError: when rendering leaves the same work undone.
     """
     device = gl.choose().device
     store = FrameStore(folder, config.render)
@@ -86,8 +94,13 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
 def _needed(
     rows: Sequence[Row], judged: Mapping[str, Verdict], rejected: Mapping[str, str], failures: Collection[str]
 ) -> dict[str, Portion]:
-    """Name of each file that the plan needs to what is in it, as far as the trajectories' verdicts and the episodes'
-    rejections are known; what was dropped for a reason of ``failures`` is rendered too."""
+    """Name of each file that the plan needs to what is in it, as far as verdicts and rejections are known.
+
+    Args:
+        judged: trajectory id to its verdict.
+        rejected: episode id to the reason why its frames were rejected.
+        failures: reasons of dropped episodes that are rendered too.
+    """
     row_of = {row.trajectory_id: row for row in rows}
     planned: dict[str, dict[str, Stream]] = {trajectory_id: {} for trajectory_id in row_of}
     needed: dict[str, set[str]] = {}

@@ -25,8 +25,12 @@ from pipeline.types import Demo, Scene, Trajectory, Verdict
 
 @dataclass(frozen=True)
 class ReplayJob:
-    """The replay of a row's trajectory, as it is sent to a worker; tracking follows the trajectory ``twin``, that of
-    the same demonstration without perturbations."""
+    """One trajectory's replay, as it is sent to a worker.
+
+    Attributes:
+        row: a row of the plan that has this trajectory.
+        twin: trajectory of the same demonstration without perturbations, which tracking follows.
+    """
 
     row: Row
     twin: str
@@ -35,8 +39,11 @@ class ReplayJob:
     folder: Path
 
     def __call__(self) -> Verdict:
-        """Replay, judge and store; returns the verdict. PipelineError when the demonstration is not there, or another
-        than the plan was drawn for."""
+        """Replay, judge and store; returns the verdict.
+
+        Raises:
+            PipelineError: when the demonstration is not there, or another than the plan was drawn for.
+        """
         demo = self.demos.open().load(self.row.demo_id)
         if demo.sha256 != self.row.demo_sha256:
             raise PipelineError(

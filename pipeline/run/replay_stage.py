@@ -17,7 +17,11 @@ NO_LIMITS = FilterConfig()
 
 @dataclass(frozen=True)
 class Replays:
-    """How the trajectories of a run are made. ``limits``: the section ``filter``."""
+    """How the trajectories of a run are made.
+
+    Attributes:
+        limits: the section ``filter``.
+    """
 
     demos: DemosConfig
     config: ReplayConfig
@@ -28,8 +32,13 @@ class Replays:
     def of(self, rows: Sequence[Row], rejected: Mapping[str, str] | None = None) -> dict[str, Verdict]:
         """Have what a plan needs in the store; reserves only where a candidate failed.
 
-        The twins come first, because tracking follows them. ``rejected``: episode id to the reason why its frames were
-        rejected, as far as frames were made. Returns the verdict of every trajectory that was needed, by its id.
+        The twins come first, because tracking follows them.
+
+        Args:
+            rejected: episode id to the reason why its frames were rejected, as far as frames were made.
+
+        Returns:
+            Trajectory id to verdict, for every trajectory that was needed.
         """
         store = TrajectoryStore(self.folder)
         stored = verdicts_of(store.refresh(), self.limits)

@@ -25,8 +25,11 @@ HEADER = """\
 
 
 def run(file: Path) -> int:
-    """Run all stages that have something to do; the exit status. PipelineError when DVC would not find the
-    configuration."""
+    """Run all stages that have something to do; the exit status.
+
+    Raises:
+        PipelineError: when DVC would not find the configuration.
+    """
     config = load(file)
     _refuse_elsewhere(file, config)
     choose(config)
@@ -77,8 +80,10 @@ def _refuse_elsewhere(file: Path, config: Config) -> None:
 
 
 def _mend() -> None:
-    """DVC writes two lock files in place, and refuses to start where it was killed meanwhile. What is finished, a run
-    knows by itself."""
+    """DVC writes two lock files in place, and refuses to start where it was killed meanwhile.
+
+    What is finished, a run knows by itself.
+    """
     if subprocess.run([*DVC, "stage", "list"], capture_output=True, check=False).returncode:
         remove(Path("dvc.lock"))
     running = Path(".dvc/tmp/rwlock")

@@ -51,7 +51,10 @@ def claimed(file: Path) -> Config:
     """Load a configuration that is about to be run; a run's folder that is new belongs to it from now on.
 
     A stage deletes what its plan does not name, so two configurations must never share a folder. The same file may
-    change as it likes. PipelineError when the configuration is not valid, or the folder belongs to another file.
+    change as it likes.
+
+    Raises:
+        PipelineError: when the configuration is not valid, or the folder belongs to another file.
     """
     config = load(file)
     _refuse_other_folder(config, file)
@@ -70,8 +73,10 @@ def claimed(file: Path) -> Config:
 def locked(folder: Path) -> Iterator[None]:
     """Keep other stages out of a run's folder, and clear what killed ones left in it.
 
-    The system ends the lock with this process, however it ends. PipelineError when a stage runs there, or nothing can
-    say whether one does.
+    The system ends the lock with this process, however it ends.
+
+    Raises:
+        PipelineError: when a stage runs there.
     """
     with (folder / LOCK).open("a") as file:
         try:
@@ -95,7 +100,11 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def owned(file: Path) -> Config:
-    """Load a configuration whose finished run is to be read; nothing is written. PipelineError as ``claimed``."""
+    """Load a configuration whose finished run is to be read; nothing is written.
+
+    Raises:
+        PipelineError: as ``claimed``.
+    """
     config = load(file)
     if (config.data / OWNER).exists():
         _refuse_foreign(config, file)

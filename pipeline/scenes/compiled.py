@@ -22,8 +22,10 @@ FINGERS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
 def compiled(model_xml: str) -> mujoco.MjModel:
     """A scene's model, images included.
 
-    Compiled in 0.6 s, and in 2 to 3 by a process that has not read its files before. ValueError when MuJoCo refuses the
-    scene.
+    Compiled in 0.6 s, and in 2 to 3 by a process that has not read its files before.
+
+    Raises:
+        ValueError: when MuJoCo refuses the scene.
     """
     model = mujoco.MjModel.from_xml_string(model_xml)
     # MuJoCo keeps what it read last, images included, until it reads something else: 300 MB.
@@ -36,7 +38,9 @@ def physics_to_read(model_xml: str) -> mujoco.MjModel:
     """A scene's model, with plain colours for images: nothing is rendered with it, and images are half of the work.
 
     The same for all who ask, and not to be written into: compiling takes 0.2 to 0.4 s, a copy 0.05 s and 100 MB.
-    ValueError when MuJoCo refuses the scene.
+
+    Raises:
+        ValueError: when MuJoCo refuses the scene.
     """
     scene = ET.fromstring(model_xml)
     for texture in scene.iterfind("asset/texture[@name][@file]"):

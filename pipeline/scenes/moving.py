@@ -36,7 +36,10 @@ def move_one(scene: Scene, task: Task, name: str, shift_m: tuple[float, float], 
     """The scene with an object moved in the horizontal plane and turned about the vertical through its origin.
 
     The recorded and the moved object are both watched for ``SETTLE_S`` while everything else is held: they must come to
-    rest on the same things, after as little motion. RefusedError as ``move``.
+    rest on the same things, after as little motion.
+
+    Raises:
+        RefusedError: as ``move``.
     """
     before = CompiledScene(scene)
     moved = replace(scene, state=scene.state.copy())
@@ -55,9 +58,12 @@ def move(scene: Scene, task: Task, moves: Moves) -> Scene:
 
     A region of the working surface that the goal names moves with the thing that it is named after, so that the front
     of the stove stays in front of the stove. The recorded and the moved scene are both watched for ``SETTLE_S`` while
-    the robot and the fixtures' joints are held. RefusedError: ``relation_broken`` when something leaves what it stands
-    on or in, or a target the place that the instruction names; ``object_in_collision`` when things touch that did not;
-    ``object_unstable`` when an object slides or tilts more than the recorded one.
+    the robot and the fixtures' joints are held.
+
+    Raises:
+        RefusedError: ``relation_broken`` when something leaves what it stands on or in, or a target the place that the
+            instruction names; ``object_in_collision`` when things touch that did not; ``object_unstable`` when an
+            object slides or tilts more than the recorded one.
     """
     known = bddl.read(task.bddl_file)
     before = CompiledScene(scene)
@@ -97,8 +103,12 @@ def _refuse_relations(task: Task, scene: CompiledScene) -> None:
 
 
 class _Settled(NamedTuple):
-    """How a scene came to rest: gaps between bodies that touched at the start and at rest (deepest, negative), and how
-    far objects that were free to move went (N,)."""
+    """How a scene came to rest: gaps in m of what touched at the start and at rest, and how far objects went.
+
+    Attributes:
+        started, rested: pairs of bodies to the gap between them, deepest, negative.
+        slid_m, tilted_deg: (N,) of each object that was free to move.
+    """
 
     started: Mapping[tuple[int, int], float]
     rested: Mapping[tuple[int, int], float]

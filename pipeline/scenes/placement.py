@@ -43,9 +43,14 @@ def place(scene: Scene, demo: Demo, objects: Sequence[ObjectModel], seed: int, r
 
     Everything that was in the scene keeps its recorded state exactly, and the gripper and the controller what they were
     at. The objects' joints come last: the state is time, the old qpos, the new qpos (7 each), the old qvel, the new
-    qvel (6 each). RefusedError when no place was found; the reason is the one that most places were refused for.
+    qvel (6 each).
 
-    ``seed`` keys the places that are tried.
+    Args:
+        seed: keys the places that are tried.
+        roll_out: gives the states that the demonstration's actions lead through when nothing is added.
+
+    Raises:
+        RefusedError: when no place was found; the reason is the one that most places were refused for.
     """
     placement = _Placement(scene, roll_out(scene, demo), objects, bddl.read(demo.task.bddl_file))
     rejected: Counter[str] = Counter()

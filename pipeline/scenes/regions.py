@@ -16,7 +16,11 @@ from pipeline.types import Floats
 
 
 class Region(NamedTuple):
-    """A rectangle of the working surface, by its bounds in the world; x points from the robot to the camera."""
+    """A rectangle of the working surface.
+
+    Attributes:
+        x_m, y_m: bounds in the world; x points from the robot to the camera.
+    """
 
     x_m: tuple[float, float]
     y_m: tuple[float, float]
@@ -27,7 +31,13 @@ class Region(NamedTuple):
 
 
 class Regions(NamedTuple):
-    """The regions of an arena: in front, on the camera's side, and beside and behind what the task is about."""
+    """The regions of an arena.
+
+    Attributes:
+        front: on the camera's side.
+        back: beside and behind what the task is about.
+        front_share: how often an object is put in front.
+    """
 
     front: Region
     back: Region

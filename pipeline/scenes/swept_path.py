@@ -18,8 +18,11 @@ _RAY_GROUP = 5
 class SweptPath:
     """A copy of a model whose only contacts are those not allowed: of an added object with anything but a surface.
 
-    The objects' geoms are ``added`` (ngeom,), their joints the model's last; ``path`` (K+1, nq) has the positions of
-    all other joints along the demonstration."""
+    Args:
+        model: the scene with the objects; their joints are its last.
+        added: (ngeom,) which geoms are the objects'.
+        path: (K+1, nq) positions of all other joints along the demonstration.
+    """
 
     def __init__(self, model: mujoco.MjModel, added: NDArray[np.bool_], path: Floats):
         self._model, self._added, self._path = copy.copy(model), added, path

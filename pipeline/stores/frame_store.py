@@ -31,8 +31,13 @@ _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
 
 @dataclass(frozen=True)
 class Shown:
-    """What is stored of one trajectory's frames, in all its files: ids of the streams that were rendered, and of others
-    the reason why they were not."""
+    """What is stored of one trajectory's frames, in all its files.
+
+    Attributes:
+        made_by, device, replay_mode: as in the table.
+        streams: ids of those that were rendered.
+        rejected: stream id to the reason why it was not.
+    """
 
     made_by: str
     device: str
@@ -42,11 +47,14 @@ class Shown:
 
 
 class FrameStore(Store):
-    """Frames under one folder, in files ``<trajectory id>/<digest of its streams>``.
+    """Frames under one folder.
 
-    Of its table, ``device`` is what rendered, as OpenGL names it, ``streams`` are the ids of those that were rendered,
-    and ``rejected`` is JSON, of others the reason why not. What was encoded otherwise than ``config`` says counts as
-    missing."""
+    The columns of its table are ``device`` (what rendered, as OpenGL names it), ``replay_mode``, ``steps``, ``streams``
+    (ids of those that were rendered) and ``rejected`` (JSON, stream id to the reason why it was not). A file's name is
+    ``<trajectory id>/<digest of its streams>``.
+
+    What was encoded otherwise than ``config`` says counts as missing.
+    """
 
     step, stage, pattern = "encoding", "render", "*/*.h5"
     columns: ClassVar = {
@@ -95,8 +103,15 @@ class FrameStore(Store):
                 file["object_poses"] = rendered.object_poses
 
     def load(self, trajectory_id: str, streams: Collection[str], geometry: Collection[str] = ()) -> Rendered:
-        """Read the named streams of a trajectory, one at least, and some of its geometry by their ids; PipelineError
-        when a file is damaged, or one of them is not there."""
+        """Read the named streams of a trajectory.
+
+        Args:
+            streams: ids of streams, one at least.
+            geometry: ids of the geometry to read with them.
+
+        Raises:
+            PipelineError: when a file is damaged, or one of the streams or its geometry is not there.
+        """
         frames, views = set(streams), set(geometry)
         parts: list[Rendered] = []
         for name in self._files_of(trajectory_id):
@@ -116,8 +131,12 @@ class FrameStore(Store):
         return merged(parts)
 
     def stored(self, trajectory_id: str, streams: Mapping[str, str], device: str) -> list[Rendered]:
-        """What files hold of the named streams of a trajectory (each with its geometry's id) that ``device`` rendered,
-        each stream once; a damaged file counts as missing."""
+        """What files hold of the named streams of a trajectory, each stream once; a damaged file counts as missing.
+
+        Args:
+            streams: id of a stream to the id of its geometry.
+            device: which must have rendered them.
+        """
         parts: list[Rendered] = []
         missing = set(streams)
         for name in self._files_of(trajectory_id):
@@ -146,8 +165,11 @@ class FrameStore(Store):
         return reasons
 
     def motion(self, trajectory_id: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Action (K, 7) and state (K, 8) of a trajectory, without its frames; PipelineError when a file is damaged, or
-        none is there."""
+        """Action (K, 7) and state (K, 8) of a trajectory, without its frames.
+
+        Raises:
+            PipelineError: when a file is damaged, or none is there.
+        """
         for name in self._files_of(trajectory_id):
             with self.opened(name) as file:
                 if file.groups("streams"):

@@ -54,8 +54,14 @@ def _reading() -> Iterator[None]:
 
 
 class SealedFile:
-    """A file that is open for reading. ``attributes``: what the file says beside its arrays. BrokenSealError when its
-    attributes, or the list of its arrays, are not what was written."""
+    """A file that is open for reading.
+
+    Attributes:
+        attributes: what the file says beside its arrays.
+
+    Raises:
+        BrokenSealError: when its attributes, or the list of its arrays, are not what was written.
+    """
 
     def __init__(self, file: h5py.File):
         self._file = file
@@ -94,8 +100,12 @@ class SealedFile:
 
 @contextmanager
 def unsealed(path: Path) -> Iterator[SealedFile]:
-    """A file that ``sealed`` made, open for reading; BrokenSealError when it cannot be read, or its attributes or
-    arrays' list are not what was written. OSError when the system does not open it."""
+    """A file that ``sealed`` made, open for reading.
+
+    Raises:
+        BrokenSealError: when it cannot be read, or its attributes or arrays' list are not what was written.
+        OSError: when the system does not open it.
+    """
     with _reading():
         file = h5py.File(path, "r")
     with file:
@@ -104,9 +114,12 @@ def unsealed(path: Path) -> Iterator[SealedFile]:
 
 @contextmanager
 def sealed(path: Path, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
-    """A new file to fill with arrays, with JSON-serialisable ``attributes``; it gets its checksums when the block ends.
+    """A new file to fill with arrays; it gets its checksums when the block ends. The same arrays make the same bytes.
 
-    The same arrays make the same bytes."""
+    Args:
+        path: where it will lie.
+        attributes: JSON-serialisable, what it says beside its arrays.
+    """
     with h5py.File(path, "w", libver=FORMAT) as file:
         yield file
         # Or a compressed array finds its place when its last reference goes, and a profiler may hold one for a moment.

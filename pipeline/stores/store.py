@@ -37,8 +37,12 @@ _MADE_WITH = b"made_with"
 
 
 class Store(ABC):
-    """The files of one stage. Their bytes depend on ``settings`` of the user, and files with others count as missing;
-    and on what else of this project is in ``form``, by its name for people. Both are JSON-serialisable."""
+    """The files of one stage.
+
+    Args:
+        settings: JSON-serialisable, those of the user that the bytes depend on; files with others count as missing.
+        form: what else of this project they depend on, by its name for people.
+    """
 
     step: ClassVar[Step]
     """What makes the files, in ``pipeline/identity.py``."""
@@ -82,7 +86,11 @@ class Store(ABC):
 
     @contextmanager
     def opened(self, name: str) -> Iterator[SealedFile]:
-        """A file to read; PipelineError when it is missing, damaged, or not current."""
+        """A file to read.
+
+        Raises:
+            PipelineError: when it is missing, damaged, or not current.
+        """
         path, remedy = self.path(name), f"run the {self.stage} stage again"
         if not path.exists():
             raise PipelineError("missing", where=path, remedy=remedy)
@@ -108,7 +116,9 @@ class Store(ABC):
 
     def _believed(self) -> tuple[dict[str, dict[str, Any]], set[str]]:
         """The table's rows of files that have not changed since, and the names of all other files, also of those gone.
-        The rows are whatever fingerprint they have."""
+
+        The rows are whatever fingerprint they have.
+        """
         told, written_ns = self._table()
         believed = {}
         for name in self.names():
@@ -175,8 +185,10 @@ class Store(ABC):
         return known
 
     def outdated(self, names: Iterable[str]) -> Counter[str]:
-        """Why finished files count as missing, to how many do for this reason. Those that are damaged are not counted,
-        nor those with other settings: whoever changed these wants new files."""
+        """Why finished files count as missing, to how many do for this reason.
+
+        Those that are damaged are not counted, nor those with other settings: whoever changed these wants new files.
+        """
         current, known = self.rows(), self._known()
         reasons: Counter[str] = Counter()
         for name in names:

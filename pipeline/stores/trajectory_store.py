@@ -19,8 +19,14 @@ from pipeline.types import Push, Quality, Scene, Trajectory, Verdict
 
 
 class TrajectoryStore(Store):
-    """Trajectories under one folder; its table has verdict, executed steps, ``Quality`` and more of each. A file holds
-    no path of the machine, so that it is the same, and can be read, wherever the packages are installed."""
+    """Trajectories under one folder.
+
+    The columns of its table are ``kept`` and ``reason`` (the verdict), ``mode`` (how the actions came about), ``steps``
+    (how many were executed), ``resolved`` (JSON of what physics perturbations did in the scene), and those of
+    ``Quality``.
+
+    A file holds no path of the machine, so that it is the same, and can be read, wherever the packages are installed.
+    """
 
     step, stage = "physics", "render"
     columns: ClassVar = {
@@ -57,8 +63,11 @@ class TrajectoryStore(Store):
             file.create_dataset("site_alpha", data=trajectory.site_alpha, compression="gzip")
 
     def load(self, trajectory_id: str) -> Trajectory:
-        """Read a trajectory back; PipelineError when its file is missing, damaged or not current, or what its scene is
-        made of is not here."""
+        """Read a trajectory back.
+
+        Raises:
+            PipelineError: when its file is missing, damaged or not current, or what its scene is made of is not here.
+        """
         with self.opened(trajectory_id) as file:
             told = file.attributes
             posture_rad, push, quality = told["posture_rad"], told.get("push"), told["quality"]

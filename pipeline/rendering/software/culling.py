@@ -65,7 +65,10 @@ class Picture(NamedTuple):
 
 class Culling:
     """Tests the bounding boxes of a model's geoms against a camera's view. All planes must have bounds.
-    ``hidden_groups``: groups of geoms that are not rendered."""
+
+    Args:
+        hidden_groups: groups of geoms that are not rendered.
+    """
 
     def __init__(self, model: mujoco.MjModel, hidden_groups: Collection[int]):
         self._model, self.shown = model, ~np.isin(model.geom_group, list(hidden_groups))
@@ -173,8 +176,10 @@ class Culling:
         return np.asarray(self.shown & (opacity < 1))
 
     def _sites(self, shadows: bool) -> NDArray[np.bool_]:
-        """(nsite,) which sites may show. robosuite hides some by a negative opacity: MuJoCo renders them, and only
-        where lamps cast shadows they show."""
+        """(nsite,) which sites may show.
+
+        robosuite hides some by a negative opacity: MuJoCo renders them, and only where lamps cast shadows they show.
+        """
         return np.asarray((self._model.site_rgba[:, 3] > 0) | shadows)
 
 

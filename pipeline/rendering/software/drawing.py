@@ -61,10 +61,13 @@ class Still:
         self._view = b""
 
     def geoms(self, view: bytes, places: NDArray[np.float32], rendered: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(ngeom,) the geoms of the underlay for the next picture of those that are to be ``rendered`` (ngeom,).
+        """(ngeom,) the geoms of the underlay for the next picture.
 
-        ``view`` is what a picture depends on beside the geoms: the camera, and where the lamps are. ``places`` (ngeom,
-        12) are positions and rotations of the geoms, as they are rendered."""
+        Args:
+            view: what a picture depends on beside the geoms: the camera, and where the lamps are.
+            places: (ngeom, 12) positions and rotations of the geoms, as they are rendered.
+            rendered: (ngeom,) which geoms are to be rendered.
+        """
         if view != self._view:
             self._view, self._places = view, places
             self._geoms: NDArray[np.bool_] = np.zeros(len(places), np.bool_)
@@ -84,7 +87,11 @@ class Still:
 
 
 class SoftwareDrawing(PlainDrawing):
-    """Renders models that are ``possible``; PipelineError when OpenGL does not do what is asked of it."""
+    """Renders models that are ``possible``.
+
+    Raises:
+        PipelineError: when OpenGL does not do what is asked of it.
+    """
 
     def __init__(self, model: mujoco.MjModel):
         # The context is made for what all scenes have in common, and then goes on with this model.
@@ -162,8 +169,12 @@ class SoftwareDrawing(PlainDrawing):
         self._draw(shot, opaque & ~still, underlay)
 
     def _draw(self, shot: Shot, opaque: NDArray[np.bool_], underlay: Underlay | None = None, last: bool = True) -> None:
-        """Render opaque geoms (ngeom,) of a picture over an underlay. ``last``: whether this completes the picture,
-        with what is in no underlay: mirror, transparent geoms, sites, shadows and sky."""
+        """Render opaque geoms (ngeom,) of a picture over an underlay.
+
+        Args:
+            last: whether this completes the picture, with what is in no underlay: mirror, transparent geoms, sites,
+                shadows and sky.
+        """
         model, picture, flags = self._model, shot.picture, self._scene.flags
         rendered, passes = opaque, [Pass(Purpose.CAMERA, picture.seen & opaque)]
         if last:

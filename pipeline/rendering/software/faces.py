@@ -24,9 +24,11 @@ class Faces(NamedTuple):
     """A mesh by its vertices, each a place with what is rendered there; faces that meet mostly differ in the normal.
 
     Attributes:
-        vertices_m, normals, texture: (V, 3), (V, 3) and (V, 2); None where the mesh has no places in a texture.
+        vertices_m, normals: (V, 3) in the frame of the mesh's geoms.
+        texture: (V, 2) place in a texture, or None where the mesh has no such places.
         corners: (F, 3) vertices of each face, in the mesh's order.
-        places_m, place_of_corner: (P, 3) each place once, and (F, 3) the place of each face's corners.
+        places_m: (P, 3) each place once.
+        place_of_corner: (F, 3) the place of each face's corners.
     """
 
     vertices_m: NDArray[np.float32]

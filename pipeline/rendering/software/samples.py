@@ -28,10 +28,13 @@ SAMPLES = 4
 
 
 class Projection(NamedTuple):
-    """How a picture of some width and height shows places of some frame of reference, at first the world's.
+    """How a picture shows places of some frame of reference, at first the world's.
 
-    ``matrix`` (3, 4) leads from a place, in m, to its column, its row from below, and 1, all times its depth. Nothing
-    is rendered at depths before ``near_m`` and beyond ``far_m``."""
+    Attributes:
+        matrix: (3, 4) of a place, in m, to its column, its row from below, and 1, all times its depth.
+        near_m, far_m: depths before and beyond which nothing is rendered.
+        size_px: width and height.
+    """
 
     matrix: Floats
     near_m: float
@@ -64,7 +67,10 @@ def faces_that_show(
         projection: of the picture, from the frame of the mesh.
         faces: of the mesh; their corners come counter-clockwise as seen from the front.
         samples: (``SAMPLES``, 2) place of each sample in its pixel, 0 to 1 to the right and up.
-        found: (``room(F)``,) to write into; returned is how many numbers were.
+        found: (``room(F)``,) to write into.
+
+    Returns:
+        How many numbers were written.
     """
     matrix, near_m, far_m, size_px = projection
     corners = faces.place_of_corner
@@ -104,8 +110,12 @@ def _projected(
 def _facing(
     at_px: NDArray[np.float32], outside: NDArray[np.bool_], place_of_corner: NDArray[np.uint32], batch_faces: int
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_], NDArray[np.bool_]]:
-    """The faces (L,) that may face the camera: their numbers; of each, whether it may be turned away as well; and
-    whether OpenGL sorts its batch by front and back before corners are rounded."""
+    """The faces (L,) that may face the camera.
+
+    Returns:
+        Their numbers; of each, whether it may be turned away as well; and whether OpenGL sorts its batch by front and
+        back before corners are rounded.
+    """
     left_over, doubtful = np.empty(len(place_of_corner), np.int32), np.empty(len(place_of_corner), np.bool_)
     before = np.empty(len(place_of_corner), np.bool_)
     margin, count = np.float32(MARGIN_PX), 0
@@ -139,8 +149,12 @@ def _covering(
     doubtful: NDArray[np.bool_],
     before: NDArray[np.bool_],
 ) -> tuple[int, NDArray[np.bool_]]:
-    """Keep the faces that may cover a sample of the picture: how many they are, written to the front of the last three
-    arrays, which are those of ``_facing``; and of each, whether it may face either way."""
+    """Keep the faces that may cover a sample of the picture.
+
+    Returns:
+        How many are kept, written to the front of the last three arrays, which are those of ``_facing``; and of each,
+        whether it may face either way.
+    """
     either_way = np.empty(len(left_over), np.bool_)
     margin, count = np.float32(MARGIN_PX), 0
     for number in range(len(left_over)):

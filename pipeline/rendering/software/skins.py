@@ -18,8 +18,13 @@ LEAST_FACES = 256
 
 
 class SkinnedMeshes:
-    """Gives each geom of a large mesh that is ``shown`` (ngeom,) a skin, which renders chosen faces of it. ``samples``
-    (SAMPLES, 2) are places in a pixel; ``former`` are those of the model that the context was for before."""
+    """Gives each geom of a large mesh a skin, which renders chosen faces of it.
+
+    Args:
+        samples: (SAMPLES, 2) place of each sample in its pixel.
+        shown: (ngeom,) which geoms can be rendered.
+        former: those of the model that the context was for before.
+    """
 
     def __init__(
         self,
@@ -53,8 +58,11 @@ class SkinnedMeshes:
     def put(
         self, scene: mujoco.MjvScene, data: mujoco.MjData, projection: Projection, wanted: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Have the skins follow their meshes in a scene, with the faces that a picture can show of ``wanted`` geoms;
-        (nmesh,) which meshes then have their skins in the scene."""
+        """Have the skins follow their meshes in a scene, with the faces that a picture can show of ``wanted`` geoms.
+
+        Returns:
+            (nmesh,) which meshes have their skins in the scene.
+        """
         shown, of_mesh = self._skins.meshes_of_scene()
         geoms = np.where(of_mesh, shown["objid"], 0)
         skins = np.where(of_mesh, self._skin[geoms], -1)

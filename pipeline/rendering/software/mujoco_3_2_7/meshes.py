@@ -18,8 +18,13 @@ from pipeline.rendering.software.mujoco_3_2_7.underlays import Underlay, recorde
 class _Lists:
     """The display lists of one pass: a list for each mesh, an end list, and for each mesh a list that closes its skin.
 
-    The end list calls another, and sets the list base: ``ends``. Meshes (nmesh,) have their faces ``rendered``, or are
-    ``opened`` as a skin follows, or ``shut`` where that is not rendered."""
+    Attributes:
+        base, end, closing: numbers of the first mesh's list, of the end list, and of the first closing list.
+        ends: what the end list does: the list base that it sets, and a list that it calls before.
+        rendered: (nmesh,) meshes whose faces are rendered.
+        opened: (nmesh,) meshes that a skin follows.
+        shut: (nmesh,) meshes whose skin is not rendered.
+    """
 
     def __init__(self, meshes: int):
         self.base = calls().glGenLists(2 * meshes + 1)

@@ -28,8 +28,10 @@ class Skins:
 
     A display list always renders the same faces, and recording one takes as long as rendering a third of them. For a
     skin MuJoCo renders the faces of an index buffer. Before each rendering it would overwrite the skins with those of
-    the bare model, so ``nskin`` is set to 0, which hides them from that step. ``rendered``: (2 ``SKINS``,) number of
-    faces that each skin renders; the first ``SKINS`` have texture coordinates.
+    the bare model, so ``nskin`` is set to 0, which hides them from that step.
+
+    Attributes:
+        rendered: (2 ``SKINS``,) number of faces that each skin renders; the first ``SKINS`` have texture coordinates.
     """
 
     def __init__(self, context: mujoco.MjrContext, scene: mujoco.MjvScene):
@@ -71,8 +73,13 @@ class Skins:
             opengl.glBindBuffer(opengl.GL_ELEMENT_ARRAY_BUFFER, 0)
 
     def follow(self, shown: NDArray[np.void], skins: NDArray[np.intp], closing: NDArray[np.intp]) -> None:
-        """Write the scene's geoms (N,), each with its skin, -1 for none; after each with a skin come the skin and its
-        closing mesh (``Meshes``), whose numbers ``closing`` (K,) has."""
+        """Write the scene's geoms; after each with a skin come the skin and its closing mesh (``Meshes``).
+
+        Args:
+            shown: (N,) of ``GEOM``.
+            skins: (N,) the skin of each, -1 for none.
+            closing: (K,) number of the closing mesh of each geom that has a skin.
+        """
         having = skins >= 0
         written = np.repeat(shown, np.where(having, 3, 1))
         own = np.flatnonzero(having) + 2 * np.arange(np.count_nonzero(having))
