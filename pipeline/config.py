@@ -284,11 +284,8 @@ def load(path: Path) -> Config:
     try:
         return Config.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
     except (OSError, UnicodeDecodeError) as error:
-        raise PipelineError(
-            f"cannot read the configuration ({error})",
-            where=path,
-            remedy=f"one of {sorted(map(str, Path('configs').glob('*')))}",
-        ) from error
+        there = sorted(map(str, Path("configs").glob("*")))
+        raise PipelineError(f"cannot read the configuration ({error})", where=path, remedy=f"one of {there}") from error
     except (yaml.YAMLError, RecursionError) as error:
         raise PipelineError(f"not valid YAML: {error}", where=path, expected="a file like those of configs/") from error
     except ValidationError as error:

@@ -68,7 +68,9 @@ def test_takes_the_words_of_the_recipe(tmp_path: Path) -> None:
     manifest.touch()
     clients = recipe.build(manifest, [], ExportConfig(lerobot=LeRobotConfig(name=NAME)))["clients"]
     words = {name: shlex.split(clients[f"lerobot_{name}"]["command"])[1:] for name in ("act", "pi05")}
-    read: dict[str, Any] = {name: draccus.parse(TrainPipelineConfig, args=those) for name, those in words.items()}
+    read: dict[str, Any] = {
+        name: draccus.argparsing.parse(TrainPipelineConfig, args=those) for name, those in words.items()
+    }
     assert all(one.dataset.repo_id == NAME and not one.policy.push_to_hub for one in read.values())
     pi05 = read["pi05"]
     assert (pi05.policy.type, pi05.policy.n_action_steps, pi05.steps, pi05.batch_size) == ("pi05", 10, 30000, 64)

@@ -29,7 +29,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
-from pipeline.rendering.last_scene import LastScene
+from pipeline.rendering.renderer import LastScene
 from pipeline.rendering.render import render
 from pipeline.run import outcome
 from pipeline.run.outcome import outdated
