@@ -29,8 +29,8 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.planning import plan
 from pipeline.planning.streams import Stream, streams_of
-from pipeline.rendering.renderer import LastScene
 from pipeline.rendering.render import render
+from pipeline.rendering.renderer import LastScene
 from pipeline.run import outcome
 from pipeline.run.outcome import outdated
 from pipeline.run.render_job import RenderJob
