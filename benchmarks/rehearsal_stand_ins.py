@@ -30,6 +30,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.images.jpeg import encode
 from pipeline.planning.streams import Stream
 from pipeline.types import Demo, Frame, Geometry, Rendered, Scene, Task, Trajectory, Verdict
+from pipeline.validation.checks import ARM
 
 STEPS = 8
 """The fewest that OpenVLA-OFT can read: one of its chunks."""
@@ -74,7 +75,7 @@ def render(
     return Rendered(
         replay_mode=trajectory.mode,
         state=state,
-        joint_state=np.zeros((steps, 7), np.float32),
+        joint_state=trajectory.states[:-1, ARM].astype(np.float32),
         action=trajectory.actions.astype(np.float32),
         streams={
             stream.stream_id: [encode(_pattern(f"{stream.stream_id} {step}"), config) for step in range(steps)]
