@@ -203,7 +203,8 @@ def _check_frames(episode: Episode, steps: int) -> None:
             raise _fault(episode, view, f"has {len(frames)} frames", f"{steps}, one per action")
         for index, data in enumerate(frames):
             try:
-                found = _look(data[: data.find(JPEG_SCAN) + SCAN_HEADER_BYTES])
+                scan = data.find(JPEG_SCAN)
+                found = _look(data[: scan + SCAN_HEADER_BYTES] if scan >= 0 else data)
             except UnidentifiedImageError:
                 raise _fault(episode, view, f"frame {index} is not an image", f"{expected}") from None
             if found != expected:

@@ -151,7 +151,11 @@ RollOut = Callable[[Scene, Demo], Floats]
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether something planned is kept, and ``kept`` or a short reason in snake_case, such as ``goal_not_reached``."""
+    """Whether something planned is kept.
+
+    Attributes:
+        reason: ``kept``, or a short reason in snake_case, such as ``goal_not_reached``.
+    """
 
     kept: bool
     reason: str

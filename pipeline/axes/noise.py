@@ -69,6 +69,7 @@ class NoisePerturbation(PixelPerturbation):
         return np.abs(severities - self.severity(test)) if tested else severities
 
     def apart(self, others: Sequence[NoisePerturbation]) -> Floats:
+        """To the strengths of the same component, on the scale of the benchmark's severities."""
         test = benchmark.load()
         severities = [other.severity(test) if other.component == self.component else np.nan for other in others]
         return np.abs(np.array(severities) - self.severity(test))

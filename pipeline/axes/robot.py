@@ -93,6 +93,7 @@ class RobotPerturbation(PhysicsPerturbation):
         return self._apart_rad(benchmark_offsets_rad())[[int(one.parameters["id"]) - 1 for one in test.of("robot")]]
 
     def apart(self, others: Sequence[RobotPerturbation]) -> Floats:
+        """To the offsets of all, as the arm is the same in all tasks."""
         return self._apart_rad([other.joint_offsets_rad for other in others])
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:

@@ -16,6 +16,7 @@ from pipeline.types import Floats
 
 
 def _rock(rng: Rng) -> Floats:
+    """Heights (512, 512) of plaster, gravel or rock."""
     return relief(rng, float(rng.uniform(0.8, 1.7)), coarsest=float(rng.choice([2, 4, 8, 16])))
 
 
@@ -35,6 +36,7 @@ def _blocks(rng: Rng) -> Floats:
 
 
 def _weave(rng: Rng) -> Floats:
+    """Heights (512, 512) of a plain weave."""
     down, right = grid()
     threads = int(rng.choice([24, 32, 48, 64]))
     waves = np.sin(np.pi * threads * down), np.sin(np.pi * threads * right)
@@ -64,6 +66,7 @@ def _smooth(heights: Floats, sigma_px: float) -> Floats:
 
 
 def _grey(level: Floats) -> Floats:
+    """(512, 512, 3) from (512, 512)."""
     return np.repeat(level[..., None], 3, axis=2)
 
 

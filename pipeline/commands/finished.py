@@ -46,7 +46,7 @@ def check(arguments: argparse.Namespace) -> int:
     """
     from pipeline.clients import oft
     from pipeline.compute.pool import runner
-    from pipeline.validation.validate import verify
+    from pipeline.validation.verify import verify
 
     config = owned(arguments)
     with runner(config.compute, config.data) as run:

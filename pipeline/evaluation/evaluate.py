@@ -96,10 +96,12 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
 def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[EvaluationTask, ...]]:
     """Tasks by scene: those of one scene, and of one posture of the arm, follow each other."""
     scenes: dict[tuple[str, ...], list[EvaluationTask]] = defaultdict(list)
-    for task in sorted(missing, key=lambda task: (task.axis == "robot", task.number, task.name)):
+    for task in missing:
         own_scene = task.source == "libero_plus" and task.axis in SCENE_AXES
         moved = task.name.partition("_state")[0] if own_scene or task.source == "goals" else ""
         scenes[task.suite, task.base, moved].append(task)
+    for scene in scenes.values():
+        scene.sort(key=lambda task: (task.axis == "robot", task.number, task.name))
     spread = len(missing) if workers == 1 else max(1, len(missing) // (workers * JOBS_A_WORKER))
     size = min(spread, EPISODES_A_JOB)
     return [tuple(scene[at : at + size]) for scene in scenes.values() for at in range(0, len(scene), size)]

@@ -213,7 +213,7 @@ def _fits(category: str, relation: str, place: str, known: Bddl) -> bool:
 
 @cache
 def _size_m(category: str) -> Floats:
-    """The shorter and the longer side of an object's footprint and its height; None where its model is not known."""
+    """(3,) shorter and longer side of an object's footprint, and its height; NaN where its model is not known."""
     model = next((model for model in offered("libero") if model.name == f"libero/{category}"), None)
     size_m = np.full(3, np.nan) if model is None else np.subtract(model.shape.high_m, model.shape.low_m)
     return np.array([*sorted(size_m[:2]), size_m[2]])

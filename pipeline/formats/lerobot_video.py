@@ -8,7 +8,9 @@ from typing import Final, Self
 
 import av
 import cv2
+import numpy as np
 from av.video.frame import PictureType
+from numpy.typing import NDArray
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.types import Frame
@@ -63,11 +65,14 @@ class Video:
 
     def add(self, pixels: Frame, *, first: bool) -> None:
         """Append a frame (H, W, 3); ``first`` of an episode."""
-        # A third of the time of FFmpeg's own conversion, at the same PSNR.
-        planes = cv2.cvtColor(pixels, cv2.COLOR_RGB2YUV_I420)
-        frame = av.VideoFrame.from_numpy_buffer(planes, format=INFO["video.pix_fmt"])
+        frame = av.VideoFrame.from_numpy_buffer(planes(pixels), format=INFO["video.pix_fmt"])
         frame.pts, frame.time_base = self.frames, Fraction(1, SCHEMA.fps_hz)
         if first:
             frame.pict_type = PictureType.I
         self._file.mux(self._stream.encode(frame))
         self.frames += 1
+
+
+def planes(pixels: Frame) -> NDArray[np.uint8]:
+    """The planes Y, U and V (3 * H / 2, W) of a frame; in a third of the time of FFmpeg's conversion, at its PSNR."""
+    return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2YUV_I420), np.uint8)

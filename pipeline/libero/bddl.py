@@ -51,6 +51,7 @@ class Bddl:
 
     @property
     def arena(self) -> Arena:
+        """Where the scene is."""
         return arena(self.problem)
 
     @property

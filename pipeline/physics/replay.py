@@ -8,7 +8,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from pipeline.libero.starts import kept_actions, recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError, shared
 from pipeline.physics.reference import Reference
 from pipeline.physics.tracking import Route, follow
-from pipeline.types import Demo, Floats, Scene, Task, Trajectory, Verdict
+from pipeline.types import Demo, Floats, Push, Scene, Task, Trajectory, Verdict
 
 
 # Six arguments: what is replayed, its name, how, under what changes, and what tracking follows.
@@ -159,13 +158,17 @@ def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
 def _states_from(scene: Scene, task: Task, actions: Floats, config: ReplayConfig) -> Floats:
     # All that a replay depends on of the scene, which itself can be no key.
     start = scene.model_xml, scene.state.tobytes(), scene.gripper, scene.posture_rad, scene.push
-    return _states(task, actions.tobytes(), config.settle_steps, *start)
+    return _states(task, start, actions.tobytes(), config.settle_steps)
+
+
+_Start = tuple[str, bytes, float, tuple[float, ...] | None, Push | None]
 
 
 @lru_cache(maxsize=4)
-def _states(task: Task, actions: bytes, settle_steps: int, model_xml: str, state: bytes, *acting: Any) -> Floats:
+def _states(task: Task, start: _Start, actions: bytes, settle_steps: int) -> Floats:
+    model_xml, state, gripper, posture_rad, push = start
     environment = shared(task)
-    environment.restore(Scene(model_xml, np.frombuffer(state), {}, *acting))
+    environment.restore(Scene(model_xml, np.frombuffer(state), gripper=gripper, posture_rad=posture_rad, push=push))
     environment.settle(settle_steps)
     states = [environment.state]
     for action in np.frombuffer(actions).reshape(-1, 7):

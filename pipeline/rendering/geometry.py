@@ -1,5 +1,7 @@
-"""Camera matrices, depth and segmentation of a view, and which thing an instance id stands for; conventions are those
-of ``schemas/episode.json``."""
+"""Camera matrices, depth and segmentation of a view, and which thing an instance id stands for.
+
+Conventions are those of ``schemas/episode.json``.
+"""
 
 from __future__ import annotations
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import fcntl
+import json
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -15,7 +16,7 @@ import yaml
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import exit_status
-from pipeline.files import read_json, remove_leftovers, write_json
+from pipeline.files import remove_leftovers, write_json
 from pipeline.identity import REMAKE
 
 OWNER = "configuration.json"
@@ -125,7 +126,14 @@ def _refuse_other_folder(config: Config, file: Path) -> None:
 
 def _refuse_foreign(config: Config, file: Path) -> None:
     mark, own = config.data / OWNER, _named(file)
-    owner = read_json(mark, f"call this again, if the folder is that of {own}").get("configuration")
+    try:
+        owner = str(json.loads(mark.read_text())["configuration"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise PipelineError(
+            f"cannot read which configuration the folder belongs to ({error})",
+            where=mark,
+            remedy=f"delete the file if the folder is that of {own}",
+        ) from error
     if owner != own:
         raise PipelineError(
             f"the folder belongs to {owner}, and {own} has the same name: {config.name}",

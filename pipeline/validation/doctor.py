@@ -126,7 +126,7 @@ def _packages() -> Iterator[Diagnosis]:
     except PackageNotFoundError:
         yield Diagnosis(DISTRIBUTION, "fail", "not installed", REINSTALL)
         return
-    wanted = [("Python", python_version(), SpecifierSet(pythons))]
+    wanted, absent = [("Python", python_version(), SpecifierSet(pythons))], []
     for requirement in map(Requirement, lines):
         # Of other Pythons; the harness is installed although it is an extra.
         if requirement.marker and not requirement.marker.evaluate({"extra": "evaluation"}):
@@ -134,12 +134,13 @@ def _packages() -> Iterator[Diagnosis]:
         try:
             wanted.append((requirement.name, version(requirement.name), requirement.specifier))
         except PackageNotFoundError:
-            yield Diagnosis(requirement.name, "fail", "not installed", REINSTALL)
+            absent.append(Diagnosis(requirement.name, "fail", "not installed", REINSTALL))
     for name, found, specifier in wanted:
         if not specifier.contains(found):
             yield Diagnosis(name, "fail", f"{found}, not {specifier}", REINSTALL)
         elif name == "Python" or "==" in str(specifier):
             yield Diagnosis(name, "ok", found)
+    yield from absent
 
 
 def _tensorflow() -> Diagnosis:

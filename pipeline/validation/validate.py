@@ -1,5 +1,4 @@
-"""Reopen the datasets and the manifest of a finished run, as their readers would, and say what is off (``validate``);
-compare all that it stored with the checksums that it was stored with (``verify``).
+"""Reopen the datasets and the manifest of a finished run, as their readers would, and say what is off.
 
 The datasets are compared with the stores that they were made from; those in turn are held against fresh renderings.
 """
@@ -21,7 +20,7 @@ from pipeline.files import read_json, scratch
 from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
-from pipeline.formats.registry import failures_of, formats_of, recorded
+from pipeline.formats.registry import failures_of, formats_of
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
 from pipeline.planning import plan
@@ -30,8 +29,6 @@ from pipeline.run import manifest, outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import wordings
-from pipeline.stores.frame_store import FrameStore
-from pipeline.stores.store import Store
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Extra
 from pipeline.validation.checks import CHECKS, Case
@@ -228,40 +225,3 @@ class EpisodesJob:
             results.note(name, check(case))
         if episode_id in self.witnesses:
             results.note("rendered", rendered(case, self.config.render, scene_of_process()))
-
-
-def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
-    """Read every stored file of a run: trajectories, frames and the datasets.
-
-    Returns:
-        JSON-serialisable: what was read to how many files were ``checked``, and which are ``damaged``, each with what
-        to do about it.
-    """
-    results: dict[str, dict[str, Any]] = {}
-    stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
-    for name, store in zip(("trajectories", "frames"), stores, strict=True):
-        results[name] = _result(workers(partial(_damaged, store), store.names(), name))
-    for one in recorded(config.data, config.export, config.render.extras):
-        name = one.folder.relative_to(config.data).as_posix()
-        try:
-            files = one.written()
-        except PipelineError as error:
-            results[name] = {"checked": 0, "damaged": [str(error)]}
-            continue
-        faults = workers(Written.faults, files, one.title)
-        results[name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
-    return results
-
-
-def _damaged(store: Store, file: str) -> list[str]:
-    try:
-        with store.opened(file) as opened:
-            opened.check_all()
-    except PipelineError as error:
-        return [str(error)]
-    return []
-
-
-def _result(findings: Iterable[Sequence[str]]) -> dict[str, Any]:
-    listed = list(findings)
-    return {"checked": len(listed), "damaged": [finding for found in listed for finding in found]}

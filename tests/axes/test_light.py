@@ -33,7 +33,7 @@ def drawn(component: Component, level: Level, key: str | int, task: Task = MILK)
 
 
 def weakest(task: Task) -> Iterator[LightPerturbation]:
-    """A draw of each component at level 1.
+    """A draw of each component at level 1; ``test_stronger_levels_change_more`` compares level 5 with it, in one arena.
 
     Of ``diffuse`` it is a darker, a brighter and a tinted one, where drawn; of ``combined`` one with shadows and one
     without; of ``direction`` one for each edge of the range of the azimuth, where a tilt changes least. Last comes the

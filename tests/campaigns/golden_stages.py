@@ -18,6 +18,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
+from pipeline.formats.lerobot_video import planes
 from pipeline.formats.read_back import Copy, sampled
 from pipeline.images.jpeg import decode
 from pipeline.report import figures
@@ -36,13 +37,18 @@ def rlds() -> str:
 
 
 def lerobot() -> str:
-    """All files of two sets; but for the videos, whose encoder may choose its code by the processor."""
-    return digest(_written(write_lerobot), _written(partial(write_lerobot, frames="images")))[:16]
+    """All files of two sets, and what videos are of; their encoder may choose its code by the processor."""
+    return digest(_written(write_lerobot), _written(partial(write_lerobot, frames="images")), _encoded())[:16]
 
 
 def lerobot_v21() -> str:
     """The same of a set of each convention."""
-    return digest(*(_written(partial(write_lerobot_v21, convention=each)) for each in ("ipec", "openpi")))[:16]
+    written = (_written(partial(write_lerobot_v21, convention=each)) for each in ("ipec", "openpi"))
+    return digest(*written, _encoded())[:16]
+
+
+def _encoded() -> str:
+    return hashlib.sha256(planes(decode(episode(IDS[0]).frames["image"][0])).tobytes()).hexdigest()
 
 
 def _written(write: Callable[[Path], Any]) -> str:

@@ -1,4 +1,4 @@
-"""A run that is killed anywhere ends as if it was not; `python tests/campaigns/kills.py` does this fifty times."""
+"""Of a run whose stages and workers are killed, the same comes; `python tests/campaigns/kills.py` kills all stages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def test_the_command_has_a_configuration() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_that_is_killed_anywhere_ends_like_one_that_is_not(finished: Path, tmp_path: Path) -> None:
+def test_a_run_whose_replay_and_render_are_killed_has_what_one_has_that_is_not(finished: Path, tmp_path: Path) -> None:
+    """Up to the manifest: what comes after reads it."""
     undisturbed, clone = finished.parent.parent, tmp_path / "clone"
     shutil.copytree(undisturbed, clone, symlinks=True)
     file = clone / "configs" / "tiny.yaml"

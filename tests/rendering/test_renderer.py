@@ -26,10 +26,10 @@ SHADOWS = LightPerturbation(component="shadows", level=5, shadows=True)
 
 
 def all_frames(renderer: Renderer) -> dict[str, Frame]:
-    """Of both views, and of one with shadows, whose reach a context keeps."""
+    """Of both views, as they are and with shadows, whose reach a context keeps."""
     plain = frames(renderer)
     with renderer.perturbed([SHADOWS]):
-        return plain | {"with shadows": frames(renderer, ["agentview"])["agentview"]}
+        return plain | {f"{view} with shadows": frame for view, frame in frames(renderer).items()}
 
 
 def shown(renderer: Renderer, state: Floats) -> dict[str, Frame]:

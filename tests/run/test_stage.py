@@ -86,7 +86,7 @@ def test_a_mark_that_cannot_be_read_is_named(clone: Path) -> None:
     claimed(Path("configs/tiny.yaml"))
     mark = Path("data/tiny") / OWNER
     mark.write_text("")
-    with pytest.raises(PipelineError, match=f"{mark}: damaged"):
+    with pytest.raises(PipelineError, match=f"{mark}: cannot read which configuration"):
         claimed(Path("configs/tiny.yaml"))
 
 

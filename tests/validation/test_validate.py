@@ -38,7 +38,8 @@ from pipeline.run.export import episodes_of, export
 from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.checks import CHECKS, Case
 from pipeline.validation.rerender import witnesses
-from pipeline.validation.validate import EpisodesJob, validate, verify
+from pipeline.validation.validate import EpisodesJob, validate
+from pipeline.validation.verify import verify
 
 Tree = dict[str, Any]
 Rows = list[dict[str, Any]]
