@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
-import numpy as np
 import pytest
+from PIL import Image
 from synthetic import IDS, episode
 
 from pipeline.episode_schema import check
@@ -15,8 +15,9 @@ from pipeline.errors import PipelineError
 
 
 def as_png(jpeg: bytes) -> bytes:
-    pixels = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
-    return bytes(cv2.imencode(".png", pixels)[1])
+    packed = io.BytesIO()
+    Image.open(io.BytesIO(jpeg)).save(packed, "PNG")
+    return packed.getvalue()
 
 
 @pytest.mark.parametrize(
