@@ -48,8 +48,6 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Run ``stage`` on the configuration named on the command line."""
-
     def run() -> int:
         arguments = parser().parse_args()
         try:

@@ -280,10 +280,6 @@ def write_modality(root: Path, convention: Convention) -> None:
 
 
 def listed(found: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """The sentences of an answer: its JSON list, or else its numbered, bulleted or quoted lines.
-
-    Whatever stands around the list (preambles, code fences, a model's thoughts) is no part of it.
-    """
     return {name: values.tolist() for name, values in found.items()}
 
 
@@ -297,5 +293,4 @@ def link(made: Path, place: Path) -> None:
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:
-    """Write what ``read_json`` reads; the file is whole or not there."""
     file.write_text(json.dumps(content, indent=4) + "\n")

@@ -210,7 +210,6 @@ def prepare() -> None:
 
 
 def main() -> None:
-    """Run ``stage`` on the configuration named on the command line."""
     if not Path(SCRIPT).is_file():
         sys.exit(f"error: no {SCRIPT} in {Path.cwd()}\n  try: call this in a checkout of OpenVLA-OFT")
     try:
