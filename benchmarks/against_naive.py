@@ -9,8 +9,6 @@ encodes the frames. Each in this process and on one core. The last line is JSON:
 of the frames are the same bytes.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

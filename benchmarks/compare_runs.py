@@ -6,8 +6,6 @@ Compares plan, manifest, every array of trajectories and frames, and every file 
 that differ are decoded, and their pixels are compared. The last line is JSON; it ends with 1 where anything differs.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections import Counter

@@ -6,8 +6,6 @@ Runs the stages up to `validate` on a configuration, in its own folder, and look
 is the result as JSON, beside what `doctor` says before.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """A part of a configuration that is small enough to be measured."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from pipeline.config import Config, DemosConfig

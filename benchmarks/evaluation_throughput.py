@@ -9,8 +9,6 @@ environments and results are counted. The last line is the result as JSON: wall 
 server.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

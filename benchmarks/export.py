@@ -1,7 +1,5 @@
 """Rates and peak memory of the exports on synthetic episodes; the last line printed is JSON."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

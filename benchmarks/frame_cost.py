@@ -9,8 +9,6 @@ both ways; what of it is not within ``mjr_render`` and ``mjr_readPixels``; the s
 how many frames are the same pixels.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -9,8 +9,6 @@ about ten minutes on a GPU. The last line is JSON: the device; for each number o
 and memory of a process; how far the frames are from Mesa's; naive : ours.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -8,8 +8,6 @@ sentence-transformers. For each test instruction: the largest cosine of its embe
 task. The last line is the result as JSON; ``p10`` is the tenth percentile.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

@@ -11,8 +11,6 @@ What the benchmark's code gave is kept in ``--reference``, and a task that lies 
 folder where the actions below or libero_plus_reference.py have changed.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -5,8 +5,6 @@ project. ``python libero_plus_reference.py TASKS.json FOLDER`` writes ``<suite>-
 is none.
 """
 
-from __future__ import annotations
-
 import inspect
 import io
 import json

@@ -1,7 +1,5 @@
 """Model servers in processes of their own, as evaluations meet them."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

@@ -9,8 +9,6 @@ is shared with the run's own loop over frames (``rendering/render.py``). The las
 frames compared, and how many differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

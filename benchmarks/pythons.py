@@ -7,8 +7,6 @@ the library is installed into it as a wheel that was built from the source distr
 cannot be imported. Plan, physics, frames and RLDS must be the same bytes. The last line is JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -10,8 +10,6 @@ memory of its own process and of one worker, and how large the run's folder is a
 on with the next stage.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -6,8 +6,6 @@ Eight steps take the place of a replay, and smooth patterns that of frames. Dask
 (``distributed.worker.preload``).
 """
 
-from __future__ import annotations
-
 import runpy
 import sys
 from collections.abc import Sequence

@@ -11,8 +11,6 @@ out, and of CPU time for the bare drawing, as one process draws on little more t
 take against both; and how many times faster several are than one.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

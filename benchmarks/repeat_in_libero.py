@@ -9,8 +9,6 @@ takes part, and nothing is rendered. A name is printed for each trajectory that 
 there are by what is perturbed, and how many were repeated. 30 took 1.5 minutes of CPU.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -6,8 +6,6 @@ Draws come from the planner, over the starter demonstrations; ``--folder`` keeps
 was stopped goes on where it was. The last line is the result as JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

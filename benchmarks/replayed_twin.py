@@ -1,7 +1,5 @@
 """A demonstration replayed once, for benchmarks that render it again and again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.compute.pool import loop

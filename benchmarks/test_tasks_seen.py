@@ -7,8 +7,6 @@ of the 40 at each level. A working surface and the walls are counted in the firs
 noise at the severities 1, 5 and 10 is laid on these looks. It takes about ten minutes without a GPU.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections import defaultdict

@@ -5,8 +5,6 @@
 Both views as they are, and the agent view under each noise at its strongest. The last line is the result as JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

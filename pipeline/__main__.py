@@ -1,7 +1,5 @@
 """Command line: ``python -m pipeline``, installed also as ``perturbed-demos``. The commands are in ``commands/``."""
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

@@ -1,7 +1,5 @@
 """``schemas/episode.json`` as a typed object, and the check of an episode against it."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Collection, Mapping
 from functools import lru_cache

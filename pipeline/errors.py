@@ -1,7 +1,5 @@
 """One exception type for everything a user can cause and mend."""
 
-from __future__ import annotations
-
 from functools import partial
 
 

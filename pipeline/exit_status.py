@@ -1,7 +1,5 @@
 """How a command ends: with a status, and with words that a person can act on in place of a traceback."""
 
-from __future__ import annotations
-
 import errno
 import signal
 import sys

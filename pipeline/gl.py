@@ -4,8 +4,6 @@ The choice is made when the first renderer of a process is made, and never by an
 processes inherit it. Two renderers may differ by some grey levels, so the choice is printed and recorded.
 """
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import json

@@ -12,8 +12,6 @@
 10. Before finished files of today's plan are made anew, a person must have allowed it (``refuse_unasked``).
 """
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Mapping

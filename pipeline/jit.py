@@ -4,8 +4,6 @@ Numba keeps what it compiled beside the source, for all processes that come late
 once (``pipeline/validation/loops.py``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar

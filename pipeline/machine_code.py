@@ -5,8 +5,6 @@ turns such bits into decimetres. Every x86 processor with AVX2 uses the code for
 has one trajectory everywhere.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys

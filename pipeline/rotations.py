@@ -1,7 +1,5 @@
 """Rotations whose numbers are stored or drawn with: SciPy's differ from these in the last bits."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np

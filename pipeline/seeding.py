@@ -1,7 +1,5 @@
 """Keyed randomness: the same key gives the same numbers in any process, in any order."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

@@ -4,8 +4,6 @@ Parquet has one for each page of values. It has none for the footer, which says 
 encoded, so there is one of the values too.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection
 from dataclasses import fields

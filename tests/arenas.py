@@ -1,7 +1,5 @@
 """One scene of each of LIBERO's five arenas, and what tests of the render layer ask of a model."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager

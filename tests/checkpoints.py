@@ -1,7 +1,5 @@
 """Small policies as lerobot saves them, whose actions are known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch

@@ -1,7 +1,5 @@
 """Results of episodes that nobody ran, for what reads them."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from typing import Any
 

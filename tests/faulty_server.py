@@ -1,7 +1,5 @@
 """A model server of vla-eval that replays demonstrations, except of the milk and the plate, where it is at fault."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 

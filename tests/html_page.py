@@ -1,7 +1,5 @@
 """What an HTML page consists of, what it needs, and how a browser shows it."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Looks through files of every kind for paths of the machine that they were made on."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

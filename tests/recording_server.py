@@ -1,7 +1,5 @@
 """A model server that replays a demonstration, and records what it is shown whenever it computes new actions."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from pathlib import Path

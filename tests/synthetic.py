@@ -3,8 +3,6 @@
 Nothing heavy is imported here: a process that is killed on purpose must start soon.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The configuration: what is not understood is refused, by file, field and remedy."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

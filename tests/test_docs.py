@@ -1,7 +1,5 @@
 """What the documentation points at is there: files, headings, and commands that the command line takes."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The stages of dvc.yaml meet: what one depends on is there, or exactly one stage before it makes it."""
 
-from __future__ import annotations
-
 from pathlib import Path, PurePosixPath
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The experiment that shows what the data is worth: its settings, what an arm holds, training, and what tables say."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

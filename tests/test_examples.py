@@ -1,7 +1,5 @@
 """The examples run on a finished run as they stand, and print what its manifest says."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A file is whole or not there, also where two hosts share a file system and number their processes alike."""
 
-from __future__ import annotations
-
 import resource
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is shipped or drawn, and every package, is listed with its licence."""
 
-from __future__ import annotations
-
 import json
 import re
 

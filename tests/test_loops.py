@@ -1,7 +1,5 @@
 """What setup.sh has Numba compile is all that a run would have to."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 

@@ -1,7 +1,5 @@
 """The machine code is the fixed one wherever this project computes, or it is said that it is another."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Nothing that is stored depends on where the packages and the user's folders lie, nor tells where they lay."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -1,7 +1,5 @@
 """A release says the same of itself wherever it does."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

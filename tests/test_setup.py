@@ -1,7 +1,5 @@
 """``setup.sh`` in a tree of its own, with stand-ins for what it installs and for what tells it about the machine."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Imports run one way: from rooms on upper floors to those below, and never round in a circle of modules."""
 
-from __future__ import annotations
-
 import ast
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path

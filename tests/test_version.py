@@ -1,7 +1,5 @@
 """This project's own version is information: a finished run is as good under the next version as it was before."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """An installed library has all that it reads: a wheel built from the source distribution, imported on its own."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

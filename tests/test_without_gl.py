@@ -1,7 +1,5 @@
 """A machine on which no OpenGL library can be loaded: physics runs there, and what renders says what to install."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -6,8 +6,6 @@
 TensorFlow must not live in the project's environment: it crashes processes that render with Mesa.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from typing import Any

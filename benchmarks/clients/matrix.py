@@ -6,8 +6,6 @@ lerobot before 0.4, whose only tools here are to load and train:
     ENV/bin/python benchmarks/clients/matrix.py ROOT
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import shutil

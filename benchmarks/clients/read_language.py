@@ -10,8 +10,6 @@ is active at the frame's time. ``RenderMessagesStep`` of lerobot 0.6.1, which it
 task on, and that comes before any rewrite: what it shows is counted beside.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from pathlib import Path

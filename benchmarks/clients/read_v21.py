@@ -26,8 +26,6 @@ was written, and once more after its own ``examples/LIBERO/modality.json`` was c
     PYTHONPATH=. ENV/bin/python .../read_v21.py gr00t ROOT
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import json

@@ -11,8 +11,6 @@ Then in this project's: each task must succeed; with the gripper the other way r
     python benchmarks/clients/round.py evaluate ROOT ACTIONS
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import sys

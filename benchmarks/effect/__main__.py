@@ -9,8 +9,6 @@ Each step does those before it where they are not done. Stopped at any time, the
 made on another machine than the others: its results are one file, to be committed. docs/effect.md tells the costs.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

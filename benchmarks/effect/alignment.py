@@ -8,8 +8,6 @@ one before and one after. Both differences must be smallest at the same step. Th
 of grey levels and of states by shift.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Table and plot of the results: success by axis and arm, paired differences, and which goals instructions reach."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The episodes that an arm is trained on, from demonstrations to small frames in one file."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter, defaultdict
 from collections.abc import Sequence

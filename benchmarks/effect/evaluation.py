@@ -4,8 +4,6 @@ Four tasks of one scene differ by the instruction alone. From the same initial s
 and nothing; what counts is which of the four goals it reaches first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """What each policy did, as one small file a policy, which tables and plots are made from."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

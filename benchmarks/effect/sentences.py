@@ -7,8 +7,6 @@ makes the file: instructions, shipped rewrites and LIBERO-Plus's test instructio
 empty sentence.
 """
 
-from __future__ import annotations
-
 import argparse
 import io
 import json

@@ -3,8 +3,6 @@
 python benchmarks/effect/server.py --args.folder data/effect/policies/clean_seed0_... --address 127.0.0.1:8000
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes

@@ -4,8 +4,6 @@ The policy is lerobot's, and saved as lerobot saves one. The frames lie in memor
 thread computes, as several wait for each other; on two cores train both seeds at the same time.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -1,7 +1,5 @@
 """The axes of perturbation: one file each, and the registry, ``Axes``, with one line for each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from operator import or_

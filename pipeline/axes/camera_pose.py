@@ -1,7 +1,5 @@
 """Which change of the agent view leads to a pose: the reverse of ``CameraPerturbation.pose``."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -5,8 +5,6 @@ with ImageMagick, scikit-image and SciPy is computed here with the same arithmet
 a grey level, because every component but motion ends by truncation.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, ClassVar, Literal
 

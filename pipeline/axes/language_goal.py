@@ -7,8 +7,6 @@ wording does not say by these words is not asked of a rewrite. So a changed goal
 where they are described; whether a description fits one thing only must be checked by its writer.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial

@@ -4,8 +4,6 @@ LIBERO-Plus lays such maps over working surfaces as if they were colours: 751 of
 Each map here is computed from an invented relief.
 """
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Callable
 

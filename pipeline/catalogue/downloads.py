@@ -1,7 +1,5 @@
 """Files of others, such as wheels, that are fetched once and checked by hash, whatever program fetches them."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

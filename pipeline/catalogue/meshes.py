@@ -4,8 +4,6 @@ trimesh takes seconds to import, and every process of a run imports this module,
 is imported where it is used.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 from xml.sax.saxutils import quoteattr

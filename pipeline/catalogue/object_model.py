@@ -1,7 +1,5 @@
 """One object: a small MJCF model, measured, stood upright and made ready to be put into a scene."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import xml.etree.ElementTree as ET

@@ -5,8 +5,6 @@ and CC-BY) and a :class:`Folder` of the user's are converted into ``FOLDER`` whe
 model is kept until its origin or the conversion changes, so a conversion that was stopped goes on where it was.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import re

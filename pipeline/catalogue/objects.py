@@ -1,7 +1,5 @@
 """Small objects that can be added to a scene: of no category of the test set's, with nouns that cannot be confused."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 

@@ -1,7 +1,5 @@
 """What procedural images are made of: periodic noise, places, colours and cells, so that they tile without a seam."""
 
-from __future__ import annotations
-
 import colorsys
 from functools import cache
 

@@ -4,8 +4,6 @@ A texture is determined by its family and index and :data:`RECIPE` alone, and no
 0.1 s. The data maps are in :mod:`pipeline.catalogue.data_maps`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

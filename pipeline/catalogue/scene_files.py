@@ -5,8 +5,6 @@ stored has, in their place, where a file belongs: in a package, as ``pipeline.li
 of converted objects, and then with a hash, as an object may be converted anew.
 """
 
-from __future__ import annotations
-
 import html
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """A folder of the user's own as a source, of textures or of object models."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pydantic import BaseModel

@@ -1,7 +1,5 @@
 """Debian's package of furniture models: fetched once, checked by hash, read as an archive and never installed."""
 
-from __future__ import annotations
-
 import io
 import re
 import tarfile

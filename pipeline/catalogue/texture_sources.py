@@ -5,8 +5,6 @@
 :class:`Folder` holds the user's own images.
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import zipfile

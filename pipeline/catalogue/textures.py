@@ -1,8 +1,6 @@
 """The surfaces that may be drawn, with name, licence and hash: images that are colour maps and whatever is procedural,
 and none that the benchmark shows."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from functools import cache, lru_cache

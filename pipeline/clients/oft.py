@@ -6,8 +6,6 @@ fingers), normalisation to [-1, 1] by the 1st and 99th percentile, trajectories 
 left, so nothing is padded.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The fine-tuning recipe and, beside it, what the clients need to train on a run's datasets."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections import Counter, defaultdict

@@ -1,7 +1,5 @@
 """Before a run: what there is, what an axis does, and whether the machine is fit."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Demonstrations: ``demos fetch``, ``demos expand`` and ``demos check``."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """For contributors."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Policies: ``evaluate`` and ``analyse``. Each prints one line of JSON last."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A finished run, or a dataset from elsewhere: ``check``, ``audit``, ``regenerate`` and ``push``."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """Making datasets: ``run``, ``status`` and ``clean``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from typing import Any

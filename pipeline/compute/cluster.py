@@ -4,8 +4,6 @@ A worker may have been started in another folder, on another machine, with other
 edited, and it may have served other runs. None of this may change a result or write where nobody looks.
 """
 
-from __future__ import annotations
-
 import platform
 import sys
 from collections.abc import Callable, Iterator, Mapping

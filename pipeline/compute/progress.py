@@ -1,7 +1,5 @@
 """How far the work is, in a terminal and in a log."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 

@@ -1,7 +1,5 @@
 """Starts workers: processes of this machine, or jobs of SLURM, which sit in its queue until it has room."""
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

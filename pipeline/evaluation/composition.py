@@ -16,8 +16,6 @@ and the four combinations of a trial go together. So at high success it nearly n
 It is kept as the paper's figure; the interval is by bootstrap over trials.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations

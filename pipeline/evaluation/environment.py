@@ -1,7 +1,5 @@
 """One interface to every task: start an episode, look, act."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A whole evaluation: tasks over worker processes, a file for each episode, and a summary."""
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import threading

@@ -1,7 +1,5 @@
 """The tasks as an environment of Gymnasium, which observes and acts as lerobot 0.6's own LIBERO environment does."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -2,8 +2,6 @@
 ``pipeline.evaluation.harness:PerturbedLibero`` evaluates any of its model servers.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, ClassVar
 

@@ -4,8 +4,6 @@ One vector environment a suite runs all episodes that are selected of it, shared
 environments: ``--eval.n_episodes`` is their number, which is printed.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import partial

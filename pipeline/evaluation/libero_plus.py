@@ -6,8 +6,6 @@ models of LIBERO-Plus's asset archive (``assets.zip``, 6.4 GB, in the dataset Sy
 takes the place of LIBERO's assets in the benchmark. Which files a task needs is read from its code, as text.
 """
 
-from __future__ import annotations
-
 import io
 import re
 import xml.etree.ElementTree as ET

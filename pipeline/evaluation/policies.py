@@ -1,7 +1,5 @@
 """What acts: the questions that a policy is asked, and policies behind a model server or in a lerobot checkpoint."""
 
-from __future__ import annotations
-
 import asyncio
 from collections.abc import Callable
 from contextlib import suppress

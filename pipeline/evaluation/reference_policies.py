@@ -1,7 +1,5 @@
 """Scripted policies that repeat the starter set's demonstration of a task: what an evaluation can be checked with."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The results of an evaluation: a record of each episode in a file of its own, and the results of several folders."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """One episode: a policy acts in an environment until it is over, and the result is stored."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterable

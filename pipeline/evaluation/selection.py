@@ -5,8 +5,6 @@ to 10,030. Here the seven are this project's axes with held-out draws: its layou
 language has no draws of its own.
 """
 
-from __future__ import annotations
-
 import difflib
 import fnmatch
 from collections import Counter

@@ -1,7 +1,5 @@
 """LIBERO's environment of one task, started and observed as policies are evaluated in it, and kept between episodes."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path

@@ -15,8 +15,6 @@ Of n units n - 1 are drawn, which makes the variance of a mean unbiased (Rao and
 and 97.5 but further out, by as much as Student's t is wider than the normal distribution (Hesterberg, 2015).
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence

@@ -4,8 +4,6 @@ A new format is a subclass of ``Format`` in a file of its own and a line in ``re
 formats are listed, so heavy libraries are imported in the methods that need them.
 """
 
-from __future__ import annotations
-
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The episodes of a dataset: which, in which order, in which splits and slices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise

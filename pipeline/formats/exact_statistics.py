@@ -4,8 +4,6 @@ lerobot 0.4.4 takes longer for a camera's, from a sample of the frames, than for
 ``std`` among them overflows uint8 (huggingface/lerobot#3697).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

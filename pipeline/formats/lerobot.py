@@ -1,7 +1,5 @@
 """LeRobotDataset v3.0, written directly, and checked by lerobot itself."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil

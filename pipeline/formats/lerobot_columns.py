@@ -1,7 +1,5 @@
 """The columns of LeRobot datasets: of v3.0, and of v2.1 in the conventions in use. Light to import."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal

@@ -1,7 +1,5 @@
 """What LeRobot's files have of an episode, and of all of a dataset's episodes, whichever version they are of."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -1,7 +1,5 @@
 """LeRobot datasets read back: each episode by pyarrow and PyAV; as a whole, and in samples, by lerobot."""
 
-from __future__ import annotations
-
 import base64
 import json
 import warnings

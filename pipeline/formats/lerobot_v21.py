@@ -1,7 +1,5 @@
 """LeRobotDataset v2.1, for clients whose lerobot is of 2025: a file of data and one of each video for each episode."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar

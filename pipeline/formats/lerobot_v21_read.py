@@ -1,7 +1,5 @@
 """LeRobot v2.1 datasets read back by PyArrow and PyAV; the installed lerobot reads v3.0 alone."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace

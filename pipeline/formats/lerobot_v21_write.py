@@ -4,8 +4,6 @@ Every episode is a file of data and one of each video, final at once. ``meta/sta
 ``gr00t/data/dataset/lerobot_episode_loader.py`` of NVIDIA/Isaac-GR00T at 23ace64 asks for it.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The H.264 files of a LeRobot dataset, each with the episodes of one worker."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 from pathlib import Path
 from typing import Final, Self

@@ -9,8 +9,6 @@ lerobot's own writer appends by writing whole files again, and its statistics ar
 (huggingface/lerobot#3804) from a sample of the frames.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path

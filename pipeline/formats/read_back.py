@@ -1,7 +1,5 @@
 """What is found where a dataset is read back: its copies of episodes, its files, and what is off with either."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

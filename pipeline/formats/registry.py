@@ -1,7 +1,5 @@
 """The output formats: one line each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """RLDS as OpenVLA and OpenVLA-OFT read it: TFDS folders of TFRecord shards, one for each suite, without TensorFlow."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil
 from pathlib import Path

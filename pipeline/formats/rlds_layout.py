@@ -1,7 +1,5 @@
 """Names of RLDS sets, their folders and shards: a set for each suite."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from pipeline.formats.base import Row

@@ -1,7 +1,5 @@
 """RLDS sets read back without TensorFlow."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from functools import lru_cache

@@ -5,8 +5,6 @@ Feature names, shapes and dtypes are those of the ``libero_*_no_noops`` sets tha
 ``observation``; their loaders ignore both.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from functools import cache, partial

@@ -1,7 +1,5 @@
 """TFRecord files without TensorFlow: the framing of records, and examples as flat columns."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator, Mapping
 from functools import partial

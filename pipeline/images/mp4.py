@@ -1,7 +1,5 @@
 """Frames as a short H.264 video that every browser plays, small enough to be part of a page."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Sequence
 from fractions import Fraction

@@ -4,8 +4,6 @@ What is stored or published here names an asset by package and path instead, as 
 LIBERO's own repository has it, ``libero/libero/assets/...``.
 """
 
-from __future__ import annotations
-
 import posixpath
 import xml.etree.ElementTree as ET
 from functools import cache

@@ -1,7 +1,5 @@
 """What a BDDL file says of a task: its instruction, what is in its scene, where things start, and its goal."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Download LIBERO's demonstrations from the Hugging Face hub."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """LIBERO's HDF5 layout: reading it with every part checked, and writing it."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Where a recording starts, what the robot's controller and gripper were at then, and which actions do nothing."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

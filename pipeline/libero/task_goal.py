@@ -2,8 +2,6 @@
 
 And what one calls the things and places of it, in plain words, and whether what those words say still holds."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections import Counter

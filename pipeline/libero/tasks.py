@@ -1,7 +1,5 @@
 """LIBERO's task list, and tasks of one's own beside it."""
 
-from __future__ import annotations
-
 import difflib
 import fnmatch
 import re

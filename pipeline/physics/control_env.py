@@ -1,7 +1,5 @@
 """LIBERO's environment class imported without OpenGL, and its resets, which draw from NumPy's global generator."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """LIBERO's own environment for one task, without rendering: the physics, the controller and the goal's predicates."""
 
-from __future__ import annotations
-
 import copy
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """How well a trajectory was moved: what graders of demonstrations ask, from states and actions alone."""
 
-from __future__ import annotations
-
 from collections.abc import Set
 
 import mujoco

@@ -3,8 +3,6 @@
 And where a scene and a demonstration's actions in it lead, for whoever looks before the replay.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, partial

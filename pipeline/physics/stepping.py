@@ -1,7 +1,5 @@
 """LIBERO's control step without the parts that change no state: the same states, bit for bit."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -5,8 +5,6 @@ without that is pushed. A drawer, door or knob of the goal: approach it, then op
 until the next begins, so that one of them is active at each step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import cycle
 from typing import NamedTuple

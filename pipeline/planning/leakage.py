@@ -7,8 +7,6 @@ Every perturbation is read back from the plan as it was recorded and compared an
 with several counts for each of its axes: the benchmark perturbs one at a time, but each part must keep its clearance.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """The plan: a table with one row per wanted episode. All randomness is drawn here, keyed, never by position."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace

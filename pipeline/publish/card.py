@@ -1,7 +1,5 @@
 """The dataset card: it explains what a run's folder holds to readers who find it on the hub."""
 
-from __future__ import annotations
-
 import inspect
 import re
 import shutil

@@ -5,8 +5,6 @@ and stay there if the upload is cut off: run again, only the rest is sent. (``up
 leaves notes among the files, shows half a dataset meanwhile, and tries for ever where a token may not write.)
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Set
 from contextlib import suppress

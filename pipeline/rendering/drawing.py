@@ -3,8 +3,6 @@
 Any other drawing (``savings.py``) must give the same pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from contextlib import ExitStack
 from typing import NamedTuple

@@ -3,8 +3,6 @@
 Conventions are those of ``schemas/episode.json``.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from typing import Any
 

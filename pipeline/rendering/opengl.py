@@ -4,8 +4,6 @@ An error means that OpenGL did not do what it was asked to. PyOpenGL checks afte
 check after its own calls, so each of them that renders, uploads or reads is followed by ``check``.
 """
 
-from __future__ import annotations
-
 import functools
 import logging
 from collections.abc import Callable, Iterator

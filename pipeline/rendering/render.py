@@ -3,8 +3,6 @@
 A frame takes five steps: perturb, restore, render, add noise, turn.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One scene: put into stored states, perturbed, and rendered; the last one stays open for the next piece of work."""
 
-from __future__ import annotations
-
 import atexit
 import copy
 import functools

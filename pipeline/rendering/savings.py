@@ -5,8 +5,6 @@ has equal pixels (0.6 s for each process). Otherwise, and on request, a scene is
 times as long without a GPU.
 """
 
-from __future__ import annotations
-
 import functools
 import logging
 import os

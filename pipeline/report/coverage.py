@@ -1,7 +1,5 @@
 """Panels for each axis: the parameters that a run drew beside those of the test tasks, and how far these are away."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

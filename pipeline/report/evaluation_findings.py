@@ -1,7 +1,5 @@
 """All that a report of evaluations says, as JSON: rates, the paper's table, comparisons, failures."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

@@ -1,7 +1,5 @@
 """The report of evaluations: one HTML page in need of nothing beside itself, and what it says as JSON."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from pathlib import Path

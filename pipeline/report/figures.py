@@ -4,8 +4,6 @@ A page lays panels out as its width allows. Text stays text, and whatever is plo
 colour, so that one figure reads in light and in dark.
 """
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """HTML pages from ``templates/``, that need nothing beside themselves: pictures and videos are ``data:`` addresses."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Sequence

@@ -4,8 +4,6 @@ Every picture shows the demonstration's first state, without a replay; of a push
 are those that a plan with the same seed makes for the demonstration.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial

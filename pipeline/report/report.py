@@ -1,7 +1,5 @@
 """The report of a run: one HTML page with its counts, plots, pictures and videos, that needs no other file."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields

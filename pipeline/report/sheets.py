@@ -1,7 +1,5 @@
 """Contact sheets: captioned pictures in rows; and for each axis of a run its episodes beside their clean twins."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

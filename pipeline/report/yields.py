@@ -1,7 +1,5 @@
 """Tables of what became of a run's planned episodes: how many were kept, why the others were dropped."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any, NamedTuple

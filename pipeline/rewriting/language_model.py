@@ -1,7 +1,5 @@
 """One question to a language model behind an OpenAI-compatible endpoint, and the ways in which it can go wrong."""
 
-from __future__ import annotations
-
 import json
 import os
 import time

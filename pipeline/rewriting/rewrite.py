@@ -4,8 +4,6 @@ The bank is a file of the form of ``axes/language_bank.yaml``. Nothing that a mo
 for lists, each sentence is linted as ``axes/language.py`` lints the bank, and what is missing is asked for again.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections import Counter

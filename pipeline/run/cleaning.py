@@ -1,7 +1,5 @@
 """What a run's folder holds that can be made again: found with its sizes, and deleted."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """From the plan and the rendered streams to the Episode that a writer puts into a dataset."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache

@@ -4,8 +4,6 @@ Pieces are written into ``data/<run>/.work/<format>/<identity>/``, each under a 
 is whole. The finished dataset then takes the place of the one before in one rename, and the work folder goes.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 The memory is a file of ``data/<run>/.finished/``. To have a stage work again, delete its output.
 """
 
-from __future__ import annotations
-
 import json
 import platform
 from collections.abc import Mapping, Sequence, Set

@@ -5,8 +5,6 @@ the configuration and lists these files each time, and other stages depend on th
 both are the same nothing runs again.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any

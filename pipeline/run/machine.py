@@ -4,8 +4,6 @@ Ten control steps and a frame are tried. Their digests are recorded with what th
 files goes on only where the same versions and the same device give the same digests.
 """
 
-from __future__ import annotations
-
 import hashlib
 import time
 import timeit

@@ -1,7 +1,5 @@
 """What became of every planned episode: kept, or dropped and why."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass

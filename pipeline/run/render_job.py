@@ -1,7 +1,5 @@
 """One file of frames as a worker makes it: it reads the trajectory, has it rendered, and stores what was encoded."""
 
-from __future__ import annotations
-
 import platform
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the stage ``render`` does: the frames that a plan needs and the store lacks are rendered by workers."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise

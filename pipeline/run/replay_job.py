@@ -1,7 +1,5 @@
 """One replay as a worker does it: read the demonstration, have physics replay and judge it, store the trajectory."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path

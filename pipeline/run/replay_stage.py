@@ -1,7 +1,5 @@
 """What the stage ``replay`` does: the trajectories that a plan needs and the store lacks are replayed by workers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

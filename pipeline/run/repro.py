@@ -1,7 +1,5 @@
 """``dvc repro`` of one configuration: what names it for DVC, what stands in DVC's way, and where the results are."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """What the scripts in ``stages/`` share: one argument, the configuration, and errors that a person can act on."""
 
-from __future__ import annotations
-
 import argparse
 import fcntl
 import json

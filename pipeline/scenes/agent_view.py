@@ -1,7 +1,5 @@
 """What the agent view of a scene shows, by a ray through each pixel: nothing is rendered."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray

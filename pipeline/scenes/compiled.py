@@ -1,7 +1,5 @@
 """A scene compiled for its physics and put into its state, for perturbations that depend on where things stand."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from functools import lru_cache
 

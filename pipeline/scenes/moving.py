@@ -1,7 +1,5 @@
 """A demonstration's scene with one or all of its things moved, and whether that scene can be."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Where objects can be put into a demonstration's scene without being in its way."""
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections import Counter

@@ -5,8 +5,6 @@ the others beside and behind these. The regions here are the bounds of either gr
 drawn anywhere in them; how often in front is how often the benchmark's 829 test tasks put an object there.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

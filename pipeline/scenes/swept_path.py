@@ -1,7 +1,5 @@
 """The space that a demonstration moves through, and the surfaces that added objects may stand on."""
 
-from __future__ import annotations
-
 import copy
 
 import mujoco

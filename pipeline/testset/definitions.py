@@ -4,8 +4,6 @@ What a task changes is in its name, in its BDDL file, or in the class that the B
 only literals are read, through Python's syntax tree or by pattern; none is imported.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import zipfile

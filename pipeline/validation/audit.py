@@ -4,8 +4,6 @@ What an episode shows counts first: the instruction, and the matrices of the cam
 other axes only this project's labels tell (``perturbations``), in the dataset or, by ``episode_id``, in a manifest.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping

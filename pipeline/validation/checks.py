@@ -1,7 +1,5 @@
 """What must hold of an episode wherever it lies: small functions, each with a name, that yield what is off."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whether a folder of demonstrations can be used: every file is read, and some of each file are replayed."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """What a run needs of its machine, checked in seconds and before any work. Nothing is written."""
 
-from __future__ import annotations
-
 import base64
 import ctypes.util
 import hashlib

@@ -3,8 +3,6 @@
 ``setup.sh`` does so once. Without it, each process that is the first to need a loop compiles it, several at a time.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pipeline import seeding

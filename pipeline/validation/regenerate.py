@@ -3,8 +3,6 @@
 `python -m pipeline regenerate EPISODE_ID CONFIG --out FOLDER`
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path

@@ -4,8 +4,6 @@ The process is another than the one that rendered the frames, and the pictures a
 Noise and turning are done here once more, by other code than that of the run (``rendering/render.py``).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where a run stands: what is kept of what is wanted, what would run and why, and the disk. Nothing is changed."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """Compare everything that a run stored with the checksums that it was stored with."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any

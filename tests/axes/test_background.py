@@ -1,7 +1,5 @@
 """Background: the surfaces it names in every arena, nothing else in the model, and all as it was afterwards."""
 
-from __future__ import annotations
-
 import hashlib
 from itertools import product
 from statistics import mean, mode

@@ -1,7 +1,5 @@
 """Camera: the benchmark's own formulas, by an independent implementation, and clear of its test cameras."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Iterator, Mapping

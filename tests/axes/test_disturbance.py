@@ -1,7 +1,5 @@
 """Disturbance: pushes of the stated size, away from grasps, from which a tracked replay comes back to its goal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

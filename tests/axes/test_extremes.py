@@ -1,7 +1,5 @@
 """No number that a configuration may say stops a run: every field of every axis, at the ends of what is accepted."""
 
-from __future__ import annotations
-
 import copy
 import struct
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Each array of a model can be changed before a camera, and shows as MuJoCo draws it, or is refused with words."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Iterator

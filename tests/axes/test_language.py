@@ -1,7 +1,5 @@
 """The bank of rewrites is clean and complete, and the draws from it are keyed, distinct and balanced."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A rewrite that changes its task's goal is refused with the reason; one that keeps it is not, however it is put."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Confounding objects: at rest, out of the way, of other categories, and nothing of the scene itself changed."""
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace

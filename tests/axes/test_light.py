@@ -1,7 +1,5 @@
 """Light: every lamp of every arena, only what renders, and frames that stay legible at the strongest draws."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Iterator
 from statistics import mean

@@ -1,7 +1,5 @@
 """Each corruption equals an independent implementation of it, and its draws are keyed and off the test grid."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path

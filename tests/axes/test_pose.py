@@ -1,7 +1,5 @@
 """Pose: the right object moves, as far as its level says, and stays where the instruction says it is."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

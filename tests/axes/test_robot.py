@@ -1,7 +1,5 @@
 """Robot: offsets of the stated size, clear of the benchmark's, that change the arm's start and nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

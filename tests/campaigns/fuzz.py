@@ -8,8 +8,6 @@ error, a crash of the process, a hang, other values, and a file that was written
 in processes of their own, so that a crash costs one. The last line is JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

@@ -4,8 +4,6 @@ Numbers that are there are never written over. Where a result has changed, raise
 ``pipeline.identity.RECIPES`` in the same commit and run this again: then every stored file of that step is made anew.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

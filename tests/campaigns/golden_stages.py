@@ -1,7 +1,5 @@
 """What stages behind the frames make of a few small inputs: see ``golden.py``, which records it."""
 
-from __future__ import annotations
-
 import hashlib
 import tempfile
 from collections.abc import Callable, Mapping

@@ -8,8 +8,6 @@ alone, or one of its workers, which the run has to survive. In the end both must
 bytes, and no file that was whole at a kill may have been made again. The last line is JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

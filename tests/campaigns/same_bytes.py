@@ -6,8 +6,6 @@ Each run is a `dvc repro` in a folder of its own, on the tests' short demonstrat
 configuration may differ. The last line is JSON.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -9,8 +9,6 @@ go on must say so in words and end with 1; in the end both folders must hold the
 day ahead, and no stage may make one of them again. The last line is JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

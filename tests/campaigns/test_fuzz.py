@@ -1,7 +1,5 @@
 """Damaged and hostile files are refused with words; `python tests/campaigns/fuzz.py` tries a thousand."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

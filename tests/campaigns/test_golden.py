@@ -1,7 +1,5 @@
 """What a step makes does not change unless its recipe number does."""
 
-from __future__ import annotations
-
 import golden_stages
 import numpy as np
 import pytest

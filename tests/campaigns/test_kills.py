@@ -1,7 +1,5 @@
 """Of a run whose stages and workers are killed, the same comes; `python tests/campaigns/kills.py` kills all stages."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Models of objects: what is installed stands and is tellable apart; what is converted keeps size, look and licence."""
 
-from __future__ import annotations
-
 import io
 import shutil
 import tarfile

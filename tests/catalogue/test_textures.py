@@ -1,7 +1,5 @@
 """Textures: enough of them, distinct, with licence and hash, and none that the test set shows."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import zipfile

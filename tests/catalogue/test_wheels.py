@@ -1,7 +1,5 @@
 """A wheel is fetched once, checked, left as it is, and asked for in words that help where it cannot be had."""
 
-from __future__ import annotations
-
 import hashlib
 import zipfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The reader makes of our RLDS what OpenVLA-OFT's loader would, and the check catches what would mislead it."""
 
-from __future__ import annotations
-
 import io
 import json
 from collections.abc import Callable

@@ -4,8 +4,6 @@ OpenVLA-OFT cannot be installed here. A stand-in has the names that the scripts 
 that writes down what it was given.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -5,8 +5,6 @@ lerobot's dataset and processors are its own. OpenVLA-OFT's and openpi's formula
 ``benchmarks/clients/round.py`` runs openpi's own code.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Iterator
 from contextlib import closing

@@ -1,7 +1,5 @@
 """What a user types: every command explains itself at once, and those around a run do what they say."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """A command ends with words and a status, whatever the machine refuses."""
 
-from __future__ import annotations
-
 import errno
 import os
 import re

@@ -1,7 +1,5 @@
 """What workers are given to do, in a module that they import quickly."""
 
-from __future__ import annotations
-
 import os
 import resource
 import time

@@ -1,7 +1,5 @@
 """Workers of a cluster that was started elsewhere: the same bytes, nothing of an earlier run, or a clear refusal."""
 
-from __future__ import annotations
-
 import os
 import re
 import runpy

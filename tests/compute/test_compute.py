@@ -1,7 +1,5 @@
 """Work spread over processes: the same results in the same order, and a worker's error as it was raised."""
 
-from __future__ import annotations
-
 import os
 import resource
 import socket

@@ -1,7 +1,5 @@
 """Workers as jobs of a real SLURM, of one node, that runs as whoever runs the tests."""
 
-from __future__ import annotations
-
 import getpass
 import os
 import shutil

@@ -4,8 +4,6 @@ The archive itself cannot be here. The stand-in has its folders and names, so wh
 needs, and that they are used as the benchmark uses them.
 """
 
-from __future__ import annotations
-
 import shutil
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator

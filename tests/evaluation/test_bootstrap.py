@@ -1,7 +1,5 @@
 """Intervals of paired trials hold what they promise: simulated where the truth is known, and beside SciPy's own."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Several perturbations of one scene: one order whatever order they are listed in, and each sees those before it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Episodes are LIBERO's own: the same start, states and frames, whatever was run before and however it is spread."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The paper's analyses: what they compute is worked by hand, and what they run is LIBERO's own scene and judgement."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """A stored result is of the policy, settings and versions that it is asked for, or it does not count."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable, Iterator

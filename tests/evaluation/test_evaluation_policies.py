@@ -1,7 +1,5 @@
 """A policy that fails costs the episode that it fails in."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterator

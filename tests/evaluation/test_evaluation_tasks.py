@@ -1,7 +1,5 @@
 """What can be evaluated is what LIBERO and LIBERO-Plus define, and choosing is fair and repeatable."""
 
-from __future__ import annotations
-
 import io
 import json
 import pickle

@@ -1,7 +1,5 @@
 """lerobot-eval sees what LIBERO's own environment shows, and each of its episodes is one row."""
 
-from __future__ import annotations
-
 import sys
 from importlib import import_module
 from importlib.metadata import version

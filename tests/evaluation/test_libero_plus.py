@@ -1,7 +1,5 @@
 """Test tasks are set up as LIBERO-Plus sets them up: its formulas, written here with what it computes them with."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections import Counter

@@ -1,7 +1,5 @@
 """A model server that is shown few observations is shown the right ones: those that it computes new actions from."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 from collections.abc import Callable

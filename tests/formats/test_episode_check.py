@@ -1,7 +1,5 @@
 """What every writer refuses of an episode's frames, in words that say what they are."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Callable
 from dataclasses import replace

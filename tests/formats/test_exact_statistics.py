@@ -1,7 +1,5 @@
 """Statistics are exact, over every step of every episode, and each client gets them in its own convention."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """lerobot's language column: as lerobot 0.6.1 defines it, and where that is installed, as it reads it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """lerobot, as it is installed, streams a dataset and changes its features."""
 
-from __future__ import annotations
-
 import shlex
 from pathlib import Path
 from typing import Any

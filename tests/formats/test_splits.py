@@ -1,7 +1,5 @@
 """A validation split holds out whole demonstrations, and lerobot's tools keep the episodes' ids."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -1,7 +1,5 @@
 """Both formats on synthetic episodes: what is read back is what went in, and bad episodes replace nothing."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess

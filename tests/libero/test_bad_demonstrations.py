@@ -1,7 +1,5 @@
 """A demonstration that cannot be simulated is dropped with a reason and named; the others are replayed all the same."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """BDDL files: what the reader says of LIBERO's own, and that it refuses what defines no task."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

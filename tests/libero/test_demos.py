@@ -1,7 +1,5 @@
 """Demonstrations are read as recorded, unusable ones are named and skipped, and no recording reaches a foreign file."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """Downloads are whole or named, resume where they stopped, and stay inside their folder."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

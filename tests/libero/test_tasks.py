@@ -1,7 +1,5 @@
 """LIBERO's task list, read without importing LIBERO, and tasks of one's own."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The first frame of an episode shows what an evaluation of LIBERO shows first: everything at rest, gripper open."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Figures of how well a trajectory was moved, by robosuite's own contacts and sites, and by planted faults."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

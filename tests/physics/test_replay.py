@@ -1,7 +1,5 @@
 """Replay: the same bytes whenever and wherever, the no-op rule, and verdicts with reasons."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

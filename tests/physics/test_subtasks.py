@@ -1,7 +1,5 @@
 """Subtasks by robosuite's grasps, MuJoCo's contacts and the predicates of LIBERO's goals, in LIBERO's environment."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise

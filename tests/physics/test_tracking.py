@@ -1,7 +1,5 @@
 """Tracked replay: routes through moved things, actions that a policy could have sent, and goals reached from afar."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Test tasks planted in a plan are found, on every axis, and stop the run; what cannot be known is said."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

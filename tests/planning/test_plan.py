@@ -1,7 +1,5 @@
 """The plan: keyed draws, quotas with replacements in plan order, and every row accounted for."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from pathlib import Path

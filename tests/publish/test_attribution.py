@@ -1,7 +1,5 @@
 """Who made what episodes show is told from the manifest alone, and the sources hold what the README promises."""
 
-from __future__ import annotations
-
 from conftest import MILK
 
 from pipeline.axes import AXES, to_json

@@ -1,7 +1,5 @@
 """The card says what the run's files say, its pictures are beside it, and the hub can read its metadata."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -1,7 +1,5 @@
 """An upload is whole or not there, sends nothing twice, and sends nothing that was not validated or not asked for."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """In each of LIBERO's arenas, pictures with savings and plain ones are those that MuJoCo's own renderer draws."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import product
 

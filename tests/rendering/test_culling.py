@@ -1,7 +1,5 @@
 """What is left out of a picture cannot be seen in it."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

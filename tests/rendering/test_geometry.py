@@ -1,7 +1,5 @@
 """Cameras, depth, segmentation and poses: what the datasets have of them leads from a pixel to the thing it shows."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What stands still is drawn once, and every picture is the one that MuJoCo draws at once."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

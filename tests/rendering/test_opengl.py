@@ -1,7 +1,5 @@
 """What OpenGL reports is heard: what may spoil a picture stops, and what MuJoCo leaves behind is said once."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

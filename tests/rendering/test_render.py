@@ -1,7 +1,5 @@
 """Rendering: pixel for pixel what LIBERO's own environment returns, and no more of the model changed than is said."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterator

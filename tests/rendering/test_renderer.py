@@ -1,7 +1,5 @@
 """One OpenGL context serves one scene after the other, with the frames that each would have alone."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from contextlib import closing

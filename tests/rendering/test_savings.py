@@ -1,7 +1,5 @@
 """Savings are used where they were tested and give equal pixels; everywhere else MuJoCo draws a scene as it is."""
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

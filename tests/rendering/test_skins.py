@@ -1,7 +1,5 @@
 """Of a mesh only the faces are drawn that a picture can show, and every picture is the one that MuJoCo draws of all."""
 
-from __future__ import annotations
-
 import ctypes
 from contextlib import closing
 

@@ -1,7 +1,5 @@
 """The report of evaluations says what the episodes' files say: merged, weighted, compared, beside published rows."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The report of a run that was really made: complete, true to the manifest, in need of nothing beside itself."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """What a policy sees in a run beside the benchmark's test tasks: no kind of test is missing, and the figures are so."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a language model says gets into a bank through the lint alone, whatever else the endpoint does."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable, Iterator

@@ -3,8 +3,6 @@
 Most tests are of ``--starts wide``; what resets have in common with it is tested there.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

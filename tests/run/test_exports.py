@@ -1,7 +1,5 @@
 """A killed export goes on to the same bytes and leaves nothing behind; what is finished is left alone."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Replays that missed their goal are sets of their own, where they are asked for, and nothing else changes."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from contextlib import chdir

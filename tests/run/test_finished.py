@@ -1,7 +1,5 @@
 """Stages that are started again do nothing where nothing has changed, and notice what has."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable
 from pathlib import Path

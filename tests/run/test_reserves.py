@@ -1,7 +1,5 @@
 """Where frames are refused, a reserve takes the place of the episode, also one that has to be replayed first."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

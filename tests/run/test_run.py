@@ -1,7 +1,5 @@
 """Whole runs on real demonstrations: both datasets and the manifest agree, and nothing is made twice."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

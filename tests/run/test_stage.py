@@ -1,7 +1,5 @@
 """A run's folder belongs to one configuration file: a copy of the file with the old name cannot touch it."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json

@@ -1,7 +1,5 @@
 """What is stored is current or missing, the table tells it without opening files, and nothing shrinks in silence."""
 
-from __future__ import annotations
-
 import errno
 import json
 import os

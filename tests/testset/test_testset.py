@@ -1,7 +1,5 @@
 """The test set is read whole and right from the pinned wheel, and from no other file."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import zipfile

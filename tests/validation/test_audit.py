@@ -1,7 +1,5 @@
 """What an audit tells of datasets into which test tasks were planted, as they are and after their labels were lost."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """`demos check`: good files pass, and of others file, demonstration and fault are named."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

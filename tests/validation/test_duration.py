@@ -1,7 +1,5 @@
 """The estimate of a run's time: what it follows, and that the stages' own speed is what `doctor` finds."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

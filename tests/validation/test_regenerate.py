@@ -1,7 +1,5 @@
 """One episode made again from its row of the manifest is the dataset's, byte for byte; what differs is named."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The validator passes a good run, and names every planted fault by check, dataset and episode."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -18,8 +18,6 @@ any later decay), the statistics of a checkpoint are also named by suite, which 
 the statistics that OFT computes first are not written among the dataset's files.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -6,8 +6,6 @@
 * Meshes and textures that a scene shares with the one before stay in the context.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from contextlib import ExitStack
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The faces of a model's meshes as MuJoCo uploads them."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import mujoco

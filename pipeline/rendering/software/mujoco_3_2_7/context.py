@@ -1,7 +1,5 @@
 """A context of MuJoCo 3.2.7 that goes on from one model to the next, with the textures that both have."""
 
-from __future__ import annotations
-
 from operator import attrgetter
 
 import mujoco

@@ -4,8 +4,6 @@ Each pass renders all opaque geoms in the order of the scene, skins included. Tr
 map of a light has no geoms of the category decor.
 """
 
-from __future__ import annotations
-
 from enum import Enum, auto
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Meshes rendered as skins by MuJoCo 3.2.7, which takes the faces of a skin from an index buffer."""
 
-from __future__ import annotations
-
 import ctypes
 
 import mujoco

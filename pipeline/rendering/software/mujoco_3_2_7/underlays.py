@@ -1,7 +1,5 @@
 """Colour and depth of MuJoCo 3.2.7's off-screen buffer, copied and put back."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 
