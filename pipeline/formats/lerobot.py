@@ -74,9 +74,9 @@ class LeRobot(Format[LeRobotConfig]):
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
-        from pipeline.formats import lerobot_read
+        from pipeline.formats import lerobot_check
 
-        return lerobot_read.check(self.root, cache, kept, self._convention.columns(self.extras))
+        return lerobot_check.check(self.root, cache, kept, self._convention.columns(self.extras))
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_read

@@ -1,39 +1,30 @@
-"""LeRobot datasets read back: each episode by pyarrow and PyAV; as a whole, and in samples, by lerobot."""
+"""LeRobot datasets read an episode at a time, by pyarrow and PyAV; lerobot itself reads in ``lerobot_check.py``."""
 
 import base64
 import json
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import av
-import datasets
-import huggingface_hub
-import huggingface_hub.constants
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from datasets.exceptions import DatasetsError
-from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA, named
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import PipelineError
 from pipeline.files import Edition, edition
-from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, LANGUAGE, OBJECT_POSES, camera_column
-from pipeline.formats.read_back import Copy, Fault, sampled
+from pipeline.formats.read_back import Copy, sampled
 from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Extra, Frame, Geometry
 
 UNREADABLE = (
     AssertionError,
     AttributeError,
-    DatasetsError,
     IndexError,
     KeyError,
     OSError,
@@ -48,51 +39,6 @@ UNREADABLE = (
 MARKS = ("frame_index", "timestamp")
 """LeRobot's columns that tell steps apart."""
 
-BY_LEROBOT = 8
-"""So many episodes are read by lerobot too, spread over the dataset."""
-
-SAME_LEVELS = 1
-"""Largest difference of a decoded frame between PyAV and what lerobot decodes with."""
-
-
-def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str, Any]) -> Iterator[tuple[str, Fault]]:
-    """What lerobot finds: frame rate, robot, the columns' names and shapes, as many episodes as were kept, and in
-    samples the very numbers and frames that ``read`` finds; and the videos' own frame rate.
-
-    Raises:
-        PipelineError: when the dataset cannot be opened.
-    """
-    # lerobot decodes through it, and each worker would print that it will go.
-    warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
-    with readable(root):
-        with local_only(cache):
-            data = LeRobotDataset(root.name, root=root, video_backend="pyav")
-        meta = data.meta
-        read: dict[str, Any] = {"fps": meta.fps, "robot_type": meta.robot_type}
-        wanted: dict[str, Any] = {"fps": SCHEMA.fps_hz, "robot_type": SCHEMA.robot_type}
-        for key, spec in columns.items():
-            has = meta.features.get(key, {})
-            read[key] = (has.get("dtype"), tuple(has.get("shape", ())), tuple(has.get("names") or ()))
-            wanted[key] = (spec["dtype"], tuple(spec["shape"]), tuple(spec["names"] or ()))
-        for file in sorted(root.glob("videos/**/*.mp4")):
-            name = str(file.relative_to(root))
-            with av.open(str(file)) as video:
-                read[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
-        stored = (meta.total_episodes, data.num_frames)
-        strangers = sorted(_rows(root).keys() - kept.keys())
-        samples = list(_samples(root, data))
-    for key, expected in wanted.items():
-        if read[key] != expected:
-            yield "format", Fault("lerobot", None, f"{key} is {read[key]}", f"{expected}")
-    for episode_id, key in samples:
-        yield "format", Fault("lerobot", episode_id, f"lerobot reads another {key}", "what its files hold")
-    steps = sum(row["steps"] for row in kept.values())
-    if stored != (len(kept), steps):
-        yield "ids", Fault("lerobot", None, f"{stored[0]} episodes of {stored[1]} steps", f"{len(kept)} of {steps}")
-    # One that is missing is told where it is looked for.
-    for episode_id in strangers:
-        yield "ids", Fault("lerobot", episode_id, "is in the dataset", "kept episodes alone")
-
 
 def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
     """An episode with these extras; None when the dataset does not have it.
@@ -101,70 +47,29 @@ def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
         PipelineError: when it cannot be read.
     """
     with readable(root):
-        row = _rows(root).get(episode_id)
-        return None if row is None else _copy(root, row, extras)
-
-
-def _samples(root: Path, data: LeRobotDataset) -> Iterator[tuple[str, str]]:
-    """Episode and column where lerobot hands out something else than ``read`` at the sampled steps."""
-    rows = sorted(_rows(root).values(), key=lambda row: row["episode_index"])
-    for place in sorted({round(k) for k in np.linspace(0, len(rows) - 1, BY_LEROBOT)}):
-        row = rows[place]
-        copy = _copy(root, row, ())
-        for step in sampled(row["length"]):
-            item = data[row["dataset_from_index"] + step]
-            for name in MOTION:
-                key = getattr(SCHEMA, name).lerobot_key
-                if not np.array_equal(item[key].numpy(), getattr(copy.episode, name)[step]):
-                    yield row[EPISODE_ID], key
-            for view, spec in SCHEMA.views.items():
-                # lerobot hands out floats in [0, 1], channels first.
-                shown = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
-                if np.abs(shown - copy.decoded[view, step]).max() > SAME_LEVELS:
-                    yield row[EPISODE_ID], spec.lerobot_key
-            if item["task"] != copy.instructions[step]:
-                yield row[EPISODE_ID], "task"
+        row = rows(root).get(episode_id)
+        return None if row is None else copy_of(root, row, extras)
 
 
 @contextmanager
-def readable(root: Path, version: str = "v3.0") -> Iterator[None]:
-    """Turn what damaged or missing files raise into the error that says so."""
+def readable(root: Path, version: str = "v3.0", also: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn what damaged or missing files raise, by ``UNREADABLE`` or ``also``, into the error that says so."""
     try:
         yield
-    except UNREADABLE as error:
+    except (*UNREADABLE, *also) as error:
         raise PipelineError(
             f"{type(error).__name__}: {error}", where=root, expected=f"a LeRobot {version} dataset", remedy="dvc repro"
         ) from error
 
 
-@contextmanager
-def local_only(cache: Path) -> Iterator[None]:
-    """Keep the copies that ``datasets`` makes of what lerobot reads out of the home folder, and lerobot off the hub."""
-    with (
-        mock.patch.object(datasets.config, "HF_DATASETS_CACHE", cache),
-        mock.patch.object(huggingface_hub.constants, "HF_HUB_OFFLINE", True),
-    ):
-        datasets.disable_progress_bars()
-        forget_sessions()
-        try:
-            yield
-        finally:
-            forget_sessions()
-
-
-def forget_sessions() -> None:
-    """Before huggingface-hub 1, a thread keeps a session, which stays on or off the hub as it was made."""
-    getattr(huggingface_hub, "configure_http_backend", lambda: None)()
-
-
-def _rows(root: Path) -> dict[str, dict[str, Any]]:
+def rows(root: Path) -> dict[str, dict[str, Any]]:
     """Episode id to its rows of ``meta/episodes`` and of ``meta/provenance.parquet``."""
     return _opened(edition(root / "meta" / "info.json"))[1]
 
 
 @lru_cache(maxsize=1)
 def _opened(info_file: Edition) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """``meta/info.json`` with the tasks by number, and the rows of ``_rows``."""
+    """``meta/info.json`` with the tasks by number, and what ``rows`` gives."""
     meta = info_file.path.parent
     info: dict[str, Any] = json.loads(info_file.path.read_text())
     info["tasks"] = {row["task_index"]: row["task"] for row in pq.read_table(meta / "tasks.parquet").to_pylist()}
@@ -182,7 +87,8 @@ def _file(row: Mapping[str, Any], kind: str = "data") -> tuple[int, int]:
     return row[f"{kind}/chunk_index"], row[f"{kind}/file_index"]
 
 
-def _copy(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy:
+def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Copy:
+    """An episode of ``rows``."""
     index, steps = row["episode_index"], row["length"]
     info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)

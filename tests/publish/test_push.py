@@ -23,7 +23,7 @@ from synthetic import SET, write_lerobot, write_lerobot_v21, write_rlds
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.files import replaced
-from pipeline.formats import lerobot_read
+from pipeline.formats import lerobot_check
 from pipeline.formats.registry import formats_of
 from pipeline.publish import push
 from pipeline.publish.card import REPORTS
@@ -318,9 +318,9 @@ def test_the_hub_is_in_reach_after_a_dataset_was_found_damaged(hub: Hub, data: P
     upload = prepare(data, "rlds")
     root = data / "lerobot" / NAME
     shutil.rmtree(root / "meta" / "episodes")
-    lerobot_read.forget_sessions()  # as in a process that has not spoken with the hub
+    lerobot_check.forget_sessions()  # as in a process that has not spoken with the hub
     with pytest.raises(PipelineError, match=re.escape(str(root))):
-        list(lerobot_read.check(root, tmp_path / "cache", {}, {}))
+        list(lerobot_check.check(root, tmp_path / "cache", {}, {}))
     send(upload, REPOSITORY)
     assert hub.files == expected(upload)
 
