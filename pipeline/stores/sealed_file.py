@@ -65,7 +65,8 @@ class SealedFile:
         self._file = file
         with _reading():
             self._arrays = _arrays(file)
-            if _seal_of(file) != _outline(self._arrays):
+            self._seals = {name: _seal_of(array) for name, array in self._arrays.items()}
+            if _seal_of(file) != _outline(self._seals):
                 raise BrokenSealError("the list of its arrays is not what was written")
             self.attributes: Mapping[str, Any] = json.loads(self.array(ATTRIBUTES).tobytes())
 
@@ -77,7 +78,7 @@ class SealedFile:
         stored = self._arrays[name]
         with _reading():
             values: NDArray[Any] = stored[()]
-            if _seal_of(stored) != _digest(values):
+            if self._seals[name] != _digest(values):
                 raise BrokenSealError(f"{name} is not what was written")
         return values
 
@@ -124,9 +125,10 @@ def sealed(path: Path, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
         file.flush()
         file[ATTRIBUTES] = np.frombuffer(json.dumps(dict(attributes), sort_keys=True).encode(), np.uint8)
         arrays = _arrays(file)
-        for array in arrays.values():
-            array.attrs[SEAL] = np.bytes_(_digest(array[()]))
-        file.attrs[SEAL] = np.bytes_(_outline(arrays))
+        seals = {name: _digest(array[()]) for name, array in arrays.items()}
+        for name, seal in seals.items():
+            arrays[name].attrs[SEAL] = np.bytes_(seal)
+        file.attrs[SEAL] = np.bytes_(_outline(seals))
 
 
 def _arrays(file: h5py.File) -> dict[str, h5py.Dataset]:
@@ -145,5 +147,5 @@ def _digest(values: NDArray[Any]) -> str:
     return sha256(described + np.ascontiguousarray(values).tobytes()).hexdigest()
 
 
-def _outline(arrays: Mapping[str, h5py.Dataset]) -> str:
-    return sha256(json.dumps({name: _seal_of(array) for name, array in arrays.items()}).encode()).hexdigest()
+def _outline(seals: Mapping[str, str]) -> str:
+    return sha256(json.dumps(seals).encode()).hexdigest()
