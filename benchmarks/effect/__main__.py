@@ -91,13 +91,17 @@ class Work:
         from model_server import running
         from results import PolicyResults
 
-        policy, folder = self.policy(arm, seed), self.out / "evaluations" / self.policy(arm, seed).name
+        policy = self.policy(arm, seed)
+        weights = checksum(policy / "model.safetensors")
+        # What a policy did that was trained before under the same settings is not this one's.
+        label = f"{policy.name}_{weights[:8]}"
+        folder = self.out / "evaluations" / label
         tasks = folder / "tasks.json"
         tested = evaluation.tested(self.experiment)
         write_tasks(tested, 0, tasks)
         server = running(str(HERE / "server.py"), "--args.folder", str(policy))
         with self._timed(f"evaluation {policy.name}"), server as address:
-            words = ["evaluate", str(folder), "--server", address, "--label", policy.name, "--tasks-from", str(tasks)]
+            words = ["evaluate", str(folder), "--server", address, "--label", label, "--tasks-from", str(tasks)]
             run("-m", "pipeline", *words)
             reading = evaluation.tell(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)
@@ -106,7 +110,7 @@ class Work:
             "dataset_sha256": checksum(dataset),
             "episodes_by_axis": episodes.read(dataset).axes(),
             "sentences_sha256": checksum(sentences.FILE),
-            "policy_sha256": checksum(policy / "model.safetensors"),
+            "policy_sha256": weights,
             "losses": [[entry["step"], entry["loss"]] for entry in map(json.loads, losses[9::10])],
             "packages": {name: version(name) for name in ("torch", "torchvision", "lerobot")},
             "seconds": self._seconds(),

@@ -10,7 +10,7 @@ from typing import Any
 from results import PolicyResults, read
 
 from pipeline.evaluation.results import EpisodeResult
-from pipeline.evaluation.statistics import compare, paired, success_rate
+from pipeline.evaluation.statistics import compare, paired, success_rate, wilson
 from pipeline.files import replaced
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -132,8 +132,10 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
         for number, line in enumerate(lines_of(results)):
             seeds = of_line(results, line)[arm]
             rate = success_rate([*chain.from_iterable(seeds.values())])
+            # All seeds act in the same tasks, so that they are no further trials.
+            low, high = wilson(rate["successes"] / len(seeds), rate["episodes"] / len(seeds))
             x, height = number + 0.8 * (place + 0.5) / len(arms) - 0.4, 100 * rate["rate"]
-            spread = [[height - 100 * rate["low"]], [100 * rate["high"] - height]]
+            spread = [[height - 100 * low], [100 * high - height]]
             axes.bar(x, height, 0.7 / len(arms), color=COLOURS[place], label=arm if number == 0 else None)
             axes.errorbar(x, height, spread, color="black", linewidth=0.8)
             each = [100 * success_rate(rows)["rate"] for rows in seeds.values()]

@@ -8,6 +8,7 @@ from typing import Any
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeResult
+from pipeline.evaluation.rollout import RECORDED
 from pipeline.files import read_json, replaced
 
 
@@ -29,6 +30,15 @@ class PolicyResults:
     made: dict[str, Any]
     rows: Sequence[EpisodeResult]
     reading: Sequence[dict[str, Any]]
+
+    def made_by(self) -> dict[str, Any]:
+        """What has to be the same for policies to be compared."""
+        return {
+            "settings": self.settings,
+            "sentences": self.made.get("sentences_sha256"),
+            "packages": self.made.get("packages"),
+            "versions": {k: v for row in self.rows[:1] for k, v in row.versions.items() if k not in RECORDED},
+        }
 
     def write(self, folder: Path) -> Path:
         """Fields that are the same in all rows are written once."""
@@ -63,13 +73,14 @@ def read(folder: Path) -> list[PolicyResults]:
         columns, common = content.pop("columns"), content.pop("common")
         rows = [EpisodeResult(**common, **dict(zip(columns, row, strict=True))) for row in content.pop("rows")]
         found.append(PolicyResults(**content, rows=rows))
-        if found[-1].settings != found[0].settings:
-            raise PipelineError(
-                "made by other settings than the results beside it",
-                where=file,
-                expected="one experiment",
-                remedy="evaluate all policies under the same experiment, or delete those of the older one",
-            )
+        for what in ("settings", "sentences", "packages", "versions"):
+            if found[-1].made_by()[what] != found[0].made_by()[what]:
+                raise PipelineError(
+                    f"made by other {what} than the results beside it",
+                    where=file,
+                    expected="one experiment",
+                    remedy="evaluate all policies under the same experiment, or delete those of the older one",
+                )
     if not found:
         raise PipelineError("there are no results yet", where=folder, remedy="train and evaluate a policy first")
     arms = list(found[0].settings["arms"])
