@@ -296,7 +296,10 @@ def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
     for one in written:
         one.write(tmp_path)
     assert results.read(tmp_path) == written
-    others = {"settings": {"settings": {"frame_px": 32}}, "packages": {"made": {"packages": {"torch": "1.0"}}}}
+    others: dict[str, dict[str, Any]] = {
+        "settings": {"settings": {"frame_px": 32}},
+        "packages": {"made": {"packages": {"torch": "1.0"}}},
+    }
     for what, changed in others.items():
         replace(written[0], arm="other", **changed).write(tmp_path)
         with pytest.raises(PipelineError, match=f"made by other {what}"):
