@@ -47,6 +47,11 @@ def test_every_script_has_a_stage_and_no_output_lies_in_another() -> None:
     assert not [(one, other) for one in made for other in made if one in other.parents]
 
 
+def test_a_run_that_goes_on_elsewhere_is_compared_first() -> None:
+    assert "host" in sections("doctor")
+    assert DATA + "machine.json" in STAGES["plan"]["deps"]
+
+
 @pytest.mark.parametrize("file", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda file: file.stem)
 def test_sections_of_the_configuration_are_written_out_whatever_it_leaves_out(file: Path) -> None:
     """DVC stops where a parameter is missing."""

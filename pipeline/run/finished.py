@@ -79,11 +79,15 @@ def of_validate(config: Config) -> Memory:
 
 
 def of_doctor(config: Config, device: str) -> Memory:
-    """Of a trial of this machine, by its name, its kernel, its processor and what renders."""
+    """Of a trial of this machine."""
+    return Memory(config.data, "doctor", fingerprint("pixels", device, *host()), ["machine.json"])
+
+
+def host() -> list[list[str]]:
+    """This machine's name and kernel, and the models of its processors."""
     cpu = Path("/proc/cpuinfo")
     models = {line for line in cpu.read_text().splitlines() if line.startswith("model name")} if cpu.exists() else {}
-    made_by = fingerprint("pixels", device, platform.uname(), sorted(models))
-    return Memory(config.data, "doctor", made_by, ["machine.json"])
+    return [list(platform.uname()), sorted(models)]
 
 
 def of_summary(config: Config) -> Memory:

@@ -6,6 +6,7 @@ both are the same nothing runs again.
 """
 
 from collections.abc import Iterator, Mapping
+from glob import glob
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -14,7 +15,7 @@ from pydantic import BaseModel
 from pipeline.config import Config
 from pipeline.files import checksum
 from pipeline.libero.tasks import OWN, SUITES, select_tasks
-from pipeline.run.finished import settings_of
+from pipeline.run.finished import host, settings_of
 
 HASHED_BYTES = 16_000_000
 """Files up to this size are listed by their content; larger ones by size and time of change, as hashing takes long."""
@@ -35,11 +36,15 @@ def listing(config: Config) -> dict[str, list[str | int]]:
 
 
 def settings(config: Config) -> dict[str, Any]:
-    """Every section that decides what is made, with all fields; of a path the last name, as for ``listing``."""
+    """Every section that decides what is made, with all fields, and this machine.
+
+    Of a path the last name, as for ``listing``.
+    """
     sections = {
         name: settings_of(getattr(config, name)) for name in ("demos", "plan", "replay", "filter", "render", "export")
     }
-    return {**sections, "export": {"where": None, "lerobot_v21": None, "failures": False, **sections["export"]}}
+    export = {"where": None, "lerobot_v21": None, "failures": False, **sections["export"]}
+    return {**sections, "export": export, "host": host()}
 
 
 def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:
@@ -58,12 +63,8 @@ def _paths(value: Any, field: str = "") -> Iterator[tuple[str, Path]]:
 
 def _files(path: Path) -> Iterator[Path]:
     if path.is_dir():
-        # Hidden files are records that downloads leave.
-        yield from (
-            file
-            for file in path.rglob("*")
-            if file.is_file() and not any(part.startswith(".") for part in file.relative_to(path).parts)
-        )
+        # Without hidden files, which are records that downloads leave; with those of folders that are links.
+        yield from (file for name in glob("**", root_dir=path, recursive=True) if (file := path / name).is_file())
     elif path.exists():
         yield path
 

@@ -62,7 +62,7 @@ def claimed(file: Path) -> Config:
     if not mark.exists():
         with locked(config.data):
             if not mark.exists():  # Of two stages that start at the same time, the second finds it.
-                write_json(mark, {"configuration": _named(file), "name": config.name})
+                write_json(mark, {"configuration": _named(file, config.data), "name": config.name})
     _refuse_foreign(config, file)
     _refuse_links(config.data)
     return config
@@ -123,7 +123,7 @@ def _refuse_other_folder(config: Config, file: Path) -> None:
 
 
 def _refuse_foreign(config: Config, file: Path) -> None:
-    mark, own = config.data / OWNER, _named(file)
+    mark, own = config.data / OWNER, _named(file, config.data)
     try:
         owner = str(json.loads(mark.read_text())["configuration"])
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -152,7 +152,8 @@ def _refuse_links(folder: Path) -> None:
         )
 
 
-def _named(file: Path) -> str:
-    """The file's path from the folder that ``data`` lies in, or in full where it is not below that."""
+def _named(file: Path, folder: Path) -> str:
+    """The configuration's path from here where the run's folder is here too, and moves with it; else in full."""
     file, here = file.resolve(), Path.cwd().resolve()
-    return file.relative_to(here).as_posix() if file.is_relative_to(here) else file.as_posix()
+    together = file.is_relative_to(here) and folder.resolve().is_relative_to(here)
+    return file.relative_to(here).as_posix() if together else file.as_posix()

@@ -3,6 +3,7 @@
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from glob import glob
 from pathlib import Path
 
 from pipeline.compute.pool import LOST, Expendable, Workers
@@ -46,7 +47,7 @@ def check(root: Path, replays: int, run: Workers) -> Found:
     Raises:
         PipelineError: when there is no file.
     """
-    files = sorted(file for file in root.rglob("*.hdf5") if not file.relative_to(root).parts[0].startswith("."))
+    files = [root / name for name in sorted(glob("**/*.hdf5", root_dir=root, recursive=True))]
     if not files:
         raise PipelineError("there is no HDF5 file", where=root, expected=LAYOUT)
     found, jobs = Found(len(files)), []

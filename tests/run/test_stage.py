@@ -75,6 +75,18 @@ def test_a_renamed_file_gets_the_folder_when_the_mark_is_deleted(clone: Path) ->
     assert json.loads(mark.read_text())["configuration"] == "configs/renamed.yaml"
 
 
+def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
+    clone: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shared, other, file = tmp_path_factory.mktemp("disk"), tmp_path_factory.mktemp("other"), Path("configs/tiny.yaml")
+    file.write_text(file.read_text() + f"folder: {shared}\n")
+    shutil.copytree("configs", other / "configs")
+    claimed(file)
+    monkeypatch.chdir(other)
+    with pytest.raises(PipelineError, match=f"the folder belongs to {clone / file}, and {other / file} has the same"):
+        claimed(file)
+
+
 def test_reading_a_run_writes_nothing(clone: Path) -> None:
     owned(Path("configs/tiny.yaml"))
     assert not (clone / "data").exists()

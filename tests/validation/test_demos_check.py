@@ -121,6 +121,20 @@ def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         Config.model_validate({**said, "demos": {"tasks": ["my_suite/*"]}})
 
 
+def test_a_suite_that_is_a_link_is_seen_as_a_folder_is(root: Path) -> None:
+    said = {
+        "name": "own",
+        "demos": {"root": str(root), "tasks": [f"{STOVE.suite}/*"]},
+        "plan": {"episodes": {"camera": 1}},
+    }
+    before = listing(Config.model_validate(said))
+    (root / STOVE.suite).rename(root.parent / "away")
+    (root / STOVE.suite).symlink_to(root.parent / "away")
+    assert listing(Config.model_validate(said)) == before
+    assert f"demos.root/{STOVE.suite}/{STOVE.name}_demo.hdf5" in before
+    assert checked(root).files == 2
+
+
 def test_two_files_with_one_demonstration_are_named(root: Path) -> None:
     shutil.copy(file_of(root, BOWL), file_of(root, STOVE))
     with h5py.File(file_of(root, STOVE), "r+") as file:
