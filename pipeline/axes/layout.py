@@ -53,7 +53,7 @@ class LayoutPerturbation(PhysicsPerturbation):
     objects: Annotated[tuple[AddedObject, ...], Field(min_length=1)]
     seed: int
 
-    measure: ClassVar[str] = "1 where no category is shared with a test task of the same LIBERO task, else 0"
+    measure: ClassVar[str] = "infinite where no category is shared with a test task of the same LIBERO task, else 0"
     clearance: ClassVar[float] = 1.0
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:

@@ -111,10 +111,9 @@ class PosePerturbation(PhysicsPerturbation):
 
 @cache
 def _test_moves_m(test: TestSet, task: Task, moved: str) -> Floats:
-    """(N, 2) how far each of the axis's test tasks of ``task`` moves one of its targets; NaN for another thing."""
-    nowhere, is_target = (math.nan, math.nan), moved in bddl.read(task.bddl_file).targets
-    moves_m = [displacements(one.parameters).get(moved, nowhere) for one in test.on(task, "pose")]
-    return np.array(moves_m if is_target else [nowhere] * len(moves_m)).reshape(-1, 2)
+    """(N, 2) how far each of the axis's test tasks of ``task`` moves a thing; NaN where it stays."""
+    nowhere = (math.nan, math.nan)
+    return np.array([displacements(one.parameters).get(moved, nowhere) for one in test.on(task, "pose")]).reshape(-1, 2)
 
 
 Shifts = dict[str, tuple[float, float]]

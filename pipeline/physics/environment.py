@@ -208,6 +208,9 @@ class Environment:
             self._control_step(action)
         except (np.linalg.LinAlgError, mujoco.FatalError) as error:
             raise RefusedError("simulation_unstable") from error
+        # MuJoCo then goes on from the model's own pose, and raises nothing.
+        if self.sim.data._data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+            raise RefusedError("simulation_unstable")
 
     def _act_from_outside(self) -> None:
         """Begin or end the scene's push, and count the step that follows."""

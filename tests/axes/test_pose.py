@@ -195,7 +195,7 @@ def test_nearest_knows_each_of_several_objects_that_a_test_task_moves() -> None:
     assert moved("moka_pot_1", -0.03, 0.0).nearest(test, POTS).distance > 0.04, "that is how the other one moves"
     assert moved("moka_pot_2", -0.03, 0.0).nearest(test, POTS) == pytest.approx((1e-5, 1))
     assert moved("moka_pot_2", -0.03, 0.01).nearest(test, POTS) == pytest.approx((0.00999, 1))
-    assert moved("flat_stove_1", 0.0, 0.0).nearest(test, POTS) == (math.inf, 0), "no target of the task"
+    assert moved("flat_stove_1", 0.0, 0.0).nearest(test, POTS) == (0, 1), "what the goal leaves standing moves too"
 
 
 def test_the_replay_starts_there(plate_environment: Environment) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from conftest import STOVE
 
+from pipeline.errors import RefusedError
 from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.types import Scene, Task, Trajectory
@@ -91,3 +92,13 @@ def test_only_pictures_are_left_out_of_the_model(stove: Environment, whole: dict
     arrays = {name for name in set(dir(recorded)) - others if isinstance(getattr(recorded, name), np.ndarray)}
     assert {"body_mass", "geom_size", "mesh_vert", "mat_rgba", "jnt_range"} < arrays
     assert [name for name in sorted(arrays) if not np.array_equal(getattr(ours, name), getattr(recorded, name))] == []
+
+
+def test_what_mujoco_resets_by_itself_is_unstable(stove: Environment, whole: dict[Task, Trajectory]) -> None:
+    trajectory = whole[STOVE]
+    stove.restore(trajectory.scene)
+    stove.sim.data.qvel[-1] = 1e8
+    with pytest.raises(RefusedError, match="simulation_unstable"):
+        stove.step(trajectory.actions[0])
+    stove.restore(trajectory.scene)
+    stove.step(trajectory.actions[0])
