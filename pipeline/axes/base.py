@@ -260,6 +260,10 @@ Number = TypeVar("Number", bound=float)
 def _ordered(intervals: tuple[tuple[Number, Number], ...]) -> tuple[tuple[Number, Number], ...]:
     if not intervals or any(low > high for low, high in intervals):
         raise ValueError(f"expected one or more [low, high] with low <= high, got {[list(i) for i in intervals]}")
+    if len(intervals) > 1 and any(low == high and isinstance(low, float) for low, high in intervals):
+        raise ValueError(
+            f"a point beside others is never drawn: {[list(i) for i in intervals]}; widen it or leave it out"
+        )
     return intervals
 
 

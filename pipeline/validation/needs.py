@@ -22,6 +22,7 @@ from pipeline.axes import AXES, Perturbation, PhysicsPerturbation, RenderPerturb
 from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.export_config import CLEAN
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
@@ -64,6 +65,8 @@ SHADOWS_S, SHADOWS = 0.13, 0.4
 """What shadows add to a frame, and the share of the light episodes that have them."""
 ENCODE_S = 0.004
 """Of a frame: the JPEG, and the noise where there is some. A GPU does not make it quicker."""
+MAPS_S = 0.045
+"""Depth or segmentation, or both, of a view of one step: rendered once more, and PNG files."""
 SCENE_S, STEP_S, TRIES = 2.2, 0.007, 1.4
 """A trajectory besides its control steps; a step; how often steps are run, as tracking follows a replay that missed."""
 RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.003, 0.0013
@@ -78,16 +81,15 @@ def needed_mb(config: Config) -> dict[str, float]:
     Every planned episode counts as kept, and so does the clean twin of every demonstration.
     """
     amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
-    twins, planned, twin_steps, mean_steps = amounts
-    steps, episodes, export = amounts.steps, twins + planned, config.export
+    twins, _, twin_steps, mean_steps = amounts
+    export, (episodes, steps) = config.export, _exported(config, amounts)
     # What planned episodes have that their twins do not: trajectories, and views of frames and of maps.
     trajectories = frames = maps = 0.0
     for _, number, kinds in _planned(config.plan):
-        physics = [kind for kind in kinds if issubclass(kind, PhysicsPerturbation)]
-        cameras = [kind for kind in kinds if issubclass(kind, RenderPerturbation) and kind.sees_otherwise]
-        trajectories += number * (1 + config.plan.reserve) * bool(physics)
+        physics = any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
+        trajectories += number * (1 + config.plan.reserve) * physics
         frames += number * len({view for kind in kinds for view in kind.views})
-        maps += number * len({view for kind in (*physics, *cameras) for view in kind.views})
+        maps += number * len({view for kind in kinds if _seen_otherwise(kind) for view in kind.views})
     frame_kb = float(np.interp(config.render.jpeg_quality, list(JPEG_KB), list(JPEG_KB.values())))
     map_kb = sum(MAP_KB[extra] for extra in extras if extra in MAP_KB)
     poses_kb = POSES_KB if "object_poses" in extras else 0.0
@@ -100,7 +102,7 @@ def needed_mb(config: Config) -> dict[str, float]:
         "trajectories": (twins + trajectories) * (TRAJECTORY_KB + STATE_KB * mean_steps),
         "frames": (views * twin_steps + frames * mean_steps) * frame_kb
         + (views * twin_steps + maps * mean_steps) * map_kb
-        + steps * (poses_kb + MOTION_KB),
+        + amounts.steps * (poses_kb + MOTION_KB),
     }
     if export.rlds is not None:
         needed_kb["rlds"] = steps * (views * (frame_kb + map_kb) + poses_kb + MOTION_KB) + episodes * EPISODE_KB
@@ -127,21 +129,25 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
     drawn_s = np.average([FRAME_S[arena] for arena in arenas], axis=0, weights=weights)
     frame_s = [float(s) * speed.frame_s / REFERENCE.frame_s for s in drawn_s]
-    trajectories, frames_s = amounts.twins, amounts.twin_steps * sum(view_s + ENCODE_S for view_s in frame_s)
+    maps_s = MAPS_S * speed.frame_s / REFERENCE.frame_s * any(extra in MAP_KB for extra in config.render.extras)
+    trajectories, frames_s = amounts.twins, amounts.twin_steps * sum(view_s + ENCODE_S + maps_s for view_s in frame_s)
     for axes, episodes, kinds in _planned(config.plan):
         trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         for view, view_s in zip(SCHEMA.views, frame_s, strict=True):
             here = [kind for kind in kinds if view in kind.views]
             rendered = any(issubclass(kind, PhysicsPerturbation | RenderPerturbation) for kind in here)
+            mapped = any(_seen_otherwise(kind) for kind in here)
             shadows_s = SHADOWS_S * SHADOWS * ("light" in axes) * speed.frame_s / REFERENCE.frame_s
-            frames_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + ENCODE_S * bool(here))
+            step_s = rendered * (view_s + shadows_s) + ENCODE_S * bool(here) + maps_s * mapped
+            frames_s += episodes * amounts.mean_steps * step_s
     processor = speed.step_s / REFERENCE.step_s
     formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
+    _, exported_steps = _exported(config, amounts)
     return {
         "replay": processor * trajectories * (SCENE_S + TRIES * amounts.mean_steps * STEP_S),
         "render": frames_s,
-        "export": processor * amounts.steps * sum(formats[name] for name in config.export.formats),
-        "validate": processor * amounts.steps * VALIDATE_S * len(config.export.formats),
+        "export": processor * exported_steps * sum(formats[name] for name in config.export.formats),
+        "validate": processor * exported_steps * VALIDATE_S * len(config.export.formats),
         "rest": processor * FIXED_S,
     }
 
@@ -198,6 +204,19 @@ def _planned(plan: PlanConfig) -> Iterator[tuple[list[str], int, list[type[Pertu
     for name, episodes in plan.episodes.items():
         axes = list(axes_of(name))
         yield axes, episodes, [AXES[axis].draws[0] for axis in axes]
+
+
+def _seen_otherwise(kind: type[Perturbation]) -> bool:
+    """Whether it has maps of its own: it shows other surfaces than the twin does, or from elsewhere."""
+    return issubclass(kind, PhysicsPerturbation) or (issubclass(kind, RenderPerturbation) and kind.sees_otherwise)
+
+
+def _exported(config: Config, amounts: Amounts) -> tuple[int, float]:
+    """Episodes and steps of a dataset; of ``export.where`` the axes count alone."""
+    axes = config.export.where.axis if config.export.where else None
+    planned = sum(number for name, number in config.plan.episodes.items() if axes is None or name in axes)
+    twins, twin_steps = (amounts.twins, amounts.twin_steps) if axes is None or CLEAN in axes else (0, 0)
+    return twins + planned, twin_steps + planned * amounts.mean_steps
 
 
 def lengths(demos: DemosConfig) -> dict[Task, list[int]]:

@@ -8,8 +8,9 @@ from conftest import BOWL, REPOSITORY
 
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
+from pipeline.export_config import ExportConfig, Where
 from pipeline.run.machine import Speed
-from pipeline.validation.needs import REFERENCE, in_words, needed_s
+from pipeline.validation.needs import REFERENCE, in_words, needed_mb, needed_s
 
 STARTER = load(REPOSITORY / "configs" / "starter.yaml")
 
@@ -31,6 +32,18 @@ def test_what_costs_frames_and_physics_is_counted() -> None:
     assert {one["export"] for one in (noise, camera, light, robot)} == {language["export"]}
     joint = needed_s(planned(camera_robot=100), REFERENCE)
     assert joint == robot
+
+
+def test_maps_are_rendered_where_something_else_is_seen_and_only_what_is_exported_counts() -> None:
+    config = planned(noise=100, camera=100)
+    maps = config.model_copy(update={"render": config.render.model_copy(update={"extras": ("depth",)})})
+    assert needed_s(maps, REFERENCE)["render"] > 1.3 * needed_s(config, REFERENCE)["render"]
+    some = config.model_copy(update={"export": ExportConfig(where=Where(axis=("noise",)))})
+    assert needed_s(some, REFERENCE)["render"] == needed_s(config, REFERENCE)["render"]
+    # 100 of 210 episodes, each demonstration as often as the others.
+    assert needed_s(some, REFERENCE)["export"] == pytest.approx(100 / 210 * needed_s(config, REFERENCE)["export"])
+    assert needed_mb(some)["rlds"] == pytest.approx(100 / 210 * needed_mb(config)["rlds"])
+    assert needed_mb(some)["frames"] == needed_mb(config)["frames"]
 
 
 def test_it_follows_the_machine() -> None:
