@@ -178,7 +178,7 @@ class LightAxis(Axis):
                     scales = ranges.brightness_scale
                     if bddl.read(task.bddl_file).arena == "kitchen":
                         # It is as bright as can be already.
-                        scales = tuple((low, high) for low, high in scales if high <= 1) or scales
+                        scales = tuple((low, min(high, 1.0)) for low, high in scales if low < 1) or scales
                     return {"diffuse_scale_rgb": [draw(rng, scales)] * 3}
                 tint = colorsys.hsv_to_rgb(rng.random(), draw(rng, ranges.saturation), 1.0)
                 return {"diffuse_scale_rgb": [round(channel, 4) for channel in tint]}

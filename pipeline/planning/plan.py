@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from itertools import count, islice
+from itertools import chain, count, islice
 from math import ceil
 from pathlib import Path
 from typing import Annotated
@@ -83,10 +83,14 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
                 where=f"plan.episodes.{name}",
                 remedy="widen demos.tasks, or take it out of plan.episodes",
             )
-        for place, group in enumerate(groups):
-            # Dealt out evenly; the first tasks get one more where it does not divide.
-            wanted = episodes // len(groups) + (place < episodes % len(groups))
-            candidates = islice(_candidates(draws, group), wanted + ceil(wanted * plan.reserve))
+        # In an order of its own: or small numbers of all axes would come to the same tasks and demonstrations.
+        order = sorted(groups, key=lambda group: digest(plan.seed, name, group[0].task.suite, group[0].task.name))
+        more = order[: episodes % len(groups)]
+        for group in groups:
+            # Dealt out evenly; some tasks get one more where it does not divide.
+            wanted = episodes // len(groups) + (group in more)
+            dealt = sorted(group, key=lambda demo: digest(plan.seed, name, demo.demo_id))
+            candidates = islice(_candidates(draws, dealt), wanted + ceil(wanted * plan.reserve))
             for rank, (demo, perturbations, variant) in enumerate(candidates):
                 row = _row(demo, perturbations, plan.seed, replay)
                 rows.append(replace(row, rank=rank, variant=variant, wanted=rank < wanted))
@@ -144,20 +148,45 @@ class Draws:
         Yields:
             One perturbation of each axis, until no different draw is left.
         """
-        first = int(rng(self.seed, self.name, demo_id).integers(2**31))
+        place = int(rng(self.seed, self.name, demo_id).integers(2**31))
         drawn: set[tuple[str, ...]] = set()
         for variant in count():
             for attempt in range(_ATTEMPTS):
                 key = rng(self.seed, self.name, demo_id, variant, attempt)
-                perturbations = tuple(axis.sample(key, task, first + variant + attempt) for axis in self.axes)
-                content = tuple(p.model_dump_json() for p in perturbations)
-                clear = (p.nearest(self.test, task).distance >= p.clearance for p in perturbations)
-                if content not in drawn and all(clear):
+                # All from one generator, before any is drawn anew from one of its own.
+                sampled = [axis.sample(key, task, place) for axis in self.axes]
+                found = [
+                    self._clear(first, axis, task, place, (demo_id, variant, attempt, number))
+                    for number, (first, axis) in enumerate(zip(sampled, self.axes, strict=True))
+                ]
+                place += 1
+                perturbations = tuple(one for one in found if one is not None)
+                content = tuple(one.model_dump_json() for one in perturbations)
+                if len(content) == len(found) and content not in drawn:
                     break
             else:
                 return
             drawn.add(content)
             yield perturbations
+
+    def _clear(
+        self, first: Perturbation, axis: Axis, task: Task, place: int, key: tuple[str | int, ...]
+    ) -> Perturbation | None:
+        """The ``first`` draw of an axis where it keeps clear of the test set, else another of its component and level.
+
+        Or strengths near the test set's would become rare. None where none of many keeps clear.
+        """
+        again, alike = rng(self.seed, self.name, *key), axis.model_copy(update={"levels": (first.level,)})
+        others = (alike.sample(again, task, place) for _ in range(_ATTEMPTS))
+        return next(
+            (
+                one
+                for one in chain([first], others)
+                if (one.component, one.level) == (first.component, first.level)
+                and one.nearest(self.test, task).distance >= one.clearance
+            ),
+            None,
+        )
 
 
 def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:

@@ -2,6 +2,7 @@
 
 import re
 from collections import Counter
+from itertools import islice
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,11 @@ import yaml
 from conftest import REPOSITORY, read_with_flipped_bits
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import chisquare
 
 from pipeline.axes import Axes, from_json, to_json
 from pipeline.axes.background import BackgroundAxis
+from pipeline.axes.base import LEVELS
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation, deal
 from pipeline.axes.noise import NoiseAxis
@@ -199,6 +202,41 @@ def test_draws_that_overlap_with_a_test_task_are_drawn_anew() -> None:
         (drawn,) = from_json(row.perturbations)
         assert drawn.nearest(test, TASKS[0]).distance >= drawn.clearance
     assert sum(one.perturbations == other.perturbations for one, other in zip(first, again, strict=True)) >= 5
+
+
+def test_levels_near_the_test_set_are_drawn_as_often_as_others() -> None:
+    """Of level 1 here one scene in seven keeps clear of the benchmark's, of level 5 nearly each."""
+    study = next(task for task in tasks("libero_10") if task.name.startswith("STUDY_SCENE1"))
+    draws = plan.Draws("pose", (PoseAxis(),), 3, benchmark.load()).of("demo_0", study)
+    levels = Counter(scene.level for (scene,) in islice(draws, 200))
+    assert chisquare([levels[level] for level in LEVELS]).pvalue > 0.01
+
+
+def test_a_rewrite_stays_where_what_is_beside_it_is_drawn_anew() -> None:
+    """So that all of a task's are drawn once before one comes again."""
+    axes = (CameraAxis(), LanguageAxis())
+    of = ("camera+language", axes, 3)
+    number = len(deal(TASKS[0]))
+    first = [*islice(plan.Draws(*of, NO_TESTS).of("demo_0", TASKS[0]), number)]
+    names = ("azimuth_deg", "elevation_deg", "distance_scale", "yaw_deg", "pitch_deg")
+    planted = [
+        TestTask(
+            "libero_goal", TASKS[0].name, "planted", "camera", camera.component, {n: getattr(camera, n) for n in names}
+        )
+        for camera, _ in first[::5]
+    ]
+    again = [*islice(plan.Draws(*of, TestSet(tuple(planted))).of("demo_0", TASKS[0]), number)]
+    assert sum(camera != other for (camera, _), (other, _) in zip(first, again, strict=True)) >= len(planted)
+    assert [text for _, text in again] == [text for _, text in first]
+    assert len({text for _, text in again}) == number
+
+
+def test_small_numbers_of_each_axis_are_of_other_demonstrations() -> None:
+    few = config(episodes={"camera": 4, "noise": 4, "language": 4}, reserve=0)
+    rows = [row for row in plan.make(entries(), few, REPLAY, NO_TESTS) if row.role == "perturbed"]
+    by_axis = [{row.demo_id for row in rows if row.axis == axis} for axis in few.episodes]
+    assert all(len(demos) == 4 for demos in by_axis)
+    assert len(set.union(*by_axis)) > 6
 
 
 def combined(written: str, **axes: object) -> list[plan.Row]:
