@@ -238,8 +238,8 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     """Read the folders that ``evaluate`` wrote; what several of them hold counts once.
 
     Raises:
-        PipelineError: when a folder has no results, results cannot be compared, two results of an episode differ, or
-            two policies have one name.
+        PipelineError: when a folder has no results, results cannot be compared, two results of an episode differ, a
+            task has two episodes under the same settings, or two policies have one name.
     """
     found = stored(folders)
     refuse_shared_names((row.policy, row.identity, files.folder) for row, files in found)
@@ -264,6 +264,13 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     groups: dict[str, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
     for row, files in results.values():
         groups[row.identity][digest(row.settings)].append((row, files))
+    for group in (group for alike in groups.values() for group in alike.values()):
+        _agree(
+            ((f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode)) for row, files in group),
+            "a task counts twice: ",
+            expected="one episode of each task",
+            remedy="delete one of the two files",
+        )
     return [
         _evaluated(group, [other[0][0] for other in alike.values()])
         for alike in groups.values()

@@ -21,7 +21,7 @@ from pipeline.evaluation.composition import Pair
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw
 from pipeline.evaluation.policies import Wanted
-from pipeline.evaluation.results import EpisodeFiles, stored
+from pipeline.evaluation.results import EpisodeFiles, read, stored
 from pipeline.evaluation.selection import Selection, candidates, construct, select
 from pipeline.evaluation.statistics import difficulty
 from pipeline.evaluation.tasks import EvaluationTask, find_replacement, replacements
@@ -125,6 +125,23 @@ def test_tasks_are_graded_by_the_models_that_solve_them(tmp_path: Path) -> None:
     expected = {task.name: 5 - sum(place > 2 * model for model in range(4)) for place, task in enumerate(tasks[:9])}
     assert {task["name"]: task["difficulty"] for task in content["tasks"]} == expected
     assert set(select(Selection(file=graded))) == set(tasks[:9])
+
+
+def test_a_graded_task_keeps_its_name_where_another_component_was_drawn(tmp_path: Path) -> None:
+    (task,) = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot",), levels=(3,)))
+    (other,) = {"controller_posture", "initial_joints"} - {task.component}
+    EpisodeFiles(tmp_path).save(result(replace(task, component=other), True))
+    graded = tmp_path / "graded.json"
+    assert analyse("grade", str(tmp_path), "--out", str(graded)) == 0
+    assert select(Selection(file=graded)) == [task]
+
+
+def test_a_task_that_was_run_twice_under_one_setting_does_not_count_twice(tmp_path: Path) -> None:
+    (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+    for episode in ("a", "b"):
+        EpisodeFiles(tmp_path).save(result(task, True, episode=episode))
+    with pytest.raises(PipelineError, match=r"counts twice: libero/.* by p: episode a and b"):
+        read([tmp_path])
 
 
 @pytest.mark.slow
