@@ -254,8 +254,18 @@ def construct(
 
     Returns:
         The benchmark's tasks, and how many there are of each kind, JSON-serialisable, with those that were left out.
+
+    Raises:
+        PipelineError: when a result is of another seed, whose draws are others under the same names.
     """
-    refused = {str(row) for row in results if row.reason == REFUSED}
+    refused = set()
+    for row in results:
+        if row.seed != seed:
+            raise PipelineError(
+                f"a result of seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
+            )
+        if row.reason == REFUSED:
+            refused.add(str(row))
     there = [task for task in drawn if str(task) not in refused]
     apart = there
     if plan is not None:

@@ -152,7 +152,7 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     }
     assert len(set(drawn)) == len(drawn)
     refused = [task for task in drawn if task.axis == "layout"][:5]
-    chosen, counts = construct(drawn, 3, 210, [result(task, reason="refused") for task in refused])
+    chosen, counts = construct(drawn, 3, 210, [result(task, reason="refused", seed=3) for task in refused])
     assert (counts["candidates"], counts["refused"], counts["overlapping"]) == (560, 5, 0)
     assert set(Counter(task.axis for task in chosen).values()) == {30}
     assert not set(refused) & set(chosen)
@@ -168,6 +168,13 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     file.write_text("[]")
     with pytest.raises(PipelineError, match="not a list of tasks"):
         select(Selection(file=file))
+
+
+def test_a_benchmark_is_filtered_by_results_of_its_own_seed() -> None:
+    candidate = EvaluationTask("own", STOVE.suite, STOVE.name, "a", "robot", "initial_joints", 1, 0)
+    with pytest.raises(PipelineError, match=r"a result of seed 0(?s:.*)expected: seed 3"):
+        construct([candidate], 3, 1, [result(candidate, reason="refused")])
+    assert construct([candidate], 3, 1, [result(candidate, reason="refused", seed=3)])[0] == []
 
 
 def planned_row(task: EvaluationTask, *perturbations: Perturbation) -> plan.Row:
