@@ -94,7 +94,18 @@ def _check_names(selection: Selection) -> None:
     # The benchmark leaves LIBERO-90 out.
     of_benchmark = selection.source == "libero_plus" and selection.file is None
     _check_known("suites", selection.suites, TESTED_SUITES if of_benchmark else SUITES, selection)
+    if selection.episodes > 1 and (of_benchmark or selection.file is not None):
+        raise PipelineError(
+            f"{selection.file or selection.source} has one episode of each task",
+            where="episodes",
+            expected="1",
+            remedy="leave --episodes out",
+        )
     if selection.file is not None:
+        if "source" in selection.model_fields_set:
+            raise PipelineError(
+                f"{selection.file} is in place of a source", where="source", remedy="leave --source or --tasks-from out"
+            )
         return
     if selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
         raise PipelineError(
