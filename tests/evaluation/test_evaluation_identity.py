@@ -229,6 +229,15 @@ def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     assert job.lost() == [f"worker_lost ({tasks[1]})"]
 
 
+def test_a_folder_has_frames_of_one_device(tmp_path: Path) -> None:
+    (task,) = select(CHOSEN)
+    replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
+    versions = replayed.versions(task) | {"OpenGL": "another GPU"}
+    EpisodeFiles(tmp_path).save(result(task, episode=replayed.episode(task), versions=versions))
+    with pytest.raises(PipelineError, match=r"1 episodes, made with OpenGL another GPU, here (?s:.*)REMAKE=1"):
+        replayed.check([task])
+
+
 def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
     """As the versions before wrote them."""
     old = {"episode": "a", "source": "libero", "policy": "policy", "settings": {}, "success": True, "reason": "success"}
