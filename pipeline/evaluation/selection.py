@@ -1,8 +1,8 @@
 """Which tasks to evaluate on: those that a user names, or a benchmark made as LIBERO-Plus was.
 
 LIBERO-Plus drew 500 candidates of each of its seven dimensions in each of four suites, filtered them, and balanced them
-to 10,030. Here the seven are this project's axes with held-out draws: its layout is the axes layout and pose, and
-language has no draws of its own.
+to 10,030. Here the seven are this project's axes with held-out draws that the benchmark tests: its layout is the axes
+layout and pose, and language has no draws of its own.
 """
 
 import difflib
@@ -261,7 +261,8 @@ def construct(
 
     Args:
         results: episodes of candidates that were run; those whose scene was refused are left out.
-        plan: a training plan; candidates that overlap with it are left out.
+        plan: a training plan; candidates whose first draw overlaps with it are left out. Those that follow where a
+            scene refuses it are compared when an evaluation is given the plan.
 
     Returns:
         The benchmark's tasks, and how many there are of each kind, JSON-serialisable, with those that were left out.
