@@ -26,7 +26,7 @@ def add_commands(commands: Any) -> None:
         argument(
             "--across",
             nargs="+",
-            choices=("prompt", "step_limit"),
+            choices=("prompt", "step_limit", "black"),
             default=(),
             help="compare results that differ in this, which is refused otherwise",
         ),
@@ -114,8 +114,8 @@ def report(arguments: argparse.Namespace) -> None:
     """write one HTML page and one JSON file about evaluations: rates, the paper's table, comparisons, failures
 
     Reads the folders that `evaluate` wrote, on one machine or on several, and sets different policies side by side.
-    Two different results of one episode are an error, and so are results under different prompts or step limits. The
-    last line is JSON.
+    Two different results of one episode are an error, and so are results under different prompts, step limits, black
+    views or starts. The last line is JSON.
     """
     from pipeline.evaluation.results import read
     from pipeline.report import evaluation_report

@@ -45,8 +45,8 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     fixture_seed: int = 0
     """of LIBERO's reset, to which the number of the initial state is added; 0 is what OpenVLA uses"""
     initial_states: Literal["libero", "demonstration"] = "libero"
-    """those that LIBERO evaluates from, or the one that the starter set's demonstration of the task begins in, without
-    settling, as when it is replayed for a dataset; test tasks have a state of their own, and goals begin in LIBERO's"""
+    """those that LIBERO evaluates from, or the one that the starter set's demonstration of the task begins in, one
+    episode a task; test tasks have a state of their own, and goals begin in LIBERO's"""
     # What came later is left out where it is not used, so that results keep their names.
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
     """which views are black, to see what a policy does without them"""

@@ -3,7 +3,7 @@
 import atexit
 import ctypes
 import threading
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -62,12 +62,12 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
             one episode after the other.
     """
     settings, policy = evaluation.settings, evaluation.policy
-    check_settings(selection, settings)
     if settings.look_every != 1 and policy.kind != "server":
         raise PipelineError(
             f"only a server is shown one observation in {settings.look_every}", where="look_every", expected="--server"
         )
     wanted = select(selection, evaluation.archive)
+    check_settings(selection, wanted, settings)
     evaluation.check(wanted)
     faults: list[str] = []
     if missing := [task for task in wanted if evaluation.result(task) is None]:
@@ -105,8 +105,11 @@ def _jobs(missing: Sequence[EvaluationTask], workers: int) -> list[tuple[Evaluat
     return [tuple(scene[at : at + size]) for scene in scenes.values() for at in range(0, len(scene), size)]
 
 
-def check_settings(selection: Selection, settings: EpisodeSettings) -> None:
-    """Have no episode that says a setting which it does not have.
+def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], settings: EpisodeSettings) -> None:
+    """Have no episode that says a setting which it does not have, and none that is another one again.
+
+    Args:
+        wanted: the tasks that the selection names.
 
     Raises:
         PipelineError: when one would, or the plan cannot be read.
@@ -119,11 +122,25 @@ def check_settings(selection: Selection, settings: EpisodeSettings) -> None:
         )
     if settings.plan is not None:
         own_draws.sha256_of(settings.plan)
-        if selection.file is None and selection.source not in ("own", "pairs"):
+        if not any(task.source == "own" for task in wanted):
             raise PipelineError(
-                f"{selection.source} has no held-out draws to keep clear of a plan",
-                where="plan",
-                expected="--source own",
+                "no task has held-out draws to keep clear of a plan", where="plan", expected="--source own"
+            )
+    if settings.initial_states == "demonstration":
+        if others := {task.source for task in wanted} & {"libero_plus", "goals"}:
+            raise PipelineError(
+                f"tasks of {' and '.join(sorted(others))} never start where a demonstration does",
+                where="initial_states",
+                expected="tasks of libero and own",
+                remedy="leave --initial-states out",
+            )
+        starts = Counter(f"{task.suite}/{task.base}" for task in wanted if task.source == "libero")
+        if more := [name for name, count in starts.items() if count > 1]:
+            raise PipelineError(
+                f"{starts[more[0]]} episodes of {more[0]} would be the same: there is one demonstration of it",
+                where="initial_states",
+                expected="one episode of each task of libero",
+                remedy="--episodes 1, or leave --initial-states out",
             )
 
 

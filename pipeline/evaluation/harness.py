@@ -82,7 +82,6 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         self._archive = None if assets is None else Path(assets)
         episodes = EpisodeSettings.model_validate(given | (settings or {}))
         self._environment = EpisodeEnvironment(episodes, self._archive)
-        check_settings(self._selection, episodes)
         self._evaluation: Evaluation | None = None
         if out is not None:
             policy = PolicyConfig(kind="server", address="of the harness", label=label)
@@ -95,6 +94,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     def get_tasks(self) -> list[dict[str, Any]]:
         """A task for each episode; ``name`` is unique, ``suite`` is LIBERO's."""
         tasks = select(self._selection, self._archive)
+        check_settings(self._selection, tasks, self._environment.settings)
         if self._evaluation is not None:
             self._evaluation.check(tasks)
         return [task.for_harness() for task in tasks]

@@ -99,8 +99,9 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
             named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
             chosen = {"suites": (suite.strip(),), **{name: getattr(self, name) for name in named}}
             selection = Selection.model_validate(chosen)
-            check_settings(selection, settings)
-            tasks[suite.strip()] = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
+            of_suite = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
+            check_settings(selection, of_suite, settings)
+            tasks[suite.strip()] = of_suite
         if evaluation is not None:
             evaluation.check(task for suite in tasks.values() for task in suite)
         print(gl.choose())  # before the worker processes, which inherit it

@@ -17,8 +17,9 @@ from pipeline.seeding import digest
 REFUSED = "refused"
 """The reason of an episode that could not begin, as its scene does not take what was drawn."""
 
-ALIKE = ("prompt", "step_limit")
-"""What results on one suite of one source must have in common to be compared."""
+ALIKE = {"black": "none", "initial_states": "libero", "fixture_seed": 0}
+"""What results on one suite of one source must have in common to be compared, beside prompt and step limit: settings,
+and what they are where a result leaves them out."""
 
 Trial = tuple[EvaluationTask, int, str]
 """The whole task, the seed, and what was drawn: the same for results that can be compared one by one."""
@@ -149,24 +150,26 @@ def one_setting(found: Sequence[Stored]) -> dict[str, Any]:
 
 
 def refuse_different(found: Iterable[Stored], across: Collection[str] = ()) -> None:
-    """Have results that are compared made under one prompt and one limit in each suite of each source.
+    """Have results that are compared made under one prompt, limit, view and start in each suite of each source.
 
     Args:
-        across: fields of ``ALIKE`` that are what is compared.
+        across: which of them are what is compared.
 
     Raises:
         PipelineError: when two were not, with their files and what differs.
     """
-    fields = [field for field in ALIKE if field not in across]
+
+    def alike(row: EpisodeResult) -> dict[str, object]:
+        settings = {name: row.settings.get(name, default) for name, default in ALIKE.items()}
+        facts = {"prompt": row.prompt, "step_limit": row.step_limit, **settings}
+        return {name: value for name, value in facts.items() if name not in across}
+
     _agree(
-        (
-            (f"{row.source}/{row.suite}", {field: getattr(row, field) for field in fields}, files.path(row.episode))
-            for row, files in found
-        ),
+        ((f"{row.source}/{row.suite}", alike(row), files.path(row.episode)) for row, files in found),
         "these results cannot be compared, on ",
-        expected="one prompt and one step limit for all that is compared",
+        expected="one prompt, one step limit, the same black views and starts for all that is compared",
         remedy="evaluate both alike, or leave one of the folders out; where the difference is what you compare, "
-        "`analyse report --across prompt`, or --across step_limit",
+        "`analyse report --across prompt`, --across step_limit or --across black",
     )
 
 
@@ -235,8 +238,8 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     """Read the folders that ``evaluate`` wrote; what several of them hold counts once.
 
     Raises:
-        PipelineError: when a folder has no results, results cannot be compared, two results of an episode differ, or
-            two policies have one name.
+        PipelineError: when a folder has no results, results cannot be compared, two results of an episode differ, a
+            task has two episodes under the same settings, or two policies have one name.
     """
     found = stored(folders)
     refuse_shared_names((row.policy, row.identity, files.folder) for row, files in found)
@@ -261,6 +264,13 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     groups: dict[str, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
     for row, files in results.values():
         groups[row.identity][digest(row.settings)].append((row, files))
+    for group in (group for alike in groups.values() for group in alike.values()):
+        _agree(
+            ((f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode)) for row, files in group),
+            "a task counts twice: ",
+            expected="one episode of each task",
+            remedy="delete one of the two files",
+        )
     return [
         _evaluated(group, [other[0][0] for other in alike.values()])
         for alike in groups.values()

@@ -38,7 +38,7 @@ CHECKPOINT_PACKAGES = ("lerobot", "torch", "torchvision", "transformers", "diffu
 REMAKE = f"`{identity.REMAKE}=1` before the command; or evaluate into another folder"
 """How a person allows that results are made anew."""
 
-RECORDED = ("pipeline", "vla-eval", "OpenGL")
+RECORDED = ("pipeline", "vla-eval")
 """The versions of a result that do not decide whether it counts."""
 
 
@@ -143,6 +143,7 @@ class Evaluation:
         """What makes a result beside the task, the settings and the policy, by name."""
         packages = (*PACKAGES, *(CHECKPOINT_PACKAGES if self.policy.kind == "checkpoint" else ()))
         found = {**identity.made_with("pixels"), **identity.made_with("evaluation"), **_installed(packages)}
+        found["OpenGL"] = gl.choose().device
         if task.source == "libero_plus":
             contents = libero_plus.contents(benchmark.load().find(task.suite, task.name), self.archive)
             found |= {"files of the benchmark": digest(contents)[:16]} if contents else {}
@@ -173,7 +174,6 @@ class Evaluation:
                     **self.versions(task),
                     **_installed(("vla-eval",)),
                     "pipeline": identity.versions()["pipeline"],
-                    "OpenGL": gl.choose().device,
                 },
             )
         )

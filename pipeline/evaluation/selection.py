@@ -1,8 +1,8 @@
 """Which tasks to evaluate on: those that a user names, or a benchmark made as LIBERO-Plus was.
 
 LIBERO-Plus drew 500 candidates of each of its seven dimensions in each of four suites, filtered them, and balanced them
-to 10,030. Here the seven are this project's axes with held-out draws: its layout is the axes layout and pose, and
-language has no draws of its own.
+to 10,030. Here the seven are this project's axes with held-out draws that the benchmark tests: its layout is the axes
+layout and pose, and language has no draws of its own.
 """
 
 import difflib
@@ -94,7 +94,18 @@ def _check_names(selection: Selection) -> None:
     # The benchmark leaves LIBERO-90 out.
     of_benchmark = selection.source == "libero_plus" and selection.file is None
     _check_known("suites", selection.suites, TESTED_SUITES if of_benchmark else SUITES, selection)
+    if selection.episodes > 1 and (of_benchmark or selection.file is not None):
+        raise PipelineError(
+            f"{selection.file or selection.source} has one episode of each task",
+            where="episodes",
+            expected="1",
+            remedy="leave --episodes out",
+        )
     if selection.file is not None:
+        if "source" in selection.model_fields_set:
+            raise PipelineError(
+                f"{selection.file} is in place of a source", where="source", remedy="leave --source or --tasks-from out"
+            )
         return
     if selection.source in ("libero", "goals", "pairs") and selection.episodes > INITIAL_STATES:
         raise PipelineError(
@@ -250,12 +261,23 @@ def construct(
 
     Args:
         results: episodes of candidates that were run; those whose scene was refused are left out.
-        plan: a training plan; candidates that overlap with it are left out.
+        plan: a training plan; candidates whose first draw overlaps with it are left out. Those that follow where a
+            scene refuses it are compared when an evaluation is given the plan.
 
     Returns:
         The benchmark's tasks, and how many there are of each kind, JSON-serialisable, with those that were left out.
+
+    Raises:
+        PipelineError: when a result is of another seed, whose draws are others under the same names.
     """
-    refused = {str(row) for row in results if row.reason == REFUSED}
+    refused = set()
+    for row in results:
+        if row.seed != seed:
+            raise PipelineError(
+                f"a result of seed {row.seed}", where=str(row), expected=f"seed {seed}, as the candidates"
+            )
+        if row.reason == REFUSED:
+            refused.add(str(row))
     there = [task for task in drawn if str(task) not in refused]
     apart = there
     if plan is not None:

@@ -28,7 +28,10 @@ from scipy.stats import binomtest, norm, t
 
 from pipeline import seeding
 from pipeline.errors import PipelineError
+from pipeline.evaluation.own_draws import drawn_task
 from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.libero.tasks import find_task
 from pipeline.types import Floats
 
 GROUPINGS = (("suite",), ("axis",), ("axis", "component"), ("level",), ("axis", "level"), ("suite", "axis"))
@@ -225,6 +228,8 @@ def difficulty(solved: int, models: int) -> int:
 def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
     """Every task that all models ran, as JSON, with its ``difficulty`` and how many models solve it.
 
+    Held-out draws have the component that was asked for, which names their episodes, also where another was drawn.
+
     Raises:
         PipelineError: when results of a model have several settings, models cannot be compared, or no task was run by
             all.
@@ -239,5 +244,12 @@ def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
     graded = []
     for trial in shared:
         solved = sum(model[trial] for model in models)
-        graded.append({**asdict(trial[0]), "solved": solved, "difficulty": difficulty(solved, len(models))})
+        graded.append({**asdict(_asked(*trial[:2])), "solved": solved, "difficulty": difficulty(solved, len(models))})
     return graded
+
+
+def _asked(task: EvaluationTask, seed: int) -> EvaluationTask:
+    """A result's task as it was asked for: the scene may have refused that draw and taken one of another component."""
+    if task.source != "own":
+        return task
+    return drawn_task(find_task(task.suite, task.base), task.axis, task.level, task.number, seed) or task

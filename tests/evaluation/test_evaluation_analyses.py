@@ -21,7 +21,7 @@ from pipeline.evaluation.composition import Pair
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw
 from pipeline.evaluation.policies import Wanted
-from pipeline.evaluation.results import EpisodeFiles, stored
+from pipeline.evaluation.results import EpisodeFiles, read, stored
 from pipeline.evaluation.selection import Selection, candidates, construct, select
 from pipeline.evaluation.statistics import difficulty
 from pipeline.evaluation.tasks import EvaluationTask, find_replacement, replacements
@@ -127,6 +127,23 @@ def test_tasks_are_graded_by_the_models_that_solve_them(tmp_path: Path) -> None:
     assert set(select(Selection(file=graded))) == set(tasks[:9])
 
 
+def test_a_graded_task_keeps_its_name_where_another_component_was_drawn(tmp_path: Path) -> None:
+    (task,) = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot",), levels=(3,)))
+    (other,) = {"controller_posture", "initial_joints"} - {task.component}
+    EpisodeFiles(tmp_path).save(result(replace(task, component=other), True))
+    graded = tmp_path / "graded.json"
+    assert analyse("grade", str(tmp_path), "--out", str(graded)) == 0
+    assert select(Selection(file=graded)) == [task]
+
+
+def test_a_task_that_was_run_twice_under_one_setting_does_not_count_twice(tmp_path: Path) -> None:
+    (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+    for episode in ("a", "b"):
+        EpisodeFiles(tmp_path).save(result(task, True, episode=episode))
+    with pytest.raises(PipelineError, match=r"counts twice: libero/.* by p: episode a and b"):
+        read([tmp_path])
+
+
 @pytest.mark.slow
 def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) -> None:
     drawn = candidates(seed=3, each=20)
@@ -135,7 +152,7 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     }
     assert len(set(drawn)) == len(drawn)
     refused = [task for task in drawn if task.axis == "layout"][:5]
-    chosen, counts = construct(drawn, 3, 210, [result(task, reason="refused") for task in refused])
+    chosen, counts = construct(drawn, 3, 210, [result(task, reason="refused", seed=3) for task in refused])
     assert (counts["candidates"], counts["refused"], counts["overlapping"]) == (560, 5, 0)
     assert set(Counter(task.axis for task in chosen).values()) == {30}
     assert not set(refused) & set(chosen)
@@ -151,6 +168,13 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     file.write_text("[]")
     with pytest.raises(PipelineError, match="not a list of tasks"):
         select(Selection(file=file))
+
+
+def test_a_benchmark_is_filtered_by_results_of_its_own_seed() -> None:
+    candidate = EvaluationTask("own", STOVE.suite, STOVE.name, "a", "robot", "initial_joints", 1, 0)
+    with pytest.raises(PipelineError, match=r"a result of seed 0(?s:.*)expected: seed 3"):
+        construct([candidate], 3, 1, [result(candidate, reason="refused")])
+    assert construct([candidate], 3, 1, [result(candidate, reason="refused", seed=3)])[0] == []
 
 
 def planned_row(task: EvaluationTask, *perturbations: Perturbation) -> plan.Row:

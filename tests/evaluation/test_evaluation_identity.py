@@ -20,12 +20,12 @@ from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment, results
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.evaluate import EvaluationJob, _environment, evaluate
+from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
 from pipeline.evaluation.policies import Checkpoint
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.evaluation.tasks import EvaluationTask, libero_task
 
 STEPS = 4
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
@@ -229,6 +229,15 @@ def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     assert job.lost() == [f"worker_lost ({tasks[1]})"]
 
 
+def test_a_folder_has_frames_of_one_device(tmp_path: Path) -> None:
+    (task,) = select(CHOSEN)
+    replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
+    versions = replayed.versions(task) | {"OpenGL": "another GPU"}
+    EpisodeFiles(tmp_path).save(result(task, episode=replayed.episode(task), versions=versions))
+    with pytest.raises(PipelineError, match=r"1 episodes, made with OpenGL another GPU, here (?s:.*)REMAKE=1"):
+        replayed.check([task])
+
+
 def test_results_without_an_identity_are_refused(tmp_path: Path) -> None:
     """As the versions before wrote them."""
     old = {"episode": "a", "source": "libero", "policy": "policy", "settings": {}, "success": True, "reason": "success"}
@@ -277,3 +286,28 @@ def test_what_a_policy_does_not_use_is_no_setting_of_its_results(tmp_path: Path)
         evaluate(evaluation(policy, tmp_path, EpisodeSettings(plan=plan)), CHOSEN, loop)
     with pytest.raises(PipelineError, match="seed"):
         evaluate(evaluation(policy, tmp_path, EpisodeSettings(seed=1)), CHOSEN, loop)
+
+
+@pytest.mark.parametrize(
+    ("tasks", "told"),
+    [
+        ([EvaluationTask("libero_plus", STOVE.suite, STOVE.name, "a", "camera", "", 1, 0)], "libero_plus never start"),
+        ([EvaluationTask("goals", STOVE.suite, STOVE.name, "a", "goal", "", 0, 0)], "goals never start"),
+        ([libero_task(STOVE, 0), libero_task(STOVE, 1)], "2 episodes of libero_goal/.* would be the same"),
+    ],
+    ids=["test tasks", "goals", "libero"],
+)
+def test_a_demonstrations_start_is_one_a_task_and_not_every_tasks(tasks: list[EvaluationTask], told: str) -> None:
+    settings = EpisodeSettings(initial_states="demonstration")
+    with pytest.raises(PipelineError, match=told) as caught:
+        check_settings(CHOSEN, tasks, settings)
+    assert "leave --initial-states out" in str(caught.value)
+    drawn = [replace(libero_task(STOVE, number), source="own", axis="robot") for number in (0, 1)]
+    check_settings(CHOSEN, [libero_task(STOVE, 0), *drawn], settings)
+
+
+def test_a_list_without_held_out_draws_is_not_kept_clear_of_a_plan(tmp_path: Path) -> None:
+    plan = tmp_path / "plan.parquet"
+    plan.touch()
+    with pytest.raises(PipelineError, match="no task has held-out draws"):
+        check_settings(Selection(file=tmp_path), [libero_task(STOVE, 0)], EpisodeSettings(plan=plan))

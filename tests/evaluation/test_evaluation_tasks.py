@@ -155,6 +155,9 @@ def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
         ({"source": "pairs", "episodes": 51}, "at most 50"),
         ({"source": "own", "levels": (9,)}, "1 or 2 or 3 or 4 or 5"),
         ({"source": "libero_plus", "levels": (9,)}, "0 or 1 or 2 or 3 or 4 or 5"),
+        ({"source": "libero_plus", "episodes": 2}, "leave --episodes out"),
+        ({"file": Path("tasks.json"), "episodes": 2}, "leave --episodes out"),
+        ({"file": Path("tasks.json"), "source": "libero"}, "leave --source or --tasks-from out"),
         ({"levels": (3,)}, "expected: 0"),
         ({"source": "libero_plus", "components": ("dist",)}, "distance or fog or gaussian"),
         ({"source": "own", "axes": ("camera",), "components": ("dist",)}, "distance or orientation or spherical"),
@@ -165,7 +168,7 @@ def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
         ({"source": "libero_plus", "axes": ("camera",), "components": ("fog",)}, "axes noise; or components distance"),
     ],
 )
-def test_a_name_that_nothing_has_is_refused_with_those_that_there_are(chosen: dict[str, object], told: str) -> None:
+def test_what_nothing_has_is_refused_with_what_there_is(chosen: dict[str, object], told: str) -> None:
     with pytest.raises(PipelineError) as caught:
         select(Selection.model_validate(chosen))
     assert told in str(caught.value)

@@ -14,9 +14,9 @@ from scipy.stats import binomtest
 
 from pipeline.__main__ import parser
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read
+from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read, stored
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.statistics import compare, mcnemar, paired
+from pipeline.evaluation.statistics import compare, grade, mcnemar, paired
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.report import evaluation_report
@@ -134,6 +134,23 @@ def test_results_under_different_prompts_or_limits_are_not_compared(
     # Another suite has another limit, and another source another wording.
     elsewhere = result(EvaluationTask("libero", "libero_10", "a", "a_state0", "clean", "clean", 0, 0), policy="other")
     assert len(read([folders[0], write(tmp_path / "elsewhere", [elsewhere])])) == 2
+
+
+@pytest.mark.parametrize("setting", [{"initial_states": "demonstration"}, {"fixture_seed": 7}, {"black": "all"}])
+def test_results_under_different_starts_or_views_are_not_compared(tmp_path: Path, setting: dict[str, Any]) -> None:
+    task = EvaluationTask("libero", "libero_10", "a", "a_state0", "clean", "clean", 0, 0)
+    # What a result leaves out is as ``evaluate`` has it by default.
+    first = write(tmp_path / "one", [result(task, True, "one", settings={"fixture_seed": 0})])
+    others = [result(task, True, "other", settings={}), result(task, True, "third", settings=setting)]
+    assert len(read([first, write(tmp_path / "other", others[:1])])) == 2
+    folders = [first, write(tmp_path / "third", others[1:])]
+    ((name, value),) = setting.items()
+    with pytest.raises(PipelineError, match=rf"on libero/libero_10: {name} \w+ and {value}"):
+        read(folders)
+    with pytest.raises(PipelineError, match=rf"on libero/libero_10: {name} \w+ and {value}"):
+        grade([stored([folder]) for folder in folders])
+    if name == "black":
+        assert len(read(folders, across=["black"])) == 2
 
 
 def test_policies_are_paired_by_all_of_their_task(subset: list[EvaluationTask]) -> None:
