@@ -61,7 +61,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
         )
     if export.lerobot is not None:
         dataset["lerobot"] = sourced(export.lerobot.name, "the run's configuration, export.lerobot.name")
-    return {"name": export.name, "dataset": dataset, **_training_and_clients(export)}
+    return {"name": (export.rlds or export).name, "dataset": dataset, **_training_and_clients(export)}
 
 
 def _training_and_clients(export: ExportConfig) -> dict[str, Any]:

@@ -72,7 +72,9 @@ def test_recipe_counts_what_was_kept(tmp_path: Path) -> None:
         "libero_10": {"light": 1},
     }
     assert dataset["suites"] == SUITES
-    assert dataset["mixtures"] == {NAME: dict.fromkeys(sorted(SUITES.values()), 1.0)}
+    # By this name OpenVLA-OFT looks for the mixture; the LeRobot dataset has another.
+    assert dataset["mixtures"] == {recipe["name"]: dict.fromkeys(sorted(SUITES.values()), 1.0)}
+    assert recipe["name"] == NAME != dataset["lerobot"]
     values = {name: field["value"] for name, field in recipe["training"].items()}
     assert values["effective_batch_size"] == values["gpus"] * values["batch_size_per_gpu"]
     assert all(field["source"] for field in (*recipe["dataset"].values(), *recipe["training"].values()))
