@@ -238,13 +238,14 @@ def _closes_on_open(motions: Sequence[exact_statistics.Motion]) -> bool:
 
 
 def _difference(measured: Mapping[str, Any], stored: Mapping[str, Any]) -> float:
-    """Largest absolute difference between two entries of ``dataset_statistics.json``; infinite when shapes differ."""
+    """Largest absolute difference between two entries of ``dataset_statistics.json``; infinite where shapes differ or
+    what is stored is NaN."""
     largest = 0.0
     for name, value in measured.items():
         other = stored.get(name)
         if isinstance(value, Mapping):
             off = _difference(value, other) if isinstance(other, Mapping) else np.inf
-        elif other is None or np.shape(value) != np.shape(other):
+        elif other is None or np.shape(value) != np.shape(other) or np.isnan(np.asarray(other, float)).any():
             off = np.inf
         else:
             off = float(np.abs(np.asarray(value, float) - np.asarray(other, float)).max())

@@ -193,6 +193,8 @@ def test_check_catches_statistics_of_something_else(data: Path, statistics: dict
     found = oft.check(folder, {NAME: off})
     assert found["statistics_difference"] == pytest.approx(1e-6)
     assert len(found["violations"]) == 1
+    off["proprio"]["q99"][3] = float("nan")
+    assert oft.check(folder, {NAME: off})["violations"] == ["dataset_statistics.json is off by up to inf"]
     assert oft.check(folder, {NAME: statistics | {"num_trajectories": 4}})["statistics_difference"] == 1
 
 
