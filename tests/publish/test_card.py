@@ -118,6 +118,13 @@ def write(data: Path) -> None:
     card.write(data, formats_of(data, options), NAME)
 
 
+def test_other_formats_are_named_where_there_are_any(data: Path) -> None:
+    assert "the same episodes exist as LeRobot and LeRobot v2.1,\njoined by `episode_id`." in written(data, "rlds")
+    card.write(data, formats_of(data, ExportConfig(rlds=RldsConfig(name=NAME), lerobot=None)), NAME)
+    alone = (data / "card" / "rlds" / "README.md").read_text()
+    assert "This repository holds the RLDS form. `manifest.parquet` has" in alone
+
+
 def written(data: Path, kind: str) -> str:
     write(data)
     return (data / "card" / kind / "README.md").read_text()
@@ -210,7 +217,7 @@ def test_conventions_and_commands_are_the_formats_own(
 
 
 def test_a_failed_check_is_not_hidden(data: Path) -> None:
-    assert "opened again and checked, and passed" in written(data, "rlds")
+    assert "The run's datasets were opened again and checked, and passed" in written(data, "rlds")
     failed = VALIDATION | {"rotation": {"checked": 7, "findings": ["episode 3 stands upside down"]}}
     (data / "validation.json").write_text(json.dumps(failed))
     text = written(data, "rlds")
