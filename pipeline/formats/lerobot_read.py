@@ -115,10 +115,15 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
 
 
 def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...]) -> Episode:
-    """An episode but for its frames, from v3.0's columns of its steps and its row of ``meta/provenance.parquet``."""
+    """An episode, from v3.0's columns of its steps and its row of ``meta/provenance.parquet``; frames where those are
+    image files."""
     return Episode(
         episode_id=row[EPISODE_ID],
-        frames={},
+        frames={
+            view: [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
+            for view, spec in SCHEMA.views.items()
+            if spec.lerobot_key in table.column_names
+        },
         state=_matrix(table, SCHEMA.state.lerobot_key),
         joint_state=_matrix(table, SCHEMA.joint_state.lerobot_key),
         action=_matrix(table, SCHEMA.action.lerobot_key),

@@ -17,6 +17,7 @@ import cv2
 import datasets
 import lerobot.datasets.aggregate
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import tensorflow_datasets as tfds
@@ -47,9 +48,11 @@ from pipeline.formats import lerobot as lerobot_format
 from pipeline.formats import lerobot_v21, rlds_write
 from pipeline.formats.episodes import Episodes, split
 from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import columns
-from pipeline.types import Episode
+from pipeline.types import Episode, Scene, Trajectory, Verdict
+from pipeline.validation.checks import CHECKS, Case
 
 MIN_PSNR_DB = 36.0
 
@@ -564,6 +567,36 @@ def assert_close(found: Mapping[str, Any], values: NDArray[Any]) -> None:
 def decoded(file: Path) -> list[NDArray[np.uint8]]:
     with av.open(str(file)) as video:
         return [np.asarray(frame.to_ndarray(format="rgb24"), np.uint8) for frame in video.decode(video=0)]
+
+
+WITH_IMAGES: dict[str, Callable[[Path], LeRobot | LeRobotV21]] = {
+    "v3.0": partial(write_lerobot, frames="images"),
+    "v2.1": partial(write_lerobot_v21, convention="openpi"),
+}
+
+
+def put(file: Path, column: str, value: Any) -> None:
+    """Into the last step of a data file."""
+    table = pq.read_table(file)
+    place, field = table.schema.get_field_index(column), table.schema.field(column)
+    cells = [*table[column].to_pylist()[:-1], value]
+    pq.write_table(table.set_column(place, field, pa.array(cells, field.type)), file)
+
+
+@pytest.mark.parametrize("version", WITH_IMAGES)
+def test_every_image_file_is_read_back(version: str, tmp_path: Path) -> None:
+    target, source = WITH_IMAGES[version](tmp_path), episode(IDS[-1])
+    copy = target.read(source.provenance, tmp_path)
+    assert copy is not None
+    assert copy.episode.frames == source.frames
+    other = {"bytes": source.frames["wrist_image"][0], "path": None}
+    put(max(target.folder.glob("*/data/**/*.parquet")), target.keys["wrist_image"], other)
+    copy = target.read(source.provenance, tmp_path)
+    assert copy is not None
+    none = np.zeros((0, 0), np.float32)
+    replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), np.zeros(0), np.zeros(0), none, Verdict(True, "kept"))
+    (fault,) = CHECKS["jpeg"](Case({}, source, replay, [copy], None))
+    assert fault.what == f"wrist_image differs at 1 steps, first at {len(source) - 1}"
 
 
 def test_modality_names_columns_that_are_there(written: Written, tmp_path: Path) -> None:
