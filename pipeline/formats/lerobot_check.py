@@ -1,5 +1,6 @@
 """A LeRobot dataset as a whole, and samples of it, as lerobot reads them."""
 
+import json
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pipeline.episode_schema import MOTION, SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID
-from pipeline.formats.lerobot_read import copy_of, readable, rows
+from pipeline.formats.lerobot_read import copy_of, readable, rows, wrong_statistics
 from pipeline.formats.read_back import Fault, sampled
 
 BY_LEROBOT = 8
@@ -30,7 +31,8 @@ SAME_LEVELS = 1
 
 def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str, Any]) -> Iterator[tuple[str, Fault]]:
     """What lerobot finds: frame rate, robot, the columns' names and shapes, as many episodes as were kept, and in
-    samples the very numbers and frames that ``lerobot_read.read`` finds; and the videos' own frame rate.
+    samples the very numbers and frames that ``lerobot_read.read`` finds; the videos' own frame rate; and the statistics
+    of actions and states, computed again.
 
     Raises:
         PipelineError: when the dataset cannot be opened.
@@ -51,12 +53,17 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str
             name = str(file.relative_to(root))
             with av.open(str(file)) as video:
                 read[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
+        statistics = json.loads((root / "meta" / "stats.json").read_text())
+        measured = (SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key)
+        wrong = list(wrong_statistics(statistics, sorted(root.glob("data/**/*.parquet")), measured))
         stored = (meta.total_episodes, data.num_frames)
         strangers = sorted(rows(root).keys() - kept.keys())
         samples = list(_samples(root, data))
     for key, expected in wanted.items():
         if read[key] != expected:
             yield "format", Fault("lerobot", None, f"{key} is {read[key]}", f"{expected}")
+    for what, expected in wrong:
+        yield "format", Fault("lerobot", None, what, expected)
     for episode_id, key in samples:
         yield "format", Fault("lerobot", episode_id, f"lerobot reads another {key}", "what its files hold")
     steps = sum(row["steps"] for row in kept.values())

@@ -39,6 +39,9 @@ UNREADABLE = (
 MARKS = ("frame_index", "timestamp")
 """LeRobot's columns that tell steps apart."""
 
+SAME_SHARE, SAME = 1e-4, 1e-6
+"""Largest relative and absolute difference between stored statistics and those of the columns."""
+
 
 def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
     """An episode with these extras; None when the dataset does not have it.
@@ -93,8 +96,7 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
     info, _ = _opened(edition(root / "meta" / "info.json"))
     chunk, number = _file(row)
     table = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
-    if table["episode_index"].to_pylist() != [index] * steps:
-        raise ValueError(f"rows {row['first_row']} of data file {number} are not the {steps} steps of episode {index}")
+    refuse_others(table, row, row["dataset_from_index"])
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
     videos = {}
     for view, key in ((view, spec.lerobot_key) for view, spec in SCHEMA.views.items()):
@@ -112,6 +114,35 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
         train=index < int(info["splits"]["train"].partition(":")[2]),
     )
+
+
+def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> None:
+    """Refuse steps that are not all of an episode, by their own numbers and id.
+
+    Args:
+        first_step: so many steps of the dataset come before it.
+
+    Raises:
+        ValueError: naming the column that says so.
+    """
+    index, steps = row["episode_index"], row["length"]
+    wanted = {"episode_index": [index] * steps, EPISODE_ID: [row[EPISODE_ID]] * steps}
+    wanted["index"] = [*range(first_step, first_step + steps)]
+    for name, expected in wanted.items():
+        if table[name].to_pylist() != expected:
+            raise ValueError(f"by {name}, these are not the {steps} steps of episode {index}")
+
+
+def wrong_statistics(
+    stored: Mapping[str, Any], files: Sequence[Path], columns: Sequence[str]
+) -> Iterator[tuple[str, str]]:
+    """What is off with the stored statistics of some columns of data files, and what their values come to."""
+    for column in columns:
+        values = np.concatenate([_matrix(pq.read_table(file, columns=[column]), column) for file in files], dtype=float)
+        for name in ("mean", "std", "min", "max"):
+            expected = getattr(values, name)(axis=0)
+            if not np.allclose(stored[column][name], expected, rtol=SAME_SHARE, atol=SAME):
+                yield f"{name} of {column} is {stored[column][name]} in the statistics", f"{expected.tolist()}"
 
 
 def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...]) -> Episode:

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID, Convention
-from pipeline.formats.lerobot_read import MARKS, decoded, episode, readable
+from pipeline.formats.lerobot_read import MARKS, decoded, episode, readable, refuse_others, wrong_statistics
 from pipeline.formats.lerobot_v21_write import data_path, video_path
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.types import Extra
@@ -25,7 +25,7 @@ def check(
     folder: Path, kept: Mapping[str, Row], convention: Convention, extras: tuple[Extra, ...]
 ) -> Iterator[tuple[str, Fault]]:
     """Version, frame rate, robot, the columns' names and shapes, all totals, the files and statistics of every episode
-    and of no other, and as many episodes as were kept.
+    and of no other, as many episodes as were kept, and what actions and states of each and of all come to.
 
     Raises:
         PipelineError: when a set cannot be opened.
@@ -34,7 +34,8 @@ def check(
     for root in _sets(folder):
         with readable(root, VERSION):
             info, rows, tasks = _opened(root, _modified_ns(root))
-            stats = [line["episode_index"] for line in _lines(root / "meta" / "episodes_stats.jsonl")]
+            stats = {line["episode_index"]: line["stats"] for line in _lines(root / "meta" / "episodes_stats.jsonl")}
+            wrong = list(_wrong_statistics(root, stats, convention))
         videos = [key for key, of in info["features"].items() if of["dtype"] == "video"]
         indices = [row["episode_index"] for row in rows.values()]
         files = [*map(data_path, indices), *(video_path(index, key) for index in indices for key in videos)]
@@ -52,16 +53,31 @@ def check(
         wanted["columns"] = {name: _described(of) for name, of in convention.columns(extras).items()}
         read["files"] = sorted(str(file.relative_to(root)) for file in root.glob("*/chunk-*/**/*") if file.is_file())
         wanted["files"] = sorted(files)
-        read["episodes with statistics"], wanted["episodes with statistics"] = stats, indices
+        read["episodes with statistics"], wanted["episodes with statistics"] = [*stats], indices
         for name, expected in wanted.items():
             if read[name] != expected:
                 yield "format", Fault(NAME, None, f"{root.name}: {name} {_short(read[name])}", _short(expected))
+        for what, expected in wrong:
+            yield "format", Fault(NAME, None, f"{root.name}: {what}", expected)
         episodes += rows
     if len(episodes) != len(kept):
         yield "ids", Fault(NAME, None, f"{len(episodes)} episodes", f"{len(kept)}")
     # One that is missing is told where it is looked for.
     for episode_id in set(episodes) - kept.keys():
         yield "ids", Fault(NAME, episode_id, "is in the dataset", "kept episodes alone")
+
+
+def _wrong_statistics(
+    root: Path, of_episodes: Mapping[int, Mapping[str, Any]], convention: Convention
+) -> Iterator[tuple[str, str]]:
+    """Of the whole set, and of each episode whose file is there."""
+    measured = [convention.name(spec.lerobot_key) for spec in (SCHEMA.action, SCHEMA.state)]
+    of_all = json.loads((root / "meta" / "stats.json").read_text())
+    yield from wrong_statistics(of_all, sorted(root.glob("data/**/*.parquet")), measured)
+    for index, stored in of_episodes.items():
+        if (file := root / data_path(index)).exists():
+            for what, expected in wrong_statistics(stored, [file], measured):
+                yield f"{what} of episode {index}", expected
 
 
 def read(folder: Path, episode_id: str, convention: Convention, extras: tuple[Extra, ...]) -> Copy | None:
@@ -83,8 +99,7 @@ def _copy(
 ) -> Copy:
     index = row["episode_index"]
     table = pq.read_table(root / data_path(index))
-    if table["episode_index"].to_pylist() != [index] * row["length"]:
-        raise ValueError(f"{data_path(index)} has not the {row['length']} steps of episode {index} alone")
+    refuse_others(table, row, row["first_step"])
     instructions = [tasks[task] for task in table["task_index"].to_pylist()]
     if row["tasks"] != [instructions[0]]:
         raise ValueError(f"episode {index} has the tasks {row['tasks']}, its steps {instructions[0]!r}")
@@ -111,13 +126,13 @@ def _modified_ns(root: Path) -> int:
 def _opened(root: Path, modified_ns: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]], dict[int, str]]:
     """``meta/info.json``, episode id to its line and its provenance, and number to task."""
     info: dict[str, Any] = json.loads((root / "meta" / "info.json").read_text())
-    rows = zip(
-        _lines(root / "meta" / "episodes.jsonl"),
-        pq.read_table(root / "meta" / "provenance.parquet").to_pylist(),
-        strict=True,
-    )
+    rows = _lines(root / "meta" / "episodes.jsonl")
+    first_step = 0
+    for row in rows:
+        row["first_step"], first_step = first_step, first_step + row["length"]
+    provenance = pq.read_table(root / "meta" / "provenance.parquet").to_pylist()
     tasks = {row["task_index"]: row["task"] for row in _lines(root / "meta" / "tasks.jsonl")}
-    return info, {also[EPISODE_ID]: also | row for row, also in rows}, tasks
+    return info, {also[EPISODE_ID]: also | row for row, also in zip(rows, provenance, strict=True)}, tasks
 
 
 def _lines(file: Path) -> list[dict[str, Any]]:

@@ -599,6 +599,37 @@ def test_every_image_file_is_read_back(version: str, tmp_path: Path) -> None:
     assert fault.what == f"wrist_image differs at 1 steps, first at {len(source) - 1}"
 
 
+def stored_otherwise(text: str) -> str:
+    """Statistics with another mean of an action."""
+    found = json.loads(text)
+    stats = found.get("stats", found)
+    name = next(name for name in stats if name.startswith("action"))
+    stats[name]["mean"][2] += 1e-3
+    return json.dumps(found)
+
+
+@pytest.mark.parametrize("version", WITH_IMAGES)
+def test_ids_and_numbers_of_steps_and_statistics_are_read(version: str, tmp_path: Path) -> None:
+    target = WITH_IMAGES[version](tmp_path)
+    kept = {one: {**episode(one).provenance, "steps": len(episode(one))} for one in IDS}
+    assert list(target.check(kept, tmp_path)) == []
+    for file in target.folder.glob("*/meta/*stats.json*"):
+        first, *others = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
+        file.write_text("\n".join([stored_otherwise(first), *others]))
+        ((check, fault),) = target.check(kept, tmp_path)
+        assert check == "format"
+        assert f"mean of {target.keys['action']} is" in fault.what
+        file.write_text("\n".join([first, *others]))
+    data = max(target.folder.glob("*/data/**/*.parquet"))
+    whole = data.read_bytes()
+    for column, value in (("episode_id", IDS[0]), ("index", 0), ("episode_index", 0)):
+        put(data, column, value)
+        with pytest.raises(PipelineError, match=f"by {column}, these are not the {len(episode(IDS[-1]))} steps"):
+            target.read(kept[IDS[-1]], tmp_path)
+        data.write_bytes(whole)
+    assert target.read(kept[IDS[-1]], tmp_path) is not None
+
+
 def test_modality_names_columns_that_are_there(written: Written, tmp_path: Path) -> None:
     """In both versions; starVLA's names, and GR00T's for the agent view."""
     for root in (written.lerobot.root, write_lerobot_v21(tmp_path).folder / SET):
