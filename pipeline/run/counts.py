@@ -8,7 +8,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
+
+from pipeline.run.outcome import LEFT_OUT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -19,7 +22,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Counts:
-    """Of some rows. A reserve is planned once it was needed, so that ``planned - kept`` is what was lost on the way."""
+    """Of the rows among some that were ``tried``, so that ``planned - kept`` is what was lost on the way."""
 
     planned: int
     replayed: int
@@ -35,9 +38,15 @@ class Counts:
         return f"{self.planned}/{self.replayed}/{self.kept}" if self.planned else "-"
 
 
+_CHOSEN_BY = itemgetter("axis", "component", "level", "suite")
+"""The columns that ``export.where`` goes by."""
+
+
 def tried(rows: Rows) -> list[Mapping[str, Any]]:
-    """All rows but the reserves that were not needed."""
-    return [row for row in rows if row["reason"] != "reserve_not_needed"]
+    """All rows but the reserves that were not needed, and those that ``export.where`` leaves out, whatever became of
+    them: without what they gave, their losses are no yield."""
+    left_out = {_CHOSEN_BY(row) for row in rows if row["reason"] == LEFT_OUT}
+    return [row for row in rows if row["reason"] != "reserve_not_needed" and _CHOSEN_BY(row) not in left_out]
 
 
 def named(rows: Rows, column: str) -> list[str]:

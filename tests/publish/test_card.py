@@ -171,6 +171,14 @@ def test_tables_say_what_the_manifest_says(data: Path) -> None:
     assert re.search(rf"regenerate ({'|'.join(row['episode_id'] for row in ROWS if row['kept'])}) --manifest", text)
 
 
+def test_what_is_left_out_is_not_lost(data: Path) -> None:
+    """Nor is what failed of the same kind: of its level nothing is exported."""
+    before = written(data, "rlds")
+    others = [row("camera", CAMERA, reason=reason, level="1") for reason in ("left_out", "goal_not_reached")]
+    write_rows(data, [*ROWS, *others, row("noise", reason="left_out")])
+    assert written(data, "rlds") == before
+
+
 @pytest.mark.parametrize(("kind", "path"), [("rlds", f"rlds/{NAME}/data.bin"), ("lerobot", "data.bin")])
 def test_a_download_can_be_checked(data: Path, tmp_path: Path, kind: str, path: str) -> None:
     write(data)

@@ -109,8 +109,9 @@ def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Pa
 
 def test_a_combination_counts_with_each_of_its_axes() -> None:
     camera, light = _draw("camera", 0), _draw("light", 0)
-    lost = {"perturbations": to_json([camera]), "kept": False, "reason": "too_dark", "steps": 9}
-    kept = {"perturbations": to_json([camera, light]), "kept": True, "reason": "kept", "steps": 9}
+    columns = dict.fromkeys(("axis", "component", "level", "suite"), "") | {"steps": 9}
+    lost = {**columns, "perturbations": to_json([camera]), "kept": False, "reason": "too_dark"}
+    kept = {**columns, "perturbations": to_json([camera, light]), "kept": True, "reason": "kept"}
     table = yields.by_level("", [lost, kept, kept])
     shown = {name.text: cells for name, *cells in table.rows}
     assert shown["camera"][camera.level - 1] == ("2/3", 2 / 3)
