@@ -31,6 +31,9 @@ from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Quality
 
+ById = Mapping[str, Mapping[str, Any]]
+"""Episode id to its row of the manifest."""
+
 FILE = "report.html"
 REWRITES = 12
 """So many are quoted."""
@@ -60,7 +63,8 @@ def page(config: Config, test: TestSet) -> str:
     load = EpisodeLoader(data, config.render)
     tried = counts.tried(rows)
     kept = [row for row in tried if row["kept"]]
-    actions = _actions(kept, FrameStore(data / "frames", config.render))
+    twins = counts.twins(rows)
+    actions = _actions([*kept, *twins.values()], FrameStore(data / "frames", config.render))
     axes = list(dict.fromkeys(row["axis"] for row in kept))
     sheets = _pictures(data / "sheets")
     return pages.render(
@@ -70,15 +74,15 @@ def page(config: Config, test: TestSet) -> str:
         yields=yields.tables(tried),
         axes=axes,
         overall=_histograms({axis: _stacked(rows, actions) for axis, rows in by_axis(kept).items()}),
-        by_axis=_own_motion(kept, actions),
+        by_axis=_own_motion(kept, twins, actions),
         lengths=_lengths(rows, kept),
         quality=[_strips(each.name, kept, itemgetter(each.name), each.name) for each in fields(Quality)],
-        worst=_worst(kept, load),
+        worst=_worst(kept, twins, load),
         seen=seen.measure(config, test),
         coverage=_coverage(tried, test),
         rewrites=_rewrites(kept),
         leakage=leakage,
-        videos=_videos(kept, load),
+        videos=_videos(kept, twins, load),
         sheets={axis: sheets[axis] for axis in axes if axis in sheets},
         previews={folder.name: _pictures(folder) for folder in sorted((data / "previews").glob("*"))},
         versions=_versions(rows),
@@ -99,13 +103,13 @@ def _headline(tried: Rows, kept: Rows) -> dict[str, str]:
     return {name: f"{count:,}" for name, count in headline.items()}
 
 
-def _actions(kept: Rows, frames: FrameStore) -> dict[str, Floats]:
+def _actions(rows: Rows, frames: FrameStore) -> dict[str, Floats]:
     """Episode id to its actions (T, 7); episodes of one trajectory share the array."""
     read: dict[str, Floats] = {}
-    for row in kept:
+    for row in rows:
         if row["trajectory_id"] not in read:
             read[row["trajectory_id"]] = frames.motion(row["trajectory_id"])[0].astype(np.float64)
-    return {row["episode_id"]: read[row["trajectory_id"]] for row in kept}
+    return {row["episode_id"]: read[row["trajectory_id"]] for row in rows}
 
 
 def _histograms(groups: Mapping[str, Floats]) -> list[Panel]:
@@ -121,15 +125,14 @@ def _stacked(rows: Rows, actions: Mapping[str, Floats], key: str = "episode_id")
     return np.concatenate([actions[row[key]] for row in rows])
 
 
-def _own_motion(kept: Rows, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:
+def _own_motion(kept: Rows, twins: ById, actions: Mapping[str, Floats]) -> dict[str, list[Panel]]:
     """Axis to its actions beside those of its episodes' twins, for axes with replays of their own."""
-    by_id = {row["episode_id"]: row for row in kept}
     shown = {}
     for axis, rows in by_axis(kept).items():
-        paired = [row for row in rows if row["twin_id"] in by_id]
-        if any(row["trajectory_id"] != by_id[row["twin_id"]]["trajectory_id"] for row in paired):
-            twins = _stacked(paired, actions, "twin_id")
-            shown[axis] = _histograms({"clean": twins, axis: _stacked(paired, actions)})
+        paired = [row for row in rows if row["twin_id"] in twins]
+        if any(row["trajectory_id"] != twins[row["twin_id"]]["trajectory_id"] for row in paired):
+            clean = _stacked(paired, actions, "twin_id")
+            shown[axis] = _histograms({"clean": clean, axis: _stacked(paired, actions)})
     return shown
 
 
@@ -152,11 +155,10 @@ def _lengths(rows: Rows, kept: Rows) -> list[Panel]:
     return [*panels, _strips("longer than the twin by", perturbed, longer, "steps")] if perturbed else panels
 
 
-def _worst(kept: Rows, load: EpisodeLoader) -> list[Video]:
+def _worst(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
     """The trajectories that moved an object farthest which the goal does not name, beside their clean twins."""
-    by_id = {row["episode_id"]: row for row in kept}
-    twins = {row["trajectory_id"] for row in kept if row["role"] == "twin"}
-    paired = [row for row in kept if row["twin_id"] in by_id and row["trajectory_id"] not in twins]
+    clean = {row["trajectory_id"] for row in twins.values()}
+    paired = [row for row in kept if row["twin_id"] in twins and row["trajectory_id"] not in clean]
     moving = [row for row in {row["trajectory_id"]: row for row in paired}.values() if row["non_target_moved_m"]]
     shown = sorted(moving, key=lambda row: (-row["non_target_moved_m"], row["episode_id"]))[:WORST]
     return [_video(row, load, f"{100 * row['non_target_moved_m']:.1f} cm") for row in shown]
@@ -191,13 +193,12 @@ def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
     return dealt[:REWRITES]
 
 
-def _videos(kept: Rows, load: EpisodeLoader) -> list[Video]:
+def _videos(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
     """The strongest episode of each axis that shows it in the agent view, the shortest of several, beside its twin."""
-    by_id = {row["episode_id"]: row for row in kept}
     videos = []
     for rows in by_axis(kept).values():
-        paired = [row for row in rows if row["twin_id"] in by_id]
-        seen = [row for row in paired if _agent_view(row) != _agent_view(by_id[row["twin_id"]])]
+        paired = [row for row in rows if row["twin_id"] in twins]
+        seen = [row for row in paired if _agent_view(row) != _agent_view(twins[row["twin_id"]])]
         if seen:
             row = min(seen, key=lambda row: (-_level(row), row["steps"], row["episode_id"]))
             videos.append(_video(row, load, "; ".join(describe(made) for made in from_json(row["perturbations"]))))

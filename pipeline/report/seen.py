@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import NamedTuple
 
@@ -59,6 +59,9 @@ SAMPLE = 200
 
 CHANGED_LEVELS = 8
 """A pixel has changed where a channel differs by so many grey levels."""
+
+MADE = ("kept", outcome.LEFT_OUT)
+"""What became of an episode that reached its goal."""
 
 Places = dict[tuple[str, str], list[tuple[str, Shifts]]]
 """Suite and task to the names and displacements of its tests, or of a run's episodes."""
@@ -155,7 +158,9 @@ def measure(config: Config, test: TestSet) -> list[Measure]:
     run = outcome.read(config)
     # In the order in which they are written: shuffled, so that the first of each axis are of many tasks.
     kept = [run.row_of[episode_id] for episode_id in run.kept]
-    seen = _Run(config, kept)
+    # Trajectories and frames of those that ``export.where`` leaves out are there too.
+    twins = [row for row in run.rows if row.role == "twin" and run.verdicts[row.episode_id].reason in MADE]
+    seen = _Run(config, {row.episode_id: row for row in twins})
     by_axis = [[row for row in kept if row.axis == axis][:SAMPLE] for axis in dict.fromkeys(row.axis for row in kept)]
     ours = _summaries(chain(*map(seen.of, chain(*by_axis)), to_nearest_draw(test, kept)))
     run_once = {name: Spread(*values) for name, values in json.loads(SEEN.read_text()).items()}
@@ -175,12 +180,12 @@ def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
 
 
 class _Run:
-    """What a run has of its kept episodes; each first look is read once."""
+    """What a run has of its episodes; each first look is read once."""
 
-    def __init__(self, config: Config, kept: Sequence[Row]):
+    def __init__(self, config: Config, twins: Mapping[str, Row]):
         self._store = TrajectoryStore(config.data / "trajectories")
         self._load = EpisodeLoader(config.data, config.render)
-        self._twins = {row.episode_id: row for row in kept if row.role == "twin"}
+        self._twins = twins
         self._looks: dict[tuple[str, int], Look] = {}
 
     def of(self, row: Row) -> Iterator[tuple[str, float]]:

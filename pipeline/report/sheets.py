@@ -13,7 +13,7 @@ from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
-from pipeline.run.counts import by_axis
+from pipeline.run.counts import by_axis, twins
 from pipeline.types import Episode, Frame
 
 LINE_PX = 16
@@ -46,9 +46,10 @@ def write(manifest: Sequence[Mapping[str, Any]], load: Callable[[str], Episode],
     """Write one sheet for each perturbed axis of a run.
 
     Args:
-        folder: where the pictures go, one ``<axis>.png`` for each axis with a kept episode.
+        folder: where the pictures go, one ``<axis>.png`` for each axis with a kept episode that has a twin to show.
     """
-    perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed"]
+    shown = twins(manifest)
+    perturbed = [row for row in manifest if row["kept"] and row["role"] == "perturbed" and row["twin_id"] in shown]
     with replaced(folder) as temporary:
         temporary.mkdir()
         for axis, rows in by_axis(perturbed).items():

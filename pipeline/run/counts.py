@@ -49,6 +49,14 @@ def tried(rows: Rows) -> list[Mapping[str, Any]]:
     return [row for row in rows if row["reason"] != "reserve_not_needed" and _CHOSEN_BY(row) not in left_out]
 
 
+def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
+    """Episode id to row of the clean twins of kept episodes, as far as they were kept or ``export.where`` alone leaves
+    them out: their trajectories and frames are there."""
+    wanted = {row["twin_id"] for row in rows if row["kept"]}
+    made = (row for row in rows if row["kept"] or row["reason"] == LEFT_OUT)
+    return {row["episode_id"]: row for row in made if row["episode_id"] in wanted}
+
+
 def named(rows: Rows, column: str) -> list[str]:
     """The values of a column, each once, in the order in which they come."""
     return list(dict.fromkeys(row[column] for row in rows))

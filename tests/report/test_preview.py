@@ -15,14 +15,15 @@ from conftest import BOWL, MILK, REPOSITORY, starter_demo
 from PIL import Image
 
 from pipeline import __main__ as command_line
-from pipeline.axes import AXES, Axes, PhysicsPerturbation, RenderPerturbation, to_json
+from pipeline.axes import AXES, Axes, Perturbation, PhysicsPerturbation, RenderPerturbation, to_json
 from pipeline.axes.base import Axis, Nearest
+from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import loop
 from pipeline.config import PlanConfig, load
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import RefusedError
-from pipeline.images.jpeg import decode
+from pipeline.images.jpeg import decode, encode
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.physics.environment import Environment
 from pipeline.planning import plan
@@ -30,9 +31,10 @@ from pipeline.planning.streams import streams_of
 from pipeline.rendering.render import render
 from pipeline.rendering.renderer import scene_of_process
 from pipeline.report import preview, sheets
+from pipeline.seeding import rng
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Demo, Frame, RollOut, Scene, Task, Trajectory, Verdict
+from pipeline.types import Demo, Episode, Frame, RollOut, Scene, Task, Trajectory, Verdict
 
 if TYPE_CHECKING:
     import mujoco
@@ -272,6 +274,45 @@ def test_the_sheets_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     for folder in (tmp_path / "previews").iterdir():
         with Image.open(folder / "language.png") as sheet:
             assert np.asarray(sheet).std() > 20
+
+
+def stills(steps: int) -> Episode:
+    """Frames with the step in their grey level."""
+    frames = [encode(np.full((256, 256, 3), 8 * step, np.uint8), STARTER.render) for step in range(steps)]
+    nothing = np.zeros((steps, 7), np.float32)
+    return Episode("", {"image": frames}, nothing, nothing, nothing, "", {}, {})
+
+
+def of_run(name: str, twin: str, change: Perturbation | None = None, reason: str = "kept") -> dict[str, Any]:
+    """A row of the manifest."""
+    changes = [change] if change else []
+    row = {"episode_id": name, "twin_id": twin, "role": "perturbed" if change else "twin", "kept": reason == "kept"}
+    row |= {"axis": change.axis if change else "clean", "perturbations": to_json(changes), "reason": reason}
+    return row | {"component": "", "level": "1", "suite": BOWL.suite, "task": BOWL.name}
+
+
+def shown_beside_twins(rows: list[dict[str, Any]], folder: Path) -> dict[str, list[int]]:
+    """Axis to the steps of its twin and its episode on the only pair of its sheet."""
+    lengths = {"twin": 10, "push": 20, "view": 20}
+    sheets.write(rows, lambda name: stills(lengths[name]), folder)
+    found = {}
+    for file in folder.iterdir():
+        with Image.open(file) as sheet:
+            assert sheet.width == 2 * (sheets.PAIR_SIDE_PX + sheets.GAP_PX)
+            middles = [sheets.GAP_PX + share * sheets.PAIR_SIDE_PX // 2 for share in (1, 3)]
+            found[file.stem] = [round(np.asarray(sheet)[100, middle].mean() / 8) for middle in middles]
+    return found
+
+
+VIEW = CameraAxis().sample(rng("sheets"), BOWL, 0)
+
+
+@pytest.mark.parametrize("reason", ["kept", "left_out"])
+def test_sheets_show_the_pairs_of_a_run_whose_twin_is_there(reason: str, tmp_path: Path) -> None:
+    rows = [of_run("twin", "twin", reason=reason), of_run("view", "twin", VIEW)]
+    rows += [of_run("gone", "gone", reason="goal_not_reached"), of_run("alone", "gone", VIEW)]
+    assert shown_beside_twins(rows, tmp_path / "sheets") == {"camera": [3, 7]}
+    assert shown_beside_twins(rows[2:], tmp_path / "none") == {}
 
 
 def test_a_value_is_not_parted_from_its_name() -> None:
