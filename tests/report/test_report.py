@@ -24,7 +24,8 @@ from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
 from pipeline.report import coverage, figures, pages, report, yields
 from pipeline.report.coverage import Draw
-from pipeline.run import manifest
+from pipeline.run import counts, manifest
+from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
 from pipeline.types import Quality
@@ -65,13 +66,13 @@ def test_links_lead_to_sections_and_to_files_of_the_run(page: Page, finished: Pa
 
 def test_numbers_are_those_of_the_manifest(page: Page, finished: Path) -> None:
     rows = manifest.read(finished / "manifest.parquet")
-    counts = json.loads((finished / "counts.json").read_text())
+    told = json.loads((finished / "counts.json").read_text())
     words = " ".join(page.text.split())
     for name in ("planned", "replayed", "kept"):
-        total = sum(cell[name] for by_suite in counts.values() for cell in by_suite.values())
+        total = sum(cell[name] for by_suite in told.values() for cell in by_suite.values())
         assert f" {total} {name} " in words
     assert f" {sum(row['steps'] for row in rows if row['kept']):,} steps " in words
-    for axis, by_suite in counts.items():
+    for axis, by_suite in told.items():
         cells = [by_suite[suite] for suite in dict.fromkeys(row["suite"] for row in rows) if suite in by_suite]
         total = {name: sum(cell[name] for cell in cells) for name in ("planned", "kept")}
         shown = " ".join(f"{cell['kept']}/{cell['planned']}" for cell in (*cells, total))
@@ -105,6 +106,16 @@ def test_shows_every_picture_and_a_video_of_every_axis_that_can_be_seen(page: Pa
     moved = re.findall(r"\d+\.\d cm ", page.text)
     assert len(videos) == 2 + len(moved)  # camera and noise; a rewritten instruction shows in no frame
     assert max(map(len, videos)) <= VIDEO_BYTES
+
+
+def test_twins_that_are_left_out_are_still_shown(config: Config, finished: Path) -> None:
+    rows = manifest.read(finished / "manifest.parquet")
+    for row in rows:
+        if row["kept"] and row["role"] == "twin":
+            row |= {"kept": False, "reason": "left_out"}
+    kept = [row for row in rows if row["kept"]]
+    videos = report._videos(kept, counts.twins(rows), EpisodeLoader(finished, config.render))
+    assert [video.axis for video in videos] == ["camera", "noise"]
 
 
 def test_a_combination_counts_with_each_of_its_axes() -> None:

@@ -9,6 +9,7 @@ from conftest import MILK, REPOSITORY
 
 from pipeline.axes import AXES, Axis, Perturbation
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig, load
+from pipeline.export_config import Where
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.planning import plan
 from pipeline.report import seen
@@ -108,3 +109,15 @@ def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: 
     assert measures["layout", "scenes with 2 added that repeat a model"].tested == seen.Share(151, round(9 / 151, 4))
     for suite in SUITES[:4]:
         assert measures["pose", f"test's thing of interest in {suite} to the nearest other (cm)"].tested
+
+
+def test_twins_that_are_left_out_are_still_compared_with(
+    finished: Path, test: TestSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(finished.parents[1])
+    config = load(Path("configs/tiny.yaml"))
+    chosen = config.export.model_copy(update={"where": Where(axis=("noise",))})
+    whole, subset = (seen.measure(one, test) for one in (config, config.model_copy(update={"export": chosen})))
+    noise = [one for one in whole if one.axis == "noise"]
+    assert any(one.ours for one in noise)
+    assert [one for one in subset if one.axis == "noise"] == noise
