@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.axes import from_json
 from pipeline.axes.base import Layer, Perturbation
+from pipeline.axes.disturbance import DisturbancePerturbation
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.run.counts import by_axis, twins
@@ -76,14 +77,21 @@ def spread(rows: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, An
 
 def _pair(row: Mapping[str, Any], load: Callable[[str], Episode]) -> Tile:
     perturbations = from_json(row["perturbations"])
-    # The arm is back on the demonstration's path soon after another start.
-    moment = 0 if any(perturbation.layer is Layer.PHYSICS for perturbation in perturbations) else MOMENT
     shown = []
     for episode_id in (row["twin_id"], row["episode_id"]):
         frames = load(episode_id).frames["image"]
-        shown.append(decode(frames[int(moment * len(frames))]))
+        shown.append(decode(frames[_moment(perturbations, len(frames))]))
     changes = "; ".join(map(describe, perturbations))
     return Tile(side_by_side(shown, PAIR_SIDE_PX), f"{row['suite']}: {changes}")
+
+
+def _moment(perturbations: Sequence[Perturbation], steps: int) -> int:
+    """The step at which episodes of so many steps are shown."""
+    for push in perturbations:
+        if isinstance(push, DisturbancePerturbation):
+            return min(push.first_step + push.steps, steps - 1)
+    # The arm is back on the demonstration's path soon after another start.
+    return 0 if any(one.layer is Layer.PHYSICS for one in perturbations) else int(MOMENT * steps)
 
 
 def side_by_side(frames: Sequence[Frame], side_px: int) -> Image.Image:

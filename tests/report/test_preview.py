@@ -18,7 +18,9 @@ from pipeline import __main__ as command_line
 from pipeline.axes import AXES, Axes, Perturbation, PhysicsPerturbation, RenderPerturbation, to_json
 from pipeline.axes.base import Axis, Nearest
 from pipeline.axes.camera import CameraAxis
+from pipeline.axes.disturbance import DisturbanceAxis
 from pipeline.axes.language import LanguageAxis
+from pipeline.axes.robot import RobotAxis
 from pipeline.compute.pool import loop
 from pipeline.config import PlanConfig, load
 from pipeline.episode_schema import SCHEMA
@@ -305,6 +307,8 @@ def shown_beside_twins(rows: list[dict[str, Any]], folder: Path) -> dict[str, li
 
 
 VIEW = CameraAxis().sample(rng("sheets"), BOWL, 0)
+START = RobotAxis().sample(rng("sheets"), BOWL, 0)
+PUSH = DisturbanceAxis(first_step=((9, 9),), steps=((4, 4),)).sample(rng("sheets"), BOWL, 0)
 
 
 @pytest.mark.parametrize("reason", ["kept", "left_out"])
@@ -313,6 +317,14 @@ def test_sheets_show_the_pairs_of_a_run_whose_twin_is_there(reason: str, tmp_pat
     rows += [of_run("gone", "gone", reason="goal_not_reached"), of_run("alone", "gone", VIEW)]
     assert shown_beside_twins(rows, tmp_path / "sheets") == {"camera": [3, 7]}
     assert shown_beside_twins(rows[2:], tmp_path / "none") == {}
+
+
+@pytest.mark.parametrize(("change", "steps"), [(START, [0, 0]), (PUSH, [9, 13])])
+def test_sheets_show_a_start_at_once_and_a_push_when_it_ends(
+    change: Perturbation, steps: list[int], tmp_path: Path
+) -> None:
+    rows = [of_run("twin", "twin"), of_run("push", "twin", change)]
+    assert shown_beside_twins(rows, tmp_path / "sheets") == {change.axis: steps}
 
 
 def test_a_value_is_not_parted_from_its_name() -> None:
