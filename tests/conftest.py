@@ -199,7 +199,7 @@ def tiny_config(demos: Path) -> dict[str, Any]:
             "tasks": [f"{task.suite}/{task.name}" for task in SHORT],
         },
         "plan": {
-            "seed": 7,
+            "seed": 5,
             "axes": {"camera": {}, "noise": {}, "language": {}},
             "episodes": {"camera": 3, "noise": 4, "language": 3},
             "reserve": 0.5,

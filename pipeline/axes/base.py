@@ -260,10 +260,6 @@ Number = TypeVar("Number", bound=float)
 def _ordered(intervals: tuple[tuple[Number, Number], ...]) -> tuple[tuple[Number, Number], ...]:
     if not intervals or any(low > high for low, high in intervals):
         raise ValueError(f"expected one or more [low, high] with low <= high, got {[list(i) for i in intervals]}")
-    if len(intervals) > 1 and any(low == high and isinstance(low, float) for low, high in intervals):
-        raise ValueError(
-            f"a point beside others is never drawn: {[list(i) for i in intervals]}; widen it or leave it out"
-        )
     return intervals
 
 
@@ -277,8 +273,13 @@ Degrees = Annotated[float, Field(ge=-180.0, le=180.0)]
 
 
 def draw(rng: np.random.Generator, intervals: Intervals[float]) -> float:
-    """One number, uniform over the union of ``intervals`` and rounded to four decimals (as it will be recorded)."""
+    """One number, uniform over the union of ``intervals`` and rounded to four decimals (as it will be recorded).
+
+    Of points alone, each as often as the others; beside intervals, a point never comes.
+    """
     lengths = [high - low for low, high in intervals]
+    if len(intervals) > 1 and not any(lengths):
+        return round(pick(rng, intervals)[0], 4)
     at = rng.uniform(0.0, sum(lengths))
     for (low, _), length in zip(intervals, lengths, strict=True):
         if at <= length:

@@ -266,7 +266,11 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
         groups[row.identity][digest(row.settings)].append((row, files))
     for group in (group for alike in groups.values() for group in alike.values()):
         _agree(
-            ((f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode)) for row, files in group),
+            (
+                (f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode))
+                for row, files in group
+                if row.reason != REFUSED
+            ),
             "a task counts twice: ",
             expected="one episode of each task",
             remedy="delete one of the two files",

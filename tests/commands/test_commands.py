@@ -19,6 +19,7 @@ from pipeline.__main__ import main, parser
 from pipeline.files import edition
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.run import manifest
+from pipeline.run.stage import OWNER
 
 VERBS = {
     "demos": ("fetch", "expand", "check"),
@@ -185,6 +186,7 @@ def ablation(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Ablati
     clone, data = folder / "clone", folder / "elsewhere" / "tiny"
     shutil.copytree(finished.parent.parent, clone, symlinks=True)
     shutil.move(clone / "data" / "tiny", data)
+    (data / OWNER).unlink()  # Elsewhere, a folder is that of one checkout's configuration.
     (clone / "params.yaml").write_text("run: other\ndata: data\n")
     where = {"axis": ["clean", "camera"], "suite": ["libero_goal"]}
     configured(
