@@ -201,7 +201,7 @@ def spoil_lerobot(root: Path, index: Mapping[Any, int]) -> None:
 def spoil_manifest(data: Path, rows: Rows, other: str) -> None:
     for row in rows:
         if row["episode_id"] == other:
-            row["rlds_shard"] = next(r["rlds_shard"] for r in rows if r["kept"] and r["task"] == STOVE.name)
+            row["rlds_shard"] = next(r["rlds_shard"] for r in rows if r["kept"] and r["suite"] != row["suite"])
             row["instruction"] = "STUDY_SCENE1_" + row["instruction"]
     file = data / "manifest.parquet"
     manifest.write(pa.Table.from_pylist(rows, schema=pq.read_schema(file)), file, manifest.settings(file))
