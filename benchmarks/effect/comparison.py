@@ -89,21 +89,26 @@ def markdown(results: Sequence[PolicyResults]) -> str:
         of = of_line(results, line)
         rows.append([LINES[line], str(len(next(iter(of[arms[0]].values())))), *(_rates(of[arm]) for arm in arms)])
     text = "Success, in brackets of each seed:\n\n" + _table(rows)
-    rows = [["tests", "arms", "difference (95 %)", "p", "by Holm"]]
+    cells: dict[str, dict[str, str]] = defaultdict(dict)
     for one in differences(results):
         bounds = "" if one["low"] is None else f" ({100 * one['low']:+.0f} to {100 * one['high']:+.0f})"
-        p_value = "" if one["p_value"] is None else f"{one['p_value']:.2g}"
         pair = f"{one['second']} - {one['first']}"
-        rows.append([LINES[one["line"]], pair, f"{100 * one['value']:+.0f}{bounds}", p_value, f"{one['holm']:.2g}"])
-    if rows[1:]:
-        text += "\nPoints of success, of the same episodes:\n\n" + _table(rows)
+        cells[LINES[one["line"]]][pair] = f"{100 * one['value']:+.0f}{bounds}, {one['holm']:.2g}"
+    if cells:
+        rows = [["tests", *next(iter(cells.values()))], *([line, *of.values()] for line, of in cells.items())]
+        text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p:\n\n" + _table(rows)
     tasks = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
-    for arm in arms:
-        rows = [["told", *(_short(task) for task in tasks), "none"]]
-        for told, counts in reading(results, arm).items():
-            rows.append([told or "nothing", *(str(counts[goal]) for goal in (*tasks, None))])
-        text += f"\nGoals that `{arm}` reaches by what it is told:\n\n" + _table(rows)
-    return text
+    reached = {arm: reading(results, arm) for arm in arms}
+    rows = [["told", *arms]]
+    for told in reached[arms[0]]:
+        rows.append([told or "nothing", *(_reached(counts[told], tasks) for counts in reached.values())])
+    return text + "\nHow often each goal is reached by what the policy is told:\n\n" + _table(rows)
+
+
+def _reached(counts: Counter[str | None], tasks: Sequence[str]) -> str:
+    """The goals that were reached, in the order of the tasks, and how often none was."""
+    named = {_short(task): counts[task] for task in tasks} | {"none": counts[None]}
+    return ", ".join(f"{name} {count}" for name, count in named.items() if count)
 
 
 def _rates(seeds: Rows) -> str:
