@@ -316,9 +316,9 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     assert "| robot | 10 | 30 % (40, 20) | 90 % (90, 90) |" in text
     assert "| camera, noise | 20 | 30 % (40, 20) | 90 % (90, 90) |" in text
     assert "| robot | +60 (" in text
-    assert "| turn on the stove | stove 2 | stove 2 |" in text
-    assert "| put the bowl on the plate | none 2 | none 2 |" in text
-    assert "| nothing | stove 2 | stove 2 |" in text
+    assert "| turn on the stove | stove 2 of 2 | stove 2 of 2 |" in text, "of these rows, another goal's name"
+    assert "| put the bowl on the plate | 0 of 2 | 0 of 2 |" in text
+    assert "| nothing | stove 2 of 2 | stove 2 of 2 |" in text
 
 
 def test_holms_correction() -> None:

@@ -101,14 +101,15 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     reached = {arm: reading(results, arm) for arm in arms}
     rows = [["told", *arms]]
     for told in reached[arms[0]]:
-        rows.append([told or "nothing", *(_reached(counts[told], tasks) for counts in reached.values())])
-    return text + "\nHow often each goal is reached by what the policy is told:\n\n" + _table(rows)
+        rows.append([told or "nothing", *(_reached(counts[told], told, tasks) for counts in reached.values())])
+    return text + "\nHow often its goal is reached, and others by name, by what the policy is told:\n\n" + _table(rows)
 
 
-def _reached(counts: Counter[str | None], tasks: Sequence[str]) -> str:
-    """The goals that were reached, in the order of the tasks, and how often none was."""
-    named = {_short(task): counts[task] for task in tasks} | {"none": counts[None]}
-    return ", ".join(f"{name} {count}" for name, count in named.items() if count)
+def _reached(counts: Counter[str | None], told: str, tasks: Sequence[str]) -> str:
+    asked = told.replace(" ", "_")
+    others = [f"{_short(task)} {counts[task]}" for task in tasks if counts[task] and task != asked]
+    own = [str(counts[asked])] if asked in tasks else []
+    return f"{', '.join([*own, *others]) or 0} of {counts.total()}"
 
 
 def _rates(seeds: Rows) -> str:
