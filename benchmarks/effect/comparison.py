@@ -93,10 +93,11 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     for one in differences(results):
         bounds = "" if one["low"] is None else f" ({100 * one['low']:+.0f} to {100 * one['high']:+.0f})"
         pair = f"{one['second']} - {one['first']}"
-        cells[LINES[one["line"]]][pair] = f"{100 * one['value']:+.0f}{bounds}, {one['holm']:.2g}"
+        p_value = f", p {one['holm']:.2g}" if one["holm"] < 1 else ""
+        cells[LINES[one["line"]]][pair] = f"{100 * one['value']:+.0f}{bounds}{p_value}"
     if cells:
         rows = [["tests", *next(iter(cells.values()))], *([line, *of.values()] for line, of in cells.items())]
-        text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p:\n\n" + _table(rows)
+        text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n" + _table(rows)
     tasks = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
     reached = {arm: reading(results, arm) for arm in arms}
     rows = [["told", *arms]]
@@ -115,7 +116,7 @@ def _reached(counts: Counter[str | None], told: str, tasks: Sequence[str]) -> st
 def _rates(seeds: Rows) -> str:
     rate = success_rate([*chain.from_iterable(seeds.values())])
     each = ", ".join(f"{100 * success_rate(rows)['rate']:.0f}" for rows in seeds.values())
-    return f"{100 * rate['rate']:.0f} % ({each})"
+    return f"{100 * rate['rate']:.0f} %" + (f" ({each})" if len(seeds) > 1 else "")
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:
