@@ -97,7 +97,8 @@ def markdown(results: Sequence[PolicyResults]) -> str:
         cells[LINES[one["line"]]][pair] = f"{100 * one['value']:+.0f}{bounds}{p_value}"
     if cells:
         rows = [["tests", *next(iter(cells.values()))], *([line, *of.values()] for line, of in cells.items())]
-        text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n" + _table(rows)
+        text += "\nDifference in points, of the same episodes, with 95 % interval and Holm's p below 1:\n\n"
+        text += _table(rows)
     tasks = [name.partition("/")[2] for name in results[0].settings["run"]["demos"]["tasks"]]
     reached = {arm: reading(results, arm) for arm in arms}
     rows = [["told", *arms]]
