@@ -37,8 +37,8 @@ _NOT_SURFACES = frozenset(
 """Skins of single objects among the packages' textures, by normalised name."""
 
 _RECOLOURED = frozenset({"robosuite:yellow-plaster.png"})
-"""Walls of test tasks in another colour: the high-pass correlation with ``cream-plaster`` is 0.92 to 0.94 a channel,
-with other walls 0.0."""
+"""Walls of test tasks in another colour: a thumbnail's correlation with that of ``cream-plaster`` is 0.95; of the other
+packages' images the likest comes to 0.74 with a test image."""
 
 _DATA_MAP = re.compile(
     r"(?:^|[-_ ])(ao|alpha\w*|bump|disp|displacement|gloss|height|metalness|nor|norm|normal|nrm|objectid|opacity|refl"
