@@ -73,8 +73,9 @@ def read(folder: Path) -> list[PolicyResults]:
         columns, common = content.pop("columns"), content.pop("common")
         rows = [EpisodeResult(**common, **dict(zip(columns, row, strict=True))) for row in content.pop("rows")]
         found.append(PolicyResults(**content, rows=rows))
-        for what in ("settings", "sentences", "packages", "versions"):
-            if found[-1].made_by()[what] != found[0].made_by()[what]:
+        first = found[0].made_by()
+        for what, made_by in found[-1].made_by().items():
+            if made_by != first[what]:
                 raise PipelineError(
                     f"made by other {what} than the results beside it",
                     where=file,

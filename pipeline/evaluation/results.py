@@ -264,17 +264,15 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
     groups: dict[str, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
     for row, files in results.values():
         groups[row.identity][digest(row.settings)].append((row, files))
-    for group in (group for alike in groups.values() for group in alike.values()):
-        _agree(
-            (
-                (f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode))
-                for row, files in group
-                if row.reason != REFUSED
-            ),
-            "a task counts twice: ",
-            expected="one episode of each task",
-            remedy="delete one of the two files",
-        )
+    for alike in groups.values():
+        for group in alike.values():
+            acted = [(row, files.path(row.episode)) for row, files in group if row.reason != REFUSED]
+            _agree(
+                ((f"{row} by {row.policy}", {"episode": row.episode}, path) for row, path in acted),
+                "a task counts twice: ",
+                expected="one episode of each task",
+                remedy="delete one of the two files",
+            )
     return [
         _evaluated(group, [other[0][0] for other in alike.values()])
         for alike in groups.values()

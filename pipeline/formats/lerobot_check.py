@@ -19,7 +19,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pipeline.episode_schema import MOTION, SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID
-from pipeline.formats.lerobot_read import copy_of, readable, rows, wrong_statistics
+from pipeline.formats.lerobot_read import copy_of, readable, rows, vectors, wrong_statistics
 from pipeline.formats.read_back import Fault, sampled
 
 BY_LEROBOT = 8
@@ -55,7 +55,8 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str
                 read[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
         statistics = json.loads((root / "meta" / "stats.json").read_text())
         measured = (SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key)
-        wrong = list(wrong_statistics(statistics, sorted(root.glob("data/**/*.parquet")), measured))
+        steps = [vectors(file, measured) for file in sorted(root.glob("data/**/*.parquet"))]
+        wrong = list(wrong_statistics(statistics, steps))
         stored = (meta.total_episodes, data.num_frames)
         strangers = sorted(rows(root).keys() - kept.keys())
         samples = list(_samples(root, data))
@@ -66,9 +67,10 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str
         yield "format", Fault("lerobot", None, what, expected)
     for episode_id, key in samples:
         yield "format", Fault("lerobot", episode_id, f"lerobot reads another {key}", "what its files hold")
-    steps = sum(row["steps"] for row in kept.values())
-    if stored != (len(kept), steps):
-        yield "ids", Fault("lerobot", None, f"{stored[0]} episodes of {stored[1]} steps", f"{len(kept)} of {steps}")
+    wanted_steps = sum(row["steps"] for row in kept.values())
+    if stored != (len(kept), wanted_steps):
+        found = f"{stored[0]} episodes of {stored[1]} steps"
+        yield "ids", Fault("lerobot", None, found, f"{len(kept)} of {wanted_steps}")
     # One that is missing is told where it is looked for.
     for episode_id in strangers:
         yield "ids", Fault("lerobot", episode_id, "is in the dataset", "kept episodes alone")

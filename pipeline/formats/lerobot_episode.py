@@ -278,6 +278,7 @@ def write_modality(root: Path, convention: Convention) -> None:
 
 
 def listed(found: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Statistics by name, as JSON has them."""
     return {name: values.tolist() for name, values in found.items()}
 
 
@@ -291,4 +292,5 @@ def link(made: Path, place: Path) -> None:
 
 
 def write_json(file: Path, content: Mapping[str, Any]) -> None:
+    """Write a file of ``meta/``, indented as lerobot's are."""
     file.write_text(json.dumps(content, indent=4) + "\n")

@@ -133,12 +133,18 @@ def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
             raise ValueError(f"by {name}, these are not the {steps} steps of episode {index}")
 
 
+def vectors(file: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Column of a data file to its vectors (T, D)."""
+    table = pq.read_table(file, columns=[*columns])
+    return {column: _matrix(table, column) for column in columns}
+
+
 def wrong_statistics(
-    stored: Mapping[str, Any], files: Sequence[Path], columns: Sequence[str]
+    stored: Mapping[str, Any], steps: Sequence[Mapping[str, NDArray[Any]]]
 ) -> Iterator[tuple[str, str]]:
-    """What is off with the stored statistics of some columns of data files, and what their values come to."""
-    for column in columns:
-        values = np.concatenate([_matrix(pq.read_table(file, columns=[column]), column) for file in files], dtype=float)
+    """What is off with the stored statistics of the ``vectors`` of some files, and what these come to."""
+    for column in steps[0]:
+        values = np.concatenate([of_file[column] for of_file in steps], dtype=float)
         for name in ("mean", "std", "min", "max"):
             expected = getattr(values, name)(axis=0)
             if not np.allclose(stored[column][name], expected, rtol=SAME_SHARE, atol=SAME):

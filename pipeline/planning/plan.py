@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
-from itertools import chain, count, islice
+from itertools import count, islice
 from math import ceil
 from pathlib import Path
 from typing import Annotated
@@ -176,17 +176,18 @@ class Draws:
 
         Or strengths near the test set's would become rare. None where none of many keeps clear.
         """
+
+        def clear(one: Perturbation) -> bool:
+            return one.nearest(self.test, task).distance >= one.clearance
+
+        if clear(first):
+            return first
         again, alike = rng(self.seed, self.name, *key), axis.model_copy(update={"levels": (first.level,)})
-        others = (alike.sample(again, task, place) for _ in range(_ATTEMPTS))
-        return next(
-            (
-                one
-                for one in chain([first], others)
-                if (one.component, one.level) == (first.component, first.level)
-                and one.nearest(self.test, task).distance >= one.clearance
-            ),
-            None,
-        )
+        for _ in range(_ATTEMPTS):
+            one = alike.sample(again, task, place)
+            if (one.component, one.level) == (first.component, first.level) and clear(one):
+                return one
+        return None
 
 
 def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:

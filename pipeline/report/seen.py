@@ -60,9 +60,6 @@ SAMPLE = 200
 CHANGED_LEVELS = 8
 """A pixel has changed where a channel differs by so many grey levels."""
 
-MADE = ("kept", outcome.LEFT_OUT)
-"""What became of an episode that reached its goal."""
-
 Places = dict[tuple[str, str], list[tuple[str, Shifts]]]
 """Suite and task to the names and displacements of its tests, or of a run's episodes."""
 
@@ -159,7 +156,7 @@ def measure(config: Config, test: TestSet) -> list[Measure]:
     # In the order in which they are written: shuffled, so that the first of each axis are of many tasks.
     kept = [run.row_of[episode_id] for episode_id in run.kept]
     # Trajectories and frames of those that ``export.where`` leaves out are there too.
-    twins = [row for row in run.rows if row.role == "twin" and run.verdicts[row.episode_id].reason in MADE]
+    twins = [row for row in run.rows if row.role == "twin" and run.verdicts[row.episode_id].reason in outcome.MADE]
     seen = _Run(config, {row.episode_id: row for row in twins})
     by_axis = [[row for row in kept if row.axis == axis][:SAMPLE] for axis in dict.fromkeys(row.axis for row in kept)]
     ours = _summaries(chain(*map(seen.of, chain(*by_axis)), to_nearest_draw(test, kept)))

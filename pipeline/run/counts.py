@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
-from pipeline.run.outcome import LEFT_OUT
+from pipeline.run.outcome import LEFT_OUT, MADE
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -53,7 +53,7 @@ def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
     """Episode id to row of the clean twins of kept episodes, as far as they were kept or ``export.where`` alone leaves
     them out: their trajectories and frames are there."""
     wanted = {row["twin_id"] for row in rows if row["kept"]}
-    made = (row for row in rows if row["kept"] or row["reason"] == LEFT_OUT)
+    made = (row for row in rows if row["reason"] in MADE)
     return {row["episode_id"]: row for row in made if row["episode_id"] in wanted}
 
 

@@ -20,6 +20,9 @@ from pipeline.types import Verdict
 LEFT_OUT = "left_out"
 """The reason why an episode that reached its goal is in no dataset: ``export.where`` does not name it."""
 
+MADE = ("kept", LEFT_OUT)
+"""The reasons of episodes whose trajectory and frames are there."""
+
 
 MISSED = ("goal_not_reached", "goal_lost")
 """The reasons of failures: what was simulated to the end, and missed its goal. Good demonstrations do too: see the
