@@ -139,7 +139,8 @@ def _in_new_process(folder: Path, name: str, **environment: str) -> np.ndarray[A
     """(N, H, W, 3) frames of the first states, rendered plainly by a process of its own."""
     file = folder / "frames.npy"
     code = f"from gpu import _save; _save({str(folder)!r}, {name!r})"
-    environment |= {PLAIN: "1", "PYTHONPATH": str(Path(__file__).parent)}
+    path = os.pathsep.join(filter(None, (str(Path(__file__).parent), os.environ.get("PYTHONPATH"))))
+    environment |= {PLAIN: "1", "PYTHONPATH": path}
     subprocess.run([sys.executable, "-c", code], check=True, env=os.environ | environment)
     frames: np.ndarray[Any, np.dtype[np.uint8]] = np.load(file)
     return frames

@@ -82,7 +82,7 @@ _LEVELS = np.arange(256.0)
 
 def count(frame: Frame) -> Counts:
     """The levels of one frame (H, W, 3)."""
-    channels = [cv2.calcHist([frame], [channel], None, [256], [0, 256])[:, 0] for channel in range(3)]
+    channels = [cv2.calcHist([frame], [channel], None, [256], [0, 256]).ravel() for channel in range(3)]
     return np.stack(channels).astype(np.int64)
 
 
