@@ -51,7 +51,9 @@ class LightPerturbation(RenderPerturbation):
     """Changed lamps.
 
     Attributes:
-        diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel.
+        diffuse_scale_rgb: multiple of each lamp's diffuse colour, by channel. Before, lamps that add up to more than
+            ``SHOWN_DIFFUSE``, the kitchen's, are dimmed to it, whatever else is drawn; it changes 12 % of their pixels
+            by 8 grey levels or more.
         specular_scale: multiple of each lamp's specular colour; above 1 it polishes the surfaces too.
         tilt_deg: every lamp is turned in place by so much,
         tilt_azimuth_deg: towards this horizontal direction (0 is the world's x axis, 90 its y axis).
@@ -159,8 +161,11 @@ class LightAxis(Axis):
             "combined": ("diffuse", "direction", "specular", *(("shadows",) if rng.random() < 0.5 else ())),
         }
         drawn: dict[str, object] = {}
-        for name in properties.get(component, (component,)):
-            drawn |= self._draw(rng, name, level, task)
+        names = properties.get(component, (component,))
+        # These are as bright as can be already: the kitchen's lamps, and those whose shadows are to show.
+        brightest = "shadows" in names or bddl.read(task.bddl_file).arena == "kitchen"
+        for name in names:
+            drawn |= self._draw(rng, name, level, brightest)
         return LightPerturbation.model_validate({"component": component, "level": level, **drawn})
 
     def _draw_component(self, rng: np.random.Generator) -> Component:
@@ -169,15 +174,14 @@ class LightAxis(Axis):
             return "combined"
         return single[rng.integers(len(single))]
 
-    def _draw(self, rng: np.random.Generator, component: str, level: Level, task: Task) -> dict[str, object]:
+    def _draw(self, rng: np.random.Generator, component: str, level: Level, brightest: bool) -> dict[str, object]:
         ranges = self.ranges[level - 1]
         match component:
             case "diffuse":
                 # Not both: a brighter lamp drives its tint back to white.
                 if rng.random() < 0.5:
                     scales = ranges.brightness_scale
-                    if bddl.read(task.bddl_file).arena == "kitchen":
-                        # It is as bright as can be already.
+                    if brightest:
                         scales = tuple((low, min(high, 1.0)) for low, high in scales if low < 1) or scales
                     return {"diffuse_scale_rgb": [draw(rng, scales)] * 3}
                 tint = colorsys.hsv_to_rgb(rng.random(), draw(rng, ranges.saturation), 1.0)

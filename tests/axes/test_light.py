@@ -2,9 +2,11 @@
 
 import colorsys
 from collections.abc import Iterator
+from itertools import pairwise
 from statistics import mean
 from typing import get_args
 
+import mujoco
 import numpy as np
 import pytest
 from arenas import TASKS, change, changed, checksums, frames
@@ -103,6 +105,26 @@ def test_ranges_grow_with_the_level() -> None:
         assert values == sorted(set(values))
     fills = [drawn("shadows", level, 0).fill_scale for level in (1, 2, 3, 4, 5)]
     assert fills == sorted(set(fills), reverse=True)
+
+
+LAMPS = """
+<mujoco><worldbody>
+  <light pos="1 1 4" dir="-1 -1 -4" diffuse=".8 .8 .8"/><light pos="-3 -3 4" dir="1 1 -1" diffuse=".8 .8 .8"/>
+</worldbody></mujoco>"""
+
+
+def test_no_recorded_brightness_is_lost_in_shadows() -> None:
+    """Lamps with shadows are limited: what is recorded as brighter must not look like another draw."""
+    shown: dict[float, float] = {}
+    for key in range(200):
+        one = drawn("combined", 1 + key % 5, key)  # type: ignore[arg-type]
+        if one.shadows and len({*one.diffuse_scale_rgb}) == 1:
+            model = mujoco.MjModel.from_xml_string(LAMPS)
+            NEUTRAL.model_copy(update={"diffuse_scale_rgb": one.diffuse_scale_rgb, "shadows": True}).apply(model)
+            shown[one.diffuse_scale_rgb[0]] = float(model.light_diffuse.max())
+    scales = sorted(shown)
+    assert len(scales) > 30
+    assert all(shown[low] < shown[high] for low, high in pairwise(scales))
 
 
 @pytest.mark.slow
