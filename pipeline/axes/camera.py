@@ -193,7 +193,7 @@ class OrientationRange(Frozen):
     )
 
 
-Aside = Literal["elevation", "distance", "turn"]
+Aside = Literal["elevation", "distance", "turn", "yaw"]
 
 
 class AsideRange(Frozen):
@@ -205,7 +205,8 @@ class AsideRange(Frozen):
         elevation_deg: to either side of the test set's elevations, 0 and 15.
         distance_scale: to either side of the nominal distance, which all test cameras but the dollies keep. A smaller
             turn than the clearance at one of the dollies' distances is drawn anew.
-        turn_deg: angle of a turn in place, in any direction.
+        turn_deg: angle of a turn in place, in any direction. Of a camera that moved around the scene it is a yaw: the
+            pitch is about the world's y axis, so there it would roll the camera, as in no test task.
     """
 
     elevation_deg: Angles = ((-8.0, -5.1), (5.1, 9.9))
@@ -222,11 +223,13 @@ class AsideRange(Frozen):
             case "turn":
                 yaw_deg, pitch_deg = point(rng, draw(rng, self.turn_deg))
                 return {"yaw_deg": yaw_deg, "pitch_deg": pitch_deg}
+            case "yaw":
+                return {"yaw_deg": draw(rng, self.turn_deg) * (1 if rng.random() < 0.5 else -1)}
 
 
 ASIDES: dict[Component, tuple[Aside, ...]] = {
     "distance": ("elevation", "turn"),
-    "spherical": ("elevation", "distance", "turn"),
+    "spherical": ("elevation", "distance", "yaw"),
     "orientation": ("elevation", "distance"),
 }
 """What a component's draws may change beside what the component is about, each as often as the others."""

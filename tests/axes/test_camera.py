@@ -235,3 +235,16 @@ def test_order_of_listing_does_not_matter() -> None:
     noise = NoiseAxis().sample(rng("b"), MILK, 0)
     assert to_json([moved, noise]) == to_json([noise, moved])
     assert [p.axis for p in from_json(to_json([noise, moved]))] == ["camera", "noise"]
+
+
+def test_no_camera_rolls_more_than_the_test_s() -> None:
+    """The horizontal axis of a picture stays level: the test cameras tilt it by at most 1.7 degrees."""
+    tilts_deg = {"test": 0.0, "ours": 0.0}
+    drawn = [CameraAxis().sample(rng("roll", key), MILK, 0) for key in range(600)]
+    grid = [camera(component, **parameters) for component, parameters in benchmark_cameras()]
+    for source, cameras in (("test", grid), ("ours", drawn)):
+        for one in cameras:
+            _, quat_wxyz = one.pose(TABLETOP_POS_M, TABLETOP_QUAT_WXYZ)
+            right = Rotation.from_quat(quat_wxyz, scalar_first=True).apply([1.0, 0.0, 0.0])
+            tilts_deg[source] = max(tilts_deg[source], abs(np.degrees(np.arcsin(right[2]))))
+    assert max(tilts_deg.values()) <= 2.0, tilts_deg
