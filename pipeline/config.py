@@ -250,6 +250,10 @@ class Config(Frozen):
         chosen, axes = select_tasks(self.demos.tasks), self.plan.axes
         if axes.disturbance and self.replay.noops != "drop":
             raise ValueError("pushes count steps without no-ops: the axis disturbance goes with replay.noops: drop")
+        if axes.disturbance and self.replay.mode == "open_loop":
+            raise ValueError(
+                "recorded actions do not work against pushes: disturbance goes with replay.mode: auto or tracked"
+            )
         if axes.language:
             # LIBERO-90 has no rewrites among those that are shipped.
             banks = [load_bank(), *([load_bank(axes.language.bank)] if axes.language.bank else [])]

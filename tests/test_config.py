@@ -140,10 +140,17 @@ def test_three_lines_are_a_whole_run(tmp_path: Path) -> None:
     )
 
 
-def test_pushes_go_with_dropped_no_ops(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("replay", "message"),
+    [
+        ("noops: keep", r"goes with replay\.noops: drop"),
+        ("mode: open_loop", r"with replay\.mode: auto or tracked"),
+    ],
+)
+def test_pushes_go_with_dropped_no_ops_and_tracking(replay: str, message: str, tmp_path: Path) -> None:
     file = tmp_path / "pushed.yaml"
-    file.write_text("{name: pushed, plan: {episodes: {disturbance: 1}}, replay: {noops: keep}}")
-    with pytest.raises(PipelineError, match=r"goes with replay\.noops: drop"):
+    file.write_text(f"{{name: pushed, plan: {{episodes: {{disturbance: 1}}}}, replay: {{{replay}}}}}")
+    with pytest.raises(PipelineError, match=message):
         load(file)
 
 

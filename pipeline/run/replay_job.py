@@ -58,7 +58,9 @@ class ReplayJob:
             # Sent as they were, the actions would hit by luck and teach that where things stand does not matter.
             start, config = _at_reset(environment, demo, seed), config.model_copy(update={"mode": "tracked"})
         trajectory = replay(environment, start, self.row.trajectory_id, config, physics, reference)
-        if seed is not None and trajectory.verdict.kept and trajectory.mode != "tracked":
+        # Nor do they work against a push.
+        tracks = seed is not None or trajectory.scene.push is not None
+        if tracks and trajectory.verdict.kept and trajectory.mode != "tracked":
             trajectory = replace(trajectory, verdict=Verdict(False, "no_reference"))
         if trajectory.verdict.kept:
             trajectory = replace(trajectory, quality=measure(trajectory, demo.task))

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from conftest import BOWL, starter_demo
 
+from pipeline.axes import Axes
 from pipeline.axes.disturbance import DisturbanceAxis, DisturbancePerturbation
-from pipeline.config import ReplayConfig
+from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.selection import Selection, select
@@ -17,10 +18,13 @@ from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment
 from pipeline.physics.reference import Reference
 from pipeline.physics.replay import replay, roll_out
+from pipeline.planning import plan
+from pipeline.run.replay_job import ReplayJob
 from pipeline.scenes.compiled import CompiledScene
 from pipeline.seeding import rng
 from pipeline.stores.trajectory_store import TrajectoryStore
-from pipeline.types import Floats, Scene, Task, Trajectory
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Floats, Scene, Task, Trajectory, Verdict
 
 DEMO = starter_demo(BOWL)
 SCENE = recorded_start(DEMO, "")
@@ -98,6 +102,16 @@ def hands_m(trajectory: Trajectory, steps: range) -> Floats:
         compiled.restore(trajectory.states[step])
         positions.append(compiled.data.site("gripper0_grip_site").xpos.copy())
     return np.array(positions)
+
+
+def test_recorded_actions_that_a_push_does_not_stop_are_dropped(tmp_path: Path) -> None:
+    """They reach the goal and show nothing of how to work against it."""
+    demos = DemosConfig(tasks=(f"{BOWL.suite}/{BOWL.name}",))
+    weak = PlanConfig(seed=0, axes=Axes(disturbance=DisturbanceAxis(levels=(1,))), episodes={"disturbance": 1})
+    rows = plan.make(demos.index().entries, weak, ReplayConfig(), TestSet(()))
+    row = next(row for row in rows if row.axis == "disturbance")
+    job = ReplayJob(row, row.trajectory_id, demos, ReplayConfig(mode="open_loop"), tmp_path)
+    assert job() == Verdict(False, "no_reference")
 
 
 @pytest.mark.parametrize("first_step", [12, 50])
