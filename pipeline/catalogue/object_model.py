@@ -27,6 +27,10 @@ _CONTACT = {
     "condim": "6",
 }
 
+_PLACES = {"axisangle", "xyaxes", "zaxis", "fromto"}
+_TAGS = {"default", "include", "deformable", "frame", "replicate", "composite", "flexcomp", "attach"}
+"""Attributes and elements that place geoms in ways that are not read here."""
+
 
 class Shape(NamedTuple):
     """What a model measures when it stands.
@@ -124,11 +128,12 @@ class ObjectModel:
         folders = {"meshdir", "texturedir", "assetdir"}
         redirected = any(folders & set(compiler.attrib) for compiler in root.iter("compiler"))
         turned = any(element.get("euler", "0 0 0") != "0 0 0" for element in root.iter())
-        if redirected or turned or any(root.find(tag) is not None for tag in ("default", "include", "deformable")):
+        placed = any(_PLACES & element.attrib.keys() for element in root.iter())
+        if redirected or turned or placed or any(element.tag in _TAGS for element in root.iter()):
             raise PipelineError(
-                "the model uses defaults, includes, asset folders or euler angles",
+                "the model uses defaults, includes, frames, asset folders or rotations that are no quat",
                 where=self.mjcf,
-                expected="paths relative to the model, quat for rotations, every attribute on its element",
+                expected="paths relative to the model, pos and quat for places, every attribute on its element",
                 remedy="compile it and save it again with mujoco.mj_saveLastXML",
             )
         return root

@@ -199,10 +199,22 @@ def test_a_user_s_mjcf_is_taken_with_its_files(folder: Path, tmp_path: Path) -> 
     assert (compiled(cube).geom_group == 1).any(), "what is touched is also seen when the model draws nothing else"
 
 
-def test_models_that_would_change_their_meaning_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "geom",
+    [
+        '<geom size=".1" euler="90 0 0"/>',
+        '<geom type="box" size=".1 .1 .1" axisangle="1 0 0 90"/>',
+        '<geom type="box" size=".1 .1 .1" xyaxes="0 1 0 -1 0 0"/>',
+        '<geom type="box" size=".1 .1 .1" zaxis="1 0 0"/>',
+        '<geom type="capsule" size=".1" fromto="0 0 0 0 0 1"/>',
+        '<frame quat="0 1 0 0"><geom size=".1"/></frame>',
+    ],
+)
+def test_models_that_would_change_their_meaning_are_refused(geom: str, tmp_path: Path) -> None:
     file = tmp_path / "model.xml"
-    file.write_text('<mujoco><worldbody><body><geom size=".1" euler="90 0 0"/></body></worldbody></mujoco>')
-    with pytest.raises(PipelineError, match="euler"):
+    file.write_text(f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>")
+    mujoco.MjModel.from_xml_path(str(file))
+    with pytest.raises(PipelineError, match="no quat"):
         _ = ObjectModel("own/x", "x", "", "", file).shape
 
 
