@@ -27,7 +27,7 @@ from pipeline.seeding import digest
 Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "lerobot_v21", "evaluation", "checks", "pictures"]
 
 RECIPES: dict[Step, int] = {
-    "physics": 6,
+    "physics": 7,
     "pixels": 5,
     "encoding": 1,
     "rlds": 3,

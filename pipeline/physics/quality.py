@@ -37,7 +37,9 @@ def measure(trajectory: Trajectory, task: Task) -> Quality:
         positions.append(grip.xpos.copy())
         turns.append(grip.xmat.reshape(3, 3).copy())
         roots = model.body_rootid[scene.contacts].tolist()
-        touched += step > 0 and any(robot in pair and not allowed & {*pair} for pair in roots)
+        others = [{*pair} - {robot} for pair in roots if robot in pair]
+        # The fingers of an empty gripper touch each other.
+        touched += step > 0 and any(other and not allowed & other for other in others)
     hand, qpos = np.stack(positions), np.stack([State.of(state, model.nq).qpos for state in trajectory.states])
     steps_m: Floats = np.linalg.norm(np.diff(hand, axis=0), axis=1)
     asked = hand[:-1] + SCHEMA.action.unit_m * np.clip(trajectory.actions[:, :3], -1, 1)

@@ -13,6 +13,7 @@ from pipeline.libero.tasks import find_task
 from pipeline.physics.environment import Environment
 from pipeline.physics.quality import measure, of_goal
 from pipeline.physics.replay import replay
+from pipeline.scenes.compiled import FINGERS
 from pipeline.types import State, Trajectory
 
 CABINET = find_task("libero_goal", "put_the_bowl_on_top_of_the_cabinet")
@@ -51,6 +52,16 @@ def test_path_and_contacts_are_robosuites(replayed: tuple[Environment, Trajector
 def geoms_of(env: object, name: str) -> list[str]:
     models = {**env.objects_dict, **env.fixtures_dict}  # type: ignore[attr-defined]
     return list(models[name].contact_geoms)
+
+
+@pytest.mark.slow
+def test_an_empty_gripper_that_closes_touches_nothing(replayed: tuple[Environment, Trajectory]) -> None:
+    environment, trajectory = replayed
+    states, model = trajectory.states.copy(), environment.sim.model._model
+    for finger in FINGERS:
+        State.of(states[2], model.nq).qpos[int(model.joint(finger).qposadr[0])] = 0.0
+    shut = measure(replace(trajectory, states=states), environment.task)
+    assert shut.touched_steps == measure(trajectory, environment.task).touched_steps
 
 
 @pytest.mark.slow
