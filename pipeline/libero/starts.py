@@ -24,8 +24,8 @@ def recorded_start(demo: Demo, model_xml: str, settles: bool = True) -> Scene:
 
     In the steps that LIBERO cuts off a recording, the gripper's command came to what the first action that is left
     asks for. What settles does so as in an evaluation, which puts a state in after a reset: the controller has
-    the reset's posture. What does not, and what starts too far from home for a reset, such as the demonstrations of
-    ``demos expand``, is held where it is.
+    the reset's posture. What does not, and what starts too far from home for a reset, such as most demonstrations
+    of ``demos expand --starts wide``, is held where it is.
     """
     # After the time, a flattened state has the arm's seven joints.
     near = float(np.linalg.norm(demo.init_state[1:8] - HOME_RAD)) <= SCATTER_RAD
