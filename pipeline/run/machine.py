@@ -37,10 +37,11 @@ TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
 
 class Speed(NamedTuple):
     """How fast this machine is: seconds of one core for a control step, and for a frame of the trial's scene by the
-    plain renderer."""
+    plain renderer, of the core or of a GPU."""
 
     step_s: float
     frame_s: float
+    gpu: bool = False
 
 
 class Trial(NamedTuple):
@@ -75,19 +76,20 @@ def trial() -> Trial:
     renderer.close()
     plain = Renderer(renderer.model, PlainDrawing(renderer.model))
     plain.restore(trajectory.states[-1], trajectory.site_alpha[-1])
-    frame_s = _seconds(lambda: plain.frame("agentview"), on_gpu=not gl.choose().software)
+    gpu = not gl.choose().software
+    frame_s = _seconds(lambda: plain.frame("agentview"), gpu)
     plain.close()
     digests = {
         "OpenGL device": gl.choose().device,
         "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],
         "one frame": hashlib.sha256(frame.tobytes()).hexdigest()[:16],
     }
-    return Trial(digests, Speed(step_s, frame_s))
+    return Trial(digests, Speed(step_s, frame_s, gpu))
 
 
-def _seconds(call: Callable[[], object], on_gpu: bool = False) -> float:
+def _seconds(call: Callable[[], object], gpu: bool = False) -> float:
     """Of the quickest of ten calls: of the processor, so that other work counts little, or on the clock for a GPU."""
-    return min(timeit.repeat(call, number=1, repeat=10, timer=time.perf_counter if on_gpu else time.process_time))
+    return min(timeit.repeat(call, number=1, repeat=10, timer=time.perf_counter if gpu else time.process_time))
 
 
 def keep_speed(folder: Path, speed: Speed) -> None:

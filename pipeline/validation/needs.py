@@ -73,6 +73,9 @@ RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.003, 0.0013
 """A step of an episode in the exports and in ``validate``."""
 FIXED_S = 100.0
 """Starting the stages, previews, sheets and report: on the clock, however many workers there are."""
+IN_TURN = ("rest", "GPU")
+"""What takes as long with more workers. A GPU renders for one process at a time: an H200 gave 770 frames a second to 4
+as to 16 of them, and 600 to one (`benchmarks/gpu.py`)."""
 
 
 def needed_mb(config: Config) -> dict[str, float]:
@@ -114,10 +117,10 @@ def needed_mb(config: Config) -> dict[str, float]:
 
 
 def needed_s(config: Config, speed: Speed) -> dict[str, float]:
-    """Stage to the seconds that one core takes for it; under ``rest``, seconds that more cores do not make fewer.
+    """Stage to the seconds that one core takes for it; under ``IN_TURN``, seconds that more cores do not make fewer.
 
     Every planned episode counts as kept, and so does the clean twin of every demonstration. Savings are taken to gain
-    as much as on the reference machine.
+    as much as on the reference machine. A GPU renders plainly and takes as long in every arena.
 
     Args:
         config: of the run.
@@ -128,33 +131,35 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     # To render a frame of each view: the mean over all demonstrations.
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
     drawn_s = np.average([FRAME_S[arena] for arena in arenas], axis=0, weights=weights)
-    frame_s = [float(s) * speed.frame_s / REFERENCE.frame_s for s in drawn_s]
-    maps_s = MAPS_S * speed.frame_s / REFERENCE.frame_s * any(extra in MAP_KB for extra in config.render.extras)
-    trajectories, frames_s = amounts.twins, amounts.twin_steps * sum(view_s + ENCODE_S + maps_s for view_s in frame_s)
+    slower = speed.frame_s / REFERENCE.frame_s
+    frame_s = [speed.frame_s] * len(drawn_s) if speed.gpu else [float(s) * slower for s in drawn_s]
+    maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in config.render.extras)
+    trajectories, rendered_s = amounts.twins, amounts.twin_steps * sum(view_s + maps_s for view_s in frame_s)
+    encoded_s = amounts.twin_steps * len(frame_s) * ENCODE_S
     for axes, episodes, kinds in _planned(config.plan):
         trajectories += episodes * any(issubclass(kind, PhysicsPerturbation) for kind in kinds)
         for view, view_s in zip(SCHEMA.views, frame_s, strict=True):
             here = [kind for kind in kinds if view in kind.views]
             rendered = any(issubclass(kind, PhysicsPerturbation | RenderPerturbation) for kind in here)
             mapped = any(_seen_otherwise(kind) for kind in here)
-            shadows_s = SHADOWS_S * SHADOWS * ("light" in axes) * speed.frame_s / REFERENCE.frame_s
-            step_s = rendered * (view_s + shadows_s) + ENCODE_S * bool(here) + maps_s * mapped
-            frames_s += episodes * amounts.mean_steps * step_s
+            shadows_s = SHADOWS_S * SHADOWS * ("light" in axes) * slower
+            rendered_s += episodes * amounts.mean_steps * (rendered * (view_s + shadows_s) + maps_s * mapped)
+            encoded_s += episodes * amounts.mean_steps * ENCODE_S * bool(here)
     processor = speed.step_s / REFERENCE.step_s
     formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
     _, exported_steps = _exported(config, amounts)
     return {
         "replay": processor * trajectories * (SCENE_S + TRIES * amounts.mean_steps * STEP_S),
-        "render": frames_s,
+        "render": encoded_s + rendered_s * (not speed.gpu),
         "export": processor * exported_steps * sum(formats[name] for name in config.export.formats),
         "validate": processor * exported_steps * VALIDATE_S * len(config.export.formats),
         "rest": processor * FIXED_S,
-    }
+    } | ({"GPU": rendered_s} if speed.gpu else {})
 
 
 def in_words(stages_s: Mapping[str, float], workers: int) -> str:
     """Some stages' time on the clock, with so many cores."""
-    times_s = {stage: s if stage == "rest" else s / workers for stage, s in stages_s.items()}
+    times_s = {stage: s if stage in IN_TURN else s / workers for stage, s in stages_s.items()}
     parts = ", ".join(f"{stage} {_time(s)}" for stage, s in times_s.items())
     return f"about {_time(sum(times_s.values()))} with {workers} worker{'s' * (workers > 1)}: {parts}"
 

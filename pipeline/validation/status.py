@@ -137,6 +137,7 @@ def _time_left(
         "replay": sum(row.trajectory_id not in verdicts for row in wanted) / len(wanted),
         "render": sum(not outcome.rendered(row, frames) for row in wanted) / len(wanted),
     }
+    left["GPU"] = left["render"]
     needed = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(config, speed).items()}
     yield f"time left: {in_words(needed, workers_of(config.compute))}"
 
