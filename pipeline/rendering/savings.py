@@ -73,10 +73,12 @@ def drawing_of(model: mujoco.MjModel) -> PlainDrawing:
 
 @functools.cache
 def why_plain() -> str | None:
-    """The reason why this process renders plainly, logged unless plain was asked for; None when it uses savings."""
+    """The reason why this process renders plainly, logged where it could be quicker; None when it uses savings."""
     if os.environ.get(PLAIN):
         return f"{PLAIN} is set"
     device = gl.choose().device
+    if not gl.choose().software:
+        return f"{device} is quick without savings"
     if mujoco.__version__ != MUJOCO:
         reason = f"savings were tested with MuJoCo {MUJOCO}, this is {mujoco.__version__}"
     elif not device.startswith(DEVICE):
