@@ -5,7 +5,7 @@
 Replays one demonstration. Then each number of processes renders its states with both cameras, JPEG included, for some
 seconds, plainly and with the savings that this device may use; a process waits until all others are ready. A process
 with Mesa's software renders the first states again for the comparison. `against_naive.py` follows with one task. Takes
-about ten minutes on a GPU. The last line is JSON: the device; for each number of processes frames per second, CPU time
+about four minutes on a GPU. The last line is JSON: the device; for each number of processes frames per second, CPU time
 and memory of a process; how far the frames are from Mesa's; naive : ours.
 """
 
