@@ -17,7 +17,7 @@ that is about a run takes it as its last argument, and else the one that params.
 """
 EXAMPLES = """\
 examples:
-  python -m pipeline run configs/starter.yaml                    about 47 episodes of all axes, in minutes
+  python -m pipeline run configs/starter.yaml                    about 47 episodes of eight axes, in minutes
   python -m pipeline preview 'libero_goal/turn_on*' camera       what an axis does to a task
   python -m pipeline demos fetch data/demos libero_goal          all 50 demonstrations of each task, from the hub
   python -m pipeline COMMAND --help                              what a command takes

@@ -61,7 +61,7 @@ def axes(arguments: argparse.Namespace) -> None:
 
 
 def tasks(arguments: argparse.Namespace) -> None:
-    """list LIBERO's tasks, as demos.tasks names them, with their instructions"""
+    """list LIBERO's tasks and your own, as demos.tasks names them, with their instructions"""
     from pipeline.libero.tasks import select_tasks
 
     for task in select_tasks(arguments.patterns or ["*"]):
@@ -77,7 +77,7 @@ def _preview_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def preview(arguments: argparse.Namespace) -> None:
-    """render what an axis does to a task: its first frame, and eleven draws over the components and levels
+    """render what an axis does to a task: its first frame, and up to eleven draws over components and levels
 
     With `all`, one strong draw of each axis beside the clean twin. A name that ends in .jpg gives JPEG, else PNG.
     Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default ranges.
