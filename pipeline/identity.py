@@ -73,7 +73,7 @@ DISTRIBUTION = "perturbed-demos"
 """This project among installed packages: on PyPI, ``pipeline`` is the name of another."""
 
 REMAKE = "REMAKE"
-"""Variable of the environment that allows to make finished files anew: ``REMAKE=1 dvc repro``."""
+"""Variable of the environment that allows to make finished files anew: ``REMAKE=1`` before the command."""
 
 VERSIONS = {
     "pipeline": "this project",
@@ -123,7 +123,7 @@ def differences(then: Mapping[str, str], now: Mapping[str, str]) -> str:
     )
 
 
-ALLOW = f"`{REMAKE}=1 dvc repro`, or --remake behind one stage's command"
+ALLOW = f"`{REMAKE}=1` before the command, or --remake behind one stage's"
 """How a person allows it for what a stage makes."""
 
 

@@ -36,6 +36,8 @@ Source = Package | Folder
 
 FOLDER = Path("data/objects")
 """Where converted models lie, one folder each: ``<source>/<name>/model.xml`` and ``about.json``."""
+AGAIN = "`python -m pipeline sources CONFIG`, which converts what is not there"
+"""What makes up for a converted model that is gone."""
 CATALOGUE = Path(__file__).with_name("objects.yaml")
 
 LARGEST_M = 0.5
@@ -76,8 +78,7 @@ def converted(name: str) -> ObjectModel:
         PipelineError: when there is none.
     """
     if (about := _about(name)) is None:
-        remedy = "run the plan stage again, which converts it"
-        raise PipelineError(f"the object {name} is missing", where=FOLDER / name, remedy=remedy)
+        raise PipelineError(f"the object {name} is missing", where=FOLDER / name, remedy=f"run {AGAIN}")
     return ObjectModel(name, about["category"], about["licence"], about["attribution"], FOLDER / name / "model.xml")
 
 

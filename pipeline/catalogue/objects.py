@@ -4,7 +4,7 @@ import re
 from functools import cache
 
 from pipeline.catalogue.object_model import ObjectModel
-from pipeline.catalogue.object_sources import Source, catalogue, converted, offered
+from pipeline.catalogue.object_sources import AGAIN, Source, catalogue, converted, offered
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
 from pipeline.types import Task
@@ -49,12 +49,13 @@ def find(name: str, sha256: str) -> ObjectModel:
     Raises:
         PipelineError: when it is not here, or not the one that was recorded.
     """
-    model = models(("libero", "robosuite")).get(name) or converted(name)
+    installed = models(("libero", "robosuite")).get(name)
+    model = installed or converted(name)
     if model.sha256 != sha256:
         raise PipelineError(
             f"the object {name} is not the one that was planned with",
             where=model.mjcf,
-            remedy="run the plan stage again",
+            remedy="rm -rf .venv && bash setup.sh" if installed else f"delete its folder and run {AGAIN}",
         )
     return model
 

@@ -122,7 +122,8 @@ def pairs(found: Iterable[Stored]) -> list[Pair]:
     counted = [pair for one, other in combinations(axes, 2) if (pair := _pair(one, other, drawn)) is not None]
     if not counted:
         raise PipelineError(
-            "no trial has all four combinations of two axes", remedy="python -m pipeline evaluate DIR --source pairs"
+            "no trial has all four combinations of two axes",
+            remedy="python -m pipeline evaluate DIR --server URL --source pairs",
         )
     return counted
 

@@ -29,7 +29,7 @@ try:
 except ImportError as error:
     raise ImportError(
         "lerobot here takes no environments from outside: use lerobot 0.6.1 and Python 3.12 or 3.13, or "
-        "`python -m pipeline evaluate --checkpoint DIR`"
+        "`python -m pipeline evaluate OUT --checkpoint DIR`"
     ) from error
 
 __path__: list[str] = []  # lerobot looks for modules inside what it is told to import

@@ -34,7 +34,7 @@ class EpisodeResult(EvaluationTask):
         episode: names it by what it is made from.
         seed: of what is drawn for the task: its perturbations, and noise that is random.
         reason: why it ended, see ``Progress``; ``success`` says whether the goal was reached.
-        perturbations: held-out draws as they were used.
+        perturbations: held-out perturbations as they were used.
         policy, identity: the policy's name, and what is the same for the same policy alone.
         settings: what held for all episodes, and what the policy looks at.
         versions: what computed it, by name: recipes, packages, machine code, content of the benchmark's files, OpenGL.
@@ -149,11 +149,11 @@ def one_setting(found: Sequence[Stored]) -> dict[str, Any]:
     return found[0][0].settings if found else {}
 
 
-def refuse_different(found: Iterable[Stored], across: Collection[str] = ()) -> None:
+def refuse_different(found: Iterable[Stored], across: Collection[str] | None = None) -> None:
     """Have results that are compared made under one prompt, limit, view and start in each suite of each source.
 
     Args:
-        across: which of them are what is compared.
+        across: which of them are what is compared; None where none can be.
 
     Raises:
         PipelineError: when two were not, with their files and what differs.
@@ -162,14 +162,14 @@ def refuse_different(found: Iterable[Stored], across: Collection[str] = ()) -> N
     def alike(row: EpisodeResult) -> dict[str, object]:
         settings = {name: row.settings.get(name, default) for name, default in ALIKE.items()}
         facts = {"prompt": row.prompt, "step_limit": row.step_limit, **settings}
-        return {name: value for name, value in facts.items() if name not in across}
+        return {name: value for name, value in facts.items() if name not in (across or ())}
 
+    choice = "; where the difference is what you compare, --across prompt, --across step_limit or --across black"
     _agree(
         ((f"{row.source}/{row.suite}", alike(row), files.path(row.episode)) for row, files in found),
         "these results cannot be compared, on ",
         expected="one prompt, one step limit, the same black views and starts for all that is compared",
-        remedy="evaluate both alike, or leave one of the folders out; where the difference is what you compare, "
-        "`analyse report --across prompt`, --across step_limit or --across black",
+        remedy=f"evaluate both alike, or leave one of the folders out{'' if across is None else choice}",
     )
 
 

@@ -126,7 +126,7 @@ def staged(tasks: Iterable[Task], config: Config) -> Stage:
         raise PipelineError(
             f"no demonstration can be shown ({'; '.join(str(problem.error) for problem in problems)})",
             where="demos",
-            remedy="use a configuration with demos.source: starter",
+            remedy="correct what is wrong; tasks of LIBERO can be shown with configs/starter.yaml",
         )
     demo = source.load(index.entries[0].demo_id)
     model_xml = demo.model_xml

@@ -114,7 +114,8 @@ def _finished(config: Config) -> Diagnosis:
     if not found:
         return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
     told = "; ".join(f"{number} {what}" for what, number in found.items())
-    return Diagnosis("finished work", "warn", f"outdated: {told}", "go on where it was made, or `REMAKE=1 dvc repro`")
+    remedy = "go on where it was made, or `REMAKE=1` before the command"
+    return Diagnosis("finished work", "warn", f"outdated: {told}", remedy)
 
 
 def _packages() -> Iterator[Diagnosis]:

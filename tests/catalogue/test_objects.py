@@ -11,8 +11,10 @@ from typing import Any, get_args
 import mujoco
 import numpy as np
 import pytest
+import yaml
 from PIL import Image
 
+from pipeline.__main__ import parser
 from pipeline.axes.layout import LayoutAxis
 from pipeline.catalogue import object_sources, sweethome3d
 from pipeline.catalogue.meshes import convert
@@ -145,12 +147,28 @@ def test_without_the_package_the_error_names_it_and_what_works(folder: Path, mon
 
 def test_a_worker_does_not_convert_what_the_plan_did_not(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sweethome3d, "fetch", lambda _: pytest.fail("a worker fetched the package"))
-    with pytest.raises(PipelineError, match=r"sweethome3d/scopia_teapot is missing(?s:.*)run the plan stage again"):
+    with pytest.raises(PipelineError, match=r"sweethome3d/scopia_teapot is missing(?s:.*)pipeline sources CONFIG"):
         find("sweethome3d/scopia_teapot", "0" * 64)
 
 
 def own(folder: Path) -> tuple[Folder]:
     return (Folder(folder=folder, licence="CC0-1.0"),)
+
+
+def test_a_model_that_is_gone_is_back_once_the_remedy_was_followed(folder: Path, tmp_path: Path) -> None:
+    write_house(tmp_path / "mine" / "toy_house", scale=0.01)
+    config = tmp_path / "mine.yaml"
+    layout = {"sources": [one.model_dump(mode="json") for one in own(tmp_path / "mine")]}
+    config.write_text(yaml.safe_dump({"name": "mine", "plan": {"episodes": {"layout": 1}, "axes": {"layout": layout}}}))
+    (house,) = models(own(tmp_path / "mine")).values()
+    sha256 = house.sha256
+    shutil.rmtree(folder / house.name)
+    models.cache_clear()
+    with pytest.raises(PipelineError, match="run `python -m pipeline sources CONFIG`"):
+        find(house.name, sha256)
+    arguments = parser().parse_args(["sources", str(config)])
+    arguments.run(arguments)
+    assert find(house.name, sha256) == house
 
 
 def test_a_user_s_models_are_converted_with_size_colours_and_texture(folder: Path, tmp_path: Path) -> None:

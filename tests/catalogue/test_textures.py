@@ -138,10 +138,10 @@ def test_a_folder_of_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     BackgroundAxis(sources=(Folder(folder=folder, licence="CC-BY 4.0 Jane Doe"),)).sample(rng("oak"), STOVE, 0)
     oak.unlink()
     assert pixels(texture.name, texture.sha256)[0, 0].tolist() == [200, 20, 10]
-    with pytest.raises(PipelineError, match=r"oak_COL.png is missing(?s:.*)run the plan stage again"):
+    with pytest.raises(PipelineError, match=r"oak_COL.png is missing(?s:.*)dvc repro --force --single-item plan"):
         find(texture.name, "0" * 64)
     (tmp_path / texture_sources.FOLDER / "own" / texture.sha256).write_bytes(b"rot")
-    with pytest.raises(PipelineError, match=r"oak_COL.png is damaged(?s:.*)run the plan stage again"):
+    with pytest.raises(PipelineError, match=r"oak_COL.png is damaged(?s:.*)dvc repro --force --single-item plan"):
         find(texture.name, texture.sha256)
 
 

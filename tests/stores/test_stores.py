@@ -280,7 +280,7 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
     found = outdated(rows, config)
     told = {f"files of frames, made with {number}": 1}
     assert found == told | ({f"trajectories, made with {number}": 1} if step == "physics" else {})
-    with pytest.raises(PipelineError, match=rf"1 files of frames, made with {number}(?s:.*)REMAKE=1 dvc repro"):
+    with pytest.raises(PipelineError, match=rf"1 files of frames, made with {number}(?s:.*)REMAKE=1` before"):
         identity.refuse_unasked(found, tmp_path)
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
     monkeypatch.setenv(identity.REMAKE, "1")
