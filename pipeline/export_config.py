@@ -16,16 +16,16 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 """More than anybody has a use for would fill memory before anything is said."""
 
 
-def held_out(share: float, demonstrations: int) -> int:
-    """How many of a task's demonstrations a share holds out: rounded, a half to the even number; never the only one."""
+def validating(share: float, demonstrations: int) -> int:
+    """How many of a task's demonstrations go into ``val``: rounded, a half to the even number; never the only one."""
     return round(share * demonstrations) if demonstrations > 1 else 0
 
 
 def too_few(share: float, where: str) -> PipelineError:
     """The error that no task has enough demonstrations for a share above 0."""
-    least = next(number for number in count(max(2, int(0.5 / share))) if held_out(share, number))
+    least = next(number for number in count(max(2, int(0.5 / share))) if validating(share, number))
     return PipelineError(
-        f"no task has enough demonstrations to hold {share:g} of them out",
+        f"no task has enough demonstrations for {share:g} of them to go into the split val",
         where=where,
         expected=f"{least} or more demonstrations of a task",
         remedy="use more demonstrations, a larger share, or 0",
@@ -195,5 +195,5 @@ class ExportConfig(Frozen):
             PipelineError: when a share holds none of them out.
         """
         for name, options in self.formats.items():
-            if options.validation and not held_out(options.validation, demonstrations):
+            if options.validation and not validating(options.validation, demonstrations):
                 raise too_few(options.validation, f"export.{name}.validation")

@@ -154,7 +154,7 @@ class Axis(Frozen):
 
     @classmethod
     def held_out(cls) -> Axis:
-        """The ranges of held-out draws: the default ones, from which a key of their own keeps draws apart."""
+        """The ranges of held-out perturbations: the default ones, from which a key of their own keeps draws apart."""
         return cls()
 
     def offered(self) -> dict[str, int]:

@@ -130,8 +130,8 @@ class NoiseAxis(Axis):
     def held_out(cls) -> NoiseAxis:
         """The strengths of the benchmark's even severities.
 
-        Noise has one strength for each component and level. With the default ones, held-out draws would be as strong
-        as those that plans train on; from the benchmark's, plans keep clear.
+        Noise has one strength for each component and level. With the default ones, held-out perturbations would be as
+        strong as those that plans train on; from the benchmark's, plans keep clear.
         """
         tests = benchmark.load().of("noise")
         effects = {(test.component, test.parameters["severity"]): effect_of(test) for test in tests}

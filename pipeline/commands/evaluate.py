@@ -69,7 +69,7 @@ def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
     named = {"suites": "--suite", "axes": "--axis", "components": "--component", "levels": "--level", "tasks": "--task"}
     add_fields(command, Selection, source="--source", file="--tasks-from", **named, subset="--subset")
     add_fields(command, Selection, episodes="--episodes", seed="--seed")
-    anew = "draw held-out draws anew that overlap with the plan of this run, whose data the policy was trained on"
+    anew = "sample held-out perturbations again that overlap with the plan of this run, the policy's training data"
     value("--trained-on", "CONFIG", anew, plan_of, dest="plan")(command)
     add_fields(command, EpisodeSettings, prompt="--prompt", step_limits="--step-limits", black="--black")
     add_fields(command, EpisodeSettings, initial_states="--initial-states", look_every="--look-every")
@@ -80,7 +80,7 @@ def _evaluate_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def evaluate(arguments: argparse.Namespace) -> None:
-    """run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out draws of the axes
+    """run a policy on LIBERO's tasks, on LIBERO-Plus's test tasks or on held-out perturbations of the axes
 
     Writes one file for each episode, and summary.json with success rates and their 95 % intervals. Run again after a
     kill, it goes on. The policy is a model server of vla-eval (started by you), or a checkpoint of lerobot on disk.
@@ -157,10 +157,10 @@ def gap(arguments: argparse.Namespace) -> None:
 
 
 def construct(arguments: argparse.Namespace) -> None:
-    """draw 14,000 candidates of held-out draws, filter and balance them to a benchmark
+    """sample 14,000 held-out perturbations as candidates, filter and balance them to a benchmark
 
-    The file is for `evaluate --tasks-from`. Which scenes refuse their draw is known once candidates were run: give
-    those results, and these tasks are left out.
+    The file is for `evaluate --tasks-from`. Which scenes refuse theirs is known once candidates were run: give those
+    results, and these tasks are left out.
     """
     from pipeline.evaluation import own_draws, selection
     from pipeline.evaluation.results import stored
@@ -175,7 +175,7 @@ def construct(arguments: argparse.Namespace) -> None:
 
 
 def grade(arguments: argparse.Namespace) -> None:
-    """levels of difficulty, 1 to 5, by how many of several models solve a task"""
+    """difficulty of tasks, 1 to 5, by how many of several models solve each"""
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.statistics import grade
     from pipeline.evaluation.tasks import write_tasks
@@ -191,7 +191,7 @@ def grade(arguments: argparse.Namespace) -> None:
 
 
 def leakage(arguments: argparse.Namespace) -> int:
-    """how close the held-out draws of results come to the plan of a run; ends with 1 where they overlap"""
+    """how close the held-out perturbations of results come to the plan of a run; ends with 1 where they overlap"""
     from pipeline.axes import from_json
     from pipeline.evaluation import own_draws
     from pipeline.evaluation.results import stored
@@ -204,7 +204,8 @@ def leakage(arguments: argparse.Namespace) -> int:
         for one in from_json(json.dumps(row.perturbations))
     ]
     if not drawn:
-        raise PipelineError("there are no held-out draws", where=arguments.results, remedy="evaluate --source own")
+        lacking = "there are no held-out perturbations"
+        raise PipelineError(lacking, where=arguments.results, remedy="evaluate --source own")
     findings = own_draws.compare(drawn, own_draws.planned(owned(arguments).data / "plan.parquet"))
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

@@ -1,4 +1,4 @@
-"""Policies run on LIBERO's tasks, LIBERO-Plus's test tasks and held-out draws of the axes.
+"""Policies run on LIBERO's tasks, LIBERO-Plus's test tasks and held-out perturbations of the axes.
 
 Modules, each above those that it uses:
 

@@ -41,7 +41,7 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     """wording of test tasks: LIBERO's instruction, or as the benchmark's code has it, the file's name; ``blank`` says
     nothing in any task"""
     seed: int = 0
-    """of held-out draws and of noise that is random"""
+    """of held-out perturbations and of noise that is random"""
     fixture_seed: int = 0
     """of LIBERO's reset, to which the number of the initial state is added; 0 is what OpenVLA uses"""
     initial_states: Literal["libero", "demonstration"] = "libero"
@@ -51,8 +51,8 @@ class EpisodeSettings(Frozen, use_attribute_docstrings=True):
     black: Literal["none", "agentview", "all"] = Field(default="none", exclude_if=lambda views: views == "none")
     """which views are black, to see what a policy does without them"""
     plan: Path | None = Field(default=None, exclude_if=lambda file: file is None)
-    """which held-out draws keep clear of: what is closer than its axis allows is drawn anew. Results name it by the
-    SHA-256 of its file."""
+    """which held-out perturbations keep clear of: what is closer than its axis allows is sampled again. Results name it
+    by the SHA-256 of its file."""
     look_every: int = Field(default=1, ge=1, exclude_if=lambda steps: steps == 1)
     """a server that keeps its chunk of actions to itself takes so many of each: it is shown the scene once in so many
     control steps"""

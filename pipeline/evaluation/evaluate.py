@@ -124,7 +124,7 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
         own_draws.sha256_of(settings.plan)
         if not any(task.source == "own" for task in wanted):
             raise PipelineError(
-                "no task has held-out draws to keep clear of a plan", where="plan", expected="--source own"
+                "no task has held-out perturbations to keep clear of a plan", where="plan", expected="--source own"
             )
     if settings.initial_states == "demonstration":
         if others := {task.source for task in wanted} & {"libero_plus", "goals"}:

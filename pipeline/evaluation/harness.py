@@ -32,7 +32,7 @@ ACTION = {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPE
 
 
 class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
-    """LIBERO's tasks, LIBERO-Plus's test tasks, or held-out draws, as a ``Selection`` chooses them.
+    """LIBERO's tasks, LIBERO-Plus's test tasks, or held-out perturbations, as a ``Selection`` chooses them.
 
     ``episodes_per_task`` of the harness stays 1: each initial state and each draw is a task of its own here, and
     ``selection.episodes`` says how many.

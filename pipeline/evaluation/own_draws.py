@@ -30,7 +30,7 @@ ATTEMPTS = 20
 
 
 def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
-    """A held-out draw on a LIBERO task; None where an axis cannot change anything that the task has.
+    """A held-out perturbation on a LIBERO task; None where an axis cannot change anything that the task has.
 
     Args:
         axis: one, or several joined by +.
@@ -45,7 +45,7 @@ def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> Eva
 
 
 def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> Perturbation:
-    """The perturbation of a held-out draw on one axis.
+    """The perturbation of a task on one axis.
 
     Its key begins with ``evaluation``, which no plan's does, so that no seed makes the two draw alike. What a draw is
     joined with is not part of the key: a pair has the draws of its singles.
@@ -62,7 +62,7 @@ def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> P
 
 @cache
 def held_out(name: str) -> Axis:
-    """The ranges of an axis's held-out draws."""
+    """The ranges of an axis's held-out perturbations."""
     return AXES[name].held_out()
 
 
@@ -103,7 +103,7 @@ def drawn_scene(
 
 
 class PlannedDraws:
-    """What a plan draws, to keep held-out draws clear of it.
+    """What a plan draws, to keep held-out perturbations clear of it.
 
     Distances are those of the leakage report, with the plan in the place of the benchmark's test tasks.
 
@@ -166,7 +166,7 @@ def _edition(file: Path) -> Edition:
 
 
 def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: PlannedDraws) -> dict[str, Any]:
-    """How close held-out draws come to a plan.
+    """How close held-out perturbations come to a plan.
 
     Args:
         drawn: the name of each, the draw, and the task that it changes.

@@ -1,8 +1,8 @@
 """Which tasks to evaluate on: those that a user names, or a benchmark made as LIBERO-Plus was.
 
 LIBERO-Plus drew 500 candidates of each of its seven dimensions in each of four suites, filtered them, and balanced them
-to 10,030. Here the seven are this project's axes with held-out draws that the benchmark tests: its layout is the axes
-layout and pose, and language has no draws of its own.
+to 10,030. Here the seven are this project's axes with held-out perturbations that the benchmark tests: its layout is
+the axes layout and pose, and language has none.
 """
 
 import difflib
@@ -46,9 +46,9 @@ class Selection(Frozen, use_attribute_docstrings=True):
     """Which tasks to evaluate on; what is left out does not restrict."""
 
     source: Literal["libero", "libero_plus", "own", "goals", "pairs"] = "libero"
-    """LIBERO's tasks; LIBERO-Plus's test tasks; held-out draws of this project's axes (``own``); LIBERO's tasks asked
-    for another object of their scene (``goals``); for every two axes LIBERO's task, the held-out draw of either, and
-    both draws together, on the same initial states (``pairs``)"""
+    """LIBERO's tasks; LIBERO-Plus's test tasks; held-out perturbations on this project's axes (``own``); LIBERO's tasks
+    asked for another object of their scene (``goals``); for every two axes LIBERO's task, a held-out perturbation on
+    either, and both together, on the same initial states (``pairs``)"""
     file: Path | None = None
     """in place of a source, a list of tasks that ``analyse construct`` wrote"""
     suites: tuple[str, ...] = TESTED_SUITES
@@ -62,12 +62,12 @@ class Selection(Frozen, use_attribute_docstrings=True):
     tasks: tuple[str, ...] = ()
     """shell-style patterns, one of which must match the task's name or its LIBERO task's"""
     episodes: int = Field(default=1, ge=1)
-    """how many of LIBERO's 50 initial states of each task, or, of ``own``, draws of each task, axis and level; from the
-    51st on draws are on the same initial states again"""
+    """how many of LIBERO's 50 initial states of each task, or, of ``own``, perturbations of each task, axis and level;
+    from the 51st on they are on the same initial states again"""
     subset: int | None = Field(default=None, ge=1)
     """at most so many, spread evenly over suites, axes, components and levels"""
     seed: int = 0
-    """of the subset and of every draw"""
+    """of the subset and of all perturbations"""
 
 
 def select(selection: Selection, archive: Path | None = None) -> list[EvaluationTask]:
@@ -112,7 +112,7 @@ def _check_names(selection: Selection) -> None:
             f"a task has {INITIAL_STATES} initial states, not {selection.episodes}",
             where="episodes",
             expected=f"at most {INITIAL_STATES}",
-            remedy="held-out draws can be more: --source own",
+            remedy="held-out perturbations can be more: --source own",
         )
     if selection.source == "pairs" and (selection.subset or selection.components):
         raise PipelineError(
@@ -124,7 +124,7 @@ def _check_names(selection: Selection) -> None:
         for axis in selection.axes:
             if axis in AXES and (reason := AXES[axis].not_held_out):
                 raise PipelineError(
-                    f"{axis} has no held-out draws: {reason}",
+                    f"{axis} has no held-out perturbations: {reason}",
                     where="axes",
                     expected=" or ".join(OWN_AXES),
                     remedy=f"--source libero_plus --axis {axis}, the benchmark's test tasks, which plans keep clear of",
@@ -226,7 +226,7 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
             where="axes" if archive is None else archive,
             expected=f"test tasks of {', '.join(libero_plus.RUNNABLE)}, or 62 of background in libero_object",
             remedy=f"name the unpacked archive: --assets DIR; or --axis {' '.join(libero_plus.RUNNABLE)}; or held-out "
-            "draws of the same axes: --source own",
+            "perturbations on the same axes: --source own",
         )
     if missing:
         print(f"left out, because they need files of LIBERO-Plus's asset archive: {counts}")
@@ -234,7 +234,7 @@ def _runnable(wanted: list[EvaluationTask], selection: Selection, archive: Path 
 
 
 def candidates(seed: int, each: int = CANDIDATES) -> list[EvaluationTask]:
-    """``each`` held-out draws of every axis that the benchmark tests, in every suite; no scene is built.
+    """``each`` held-out perturbations on every axis that the benchmark tests, in every suite; no scene is built.
 
     The number of a draw counts up once all tasks and levels had one, so initial states differ too.
     """

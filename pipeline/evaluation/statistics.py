@@ -228,7 +228,8 @@ def difficulty(solved: int, models: int) -> int:
 def grade(results: Sequence[Sequence[Stored]]) -> list[dict[str, Any]]:
     """Every task that all models ran, as JSON, with its ``difficulty`` and how many models solve it.
 
-    Held-out draws have the component that was asked for, which names their episodes, also where another was drawn.
+    Held-out perturbations have the component that was asked for, which names their episodes, also where another was
+    sampled.
 
     Raises:
         PipelineError: when results of a model have several settings, models cannot be compared, or no task was run by

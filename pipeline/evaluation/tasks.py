@@ -43,8 +43,8 @@ class EvaluationTask:
     """One thing to do in one scene; all else is looked up by these.
 
     Attributes:
-        source: ``libero``, ``libero_plus``, ``own`` for held-out draws of one or more of this project's axes, or
-            ``goals`` for a LIBERO task that asks for another object of its scene.
+        source: ``libero``, ``libero_plus``, ``own`` for held-out perturbations on one or more of this project's axes,
+            or ``goals`` for a LIBERO task that asks for another object of its scene.
         suite, base: of the LIBERO task.
         name: of the test task in LIBERO-Plus; else made of what follows, once among the tasks of its source and suite.
         axis, component: what is perturbed, several joined by +; ``clean`` where nothing is. In ``goals`` the component

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from pipeline.errors import PipelineError
-from pipeline.export_config import held_out, too_few
+from pipeline.export_config import too_few, validating
 from pipeline.seeding import digest
 from pipeline.types import Episode
 
@@ -68,16 +68,16 @@ class Episodes:
         return list(self.known)
 
     def by_split(self, validation: float) -> dict[str, list[str]]:
-        """``train``, and ``val`` where a share is held out, to their episodes in the order of ``ids``.
+        """``train``, and ``val`` where a share is for validation, to their episodes in the order of ``ids``.
 
-        A demonstration is held out with all of its episodes, so that no perturbed episode has its clean twin, or the
+        A demonstration goes there with all of its episodes, so that no perturbed episode has its clean twin, or the
         same actions, on the other side. Of each task at least one demonstration stays to train on.
 
         Args:
             validation: share of each task's demonstrations, by number, rounded; drawn by a hash of its name.
 
         Raises:
-            PipelineError: when there is nothing to write, or the demonstrations are too few to hold any out.
+            PipelineError: when there is nothing to write, or the demonstrations are too few for a validation split.
         """
         if not self.known:
             raise PipelineError(
@@ -92,7 +92,7 @@ class Episodes:
         chosen = {
             demo
             for demos in by_task.values()
-            for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: held_out(validation, len(demos))]
+            for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: validating(validation, len(demos))]
         }
         if not chosen:
             raise too_few(validation, "export.<format>.validation")

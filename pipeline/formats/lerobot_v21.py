@@ -21,7 +21,7 @@ EPISODES_OF_A_PIECE = 50
 
 
 class LeRobotV21(Format[LeRobotV21Config]):
-    """Episodes of a set are numbered from 0; what is held out is a set of its own, as no client reads splits."""
+    """Episodes of a set are numbered from 0; what is for validation is a set of its own, as no client reads splits."""
 
     name: ClassVar[Step] = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"

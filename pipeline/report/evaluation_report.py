@@ -15,7 +15,7 @@ from pipeline.report.figures import Panel, Share
 
 TITLES = {
     "libero_plus": "LIBERO-Plus's test tasks",
-    "own": "Held-out draws of this project's axes",
+    "own": "Held-out perturbations of this project's axes",
     "goals": "Other goals in LIBERO's scenes",
     "libero": "LIBERO's tasks, unperturbed",
 }

@@ -70,7 +70,7 @@ def test_pairs_reuse_the_draws_and_initial_states_of_their_singles() -> None:
             assert draw(task, 0, axis=axis) == draw(single, 0)
             assert single.level == task.level
     alone = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot",)))
-    assert singles["robot", 0] in alone, "results of held-out draws serve pairs too"
+    assert singles["robot", 0] in alone, "results of held-out perturbations serve pairs too"
     assert some_pairs(axes=("noise", "robot"))[-1].axis == "robot+noise", "in the order in which they apply"
     both_suites = select(Selection(source="pairs", suites=("libero_object", STOVE.suite), axes=("robot", "noise")))
     assert set(some_pairs(axes=("robot", "noise"))) < set(both_suites), "levels do not depend on what else is chosen"
@@ -229,7 +229,7 @@ def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_language_has_no_held_out_draws_and_says_what_else_there_is() -> None:
-    with pytest.raises(PipelineError, match="language has no held-out draws") as caught:
+    with pytest.raises(PipelineError, match="language has no held-out perturbations") as caught:
         select(Selection(source="own", axes=("language",)))
     assert "--source libero_plus --axis language" in str(caught.value)
 

@@ -309,5 +309,5 @@ def test_a_demonstrations_start_is_one_a_task_and_not_every_tasks(tasks: list[Ev
 def test_a_list_without_held_out_draws_is_not_kept_clear_of_a_plan(tmp_path: Path) -> None:
     plan = tmp_path / "plan.parquet"
     plan.touch()
-    with pytest.raises(PipelineError, match="no task has held-out draws"):
+    with pytest.raises(PipelineError, match="no task has held-out perturbations"):
         check_settings(Selection(file=tmp_path), [libero_task(STOVE, 0)], EpisodeSettings(plan=plan))

@@ -1,4 +1,4 @@
-"""A validation split holds out whole demonstrations, and lerobot's tools keep the episodes' ids."""
+"""A validation split has whole demonstrations, and lerobot's tools keep the episodes' ids."""
 
 import base64
 import json
@@ -79,9 +79,7 @@ def test_too_small_a_share_is_refused_before_any_work(short_demos: Path, tmp_pat
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == refused, done.stderr
         if refused:
-            assert (
-                "export.lerobot.validation: no task has enough demonstrations to hold 0.25 of them out" in done.stderr
-            )
+            assert "export.lerobot.validation: no task has enough demonstrations for 0.25 of them" in done.stderr
             assert "3 or more demonstrations of a task" in done.stderr
 
 
