@@ -112,8 +112,8 @@ def _format(command: argparse.ArgumentParser) -> None:
 def push(arguments: argparse.Namespace) -> None:
     """upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go
 
-    Sends one of the datasets of a finished and validated run: its files, the card, the manifest and the recipe, in
-    one commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`, the address of
+    Sends one of the datasets of a finished and validated run: its files, the card, the manifest and finetune/, in one
+    commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`, the address of
     another hub from HF_ENDPOINT.
     """
     from pipeline.formats.registry import formats_of

@@ -1,18 +1,18 @@
-"""Fine-tune OpenVLA-OFT on the datasets beside this folder, by the recipe in ``finetune.yaml``.
+"""Fine-tune OpenVLA-OFT on the datasets beside this folder, by the settings in ``finetune.yaml``.
 
 Call it in a checkout of OpenVLA-OFT, which stays as it is:
 
     WANDB_MODE=offline torchrun --standalone --nnodes 1 --nproc-per-node 8 DATA/finetune/run_openvla_oft.py
 
 OFT always logs to Weights & Biases; offline it needs no account. With one, give ``--wandb_entity NAME --wandb_project
-NAME`` instead. Further arguments go to OFT's ``vla-scripts/finetune.py`` and win over the recipe, such as
+NAME`` instead. Further arguments go to OFT's ``vla-scripts/finetune.py`` and win over these, such as
 ``--dataset_name libero_perturbed_spatial`` for one suite, or ``--max_steps 20000``.
 
 To continue from a checkpoint that was trained on LIBERO, add ``--statistics CHECKPOINT/dataset_statistics.json``. Its
 action head gives actions in units of its own statistics; with others, the same outputs would be other movements. To
 begin from weights that were not trained on LIBERO, leave it out: then the statistics are those of these datasets.
 
-What OFT has no flag for is done here: the datasets and their mixture are registered, AdamW gets the recipe's weight
+What OFT has no flag for is done here: the datasets and their mixture are registered, AdamW gets the settings' weight
 decay (OFT leaves PyTorch's 0.01), a cosine with warm-up takes the place of OFT's step (whose own warm-up would undo
 any later decay), the statistics of a checkpoint are also named by suite, which is where OFT's evaluation looks, and
 the statistics that OFT computes first are not written among the dataset's files.
