@@ -18,10 +18,11 @@ def add_commands(commands: Any) -> None:
 def schemas() -> dict[str, dict[str, Any]]:
     """The files of ``schemas/`` that are written from the code."""
     from pipeline.config import Config
+    from pipeline.formats import registry
     from pipeline.run import manifest
 
     config = {"$schema": "https://json-schema.org/draft/2020-12/schema", **Config.model_json_schema()}
-    return {"config.schema.json": config, "manifest.json": manifest.described()}
+    return {"config.schema.json": config, "manifest.json": manifest.described(registry.columns())}
 
 
 def schema(arguments: argparse.Namespace) -> None:

@@ -110,14 +110,13 @@ def schema(places: Sequence[pa.Field] = ()) -> pa.Schema:
     return pa.schema([*columns_of(plan.Row), *columns_of(Result), *columns_of(Quality), *places, *made_by])
 
 
-def described() -> dict[str, Any]:
-    """``schemas/manifest.json``, for readers: every column but those of ``columns`` in ``pipeline/formats``."""
+def described(places: Sequence[pa.Field]) -> dict[str, Any]:
+    """``schemas/manifest.json``, for readers: every column."""
     return {
-        "places": f"where an episode lies in each dataset stands before {OWN_VERSION}: `columns` in pipeline/formats/",
         "columns": [
             {"name": each.name, "type": str(each.type), "meaning": each.metadata[b"meaning"].decode()}
-            for each in schema()
-        ],
+            for each in schema(places)
+        ]
     }
 
 
