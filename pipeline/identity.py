@@ -30,7 +30,7 @@ RECIPES: dict[Step, int] = {
     "physics": 7,
     "pixels": 5,
     "encoding": 1,
-    "rlds": 3,
+    "rlds": 4,
     "lerobot": 7,
     "lerobot_v21": 2,
     "evaluation": 1,

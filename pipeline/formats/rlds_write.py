@@ -92,8 +92,8 @@ def features(extras: tuple[Extra, ...] = ()) -> Any:
         dtype=np.dtype(SCHEMA.frame.dtype),
         encoding_format=SCHEMA.frame.encoding,
     )
-    turned = f"RGB, before the action, turned by {SCHEMA.image_rotation_deg} degrees from how MuJoCo renders it"
-    observation = {view: frame(doc=f"camera {spec.camera}: {turned}") for view, spec in SCHEMA.views.items()}
+    rotated = f"RGB, before the action, rotated by {SCHEMA.image_rotation_deg} degrees from how MuJoCo renders it"
+    observation = {view: frame(doc=f"camera {spec.camera}: {rotated}") for view, spec in SCHEMA.views.items()}
     observation |= {"state": _tensor(SCHEMA.state), "joint_state": _tensor(SCHEMA.joint_state)}
     for name in (name for name in MAPS if name in extras):
         observation |= {f"{view}_{name}": _map(getattr(SCHEMA, name)) for view in SCHEMA.views}
