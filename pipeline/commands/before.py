@@ -77,10 +77,11 @@ def _preview_arguments(command: argparse.ArgumentParser) -> None:
 
 
 def preview(arguments: argparse.Namespace) -> None:
-    """render what an axis does to a task: its first frame, and up to eleven draws over components and levels
+    """render what an axis does to a task: its first frame, and up to eleven perturbations over components and levels
 
-    With `all`, one strong draw of each axis beside the clean twin. A name that ends in .jpg gives JPEG, else PNG.
-    Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default ranges.
+    With `all`, one strong perturbation on each axis beside the clean twin. A name that ends in .jpg gives JPEG, else
+    PNG. Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default
+    ranges.
     """
     from pipeline import gl
     from pipeline.files import replaced

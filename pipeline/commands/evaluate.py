@@ -41,7 +41,7 @@ def add_commands(commands: Any) -> None:
         value("--size", "N", "tasks of the benchmark (default: 10,000)", int),
         value("--results", "DIR", "results of candidates", nargs="+", default=()),
         value("--trained-on", "CONFIG", "leave out what overlaps with the plan of this run", plan_of, dest="plan"),
-        argument("--seed", type=int, default=0, help="of all draws (default: 0)"),
+        argument("--seed", type=int, default=0, help="of all perturbations (default: 0)"),
     )
     graded = value("--out", "FILE", "list of tasks with their difficulty", required=True)
     add(kinds, grade, value("results", "DIR", "results of one model each", nargs="+"), graded)
