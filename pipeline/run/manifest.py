@@ -34,9 +34,9 @@ class Result:
     reason: Annotated[
         str,
         "kept, or why not: goal_not_reached, goal_lost, too_short, simulation_unstable, scene_refused, state_mismatch, "
-        "worker_lost, too_dark, blown_out, task_object_not_seen, hand_not_seen, added_objects_not_seen, what a physics "
-        "perturbation was refused for, the figure that `filter` refuses, not_replayed, reserve_not_needed, left_out "
-        "(export.where names others)",
+        "worker_lost, no_reference, too_dark, blown_out, task_object_not_seen, hand_not_seen, added_objects_not_seen, "
+        "what a physics perturbation was refused for, the figure that `filter` refuses, not_replayed, "
+        "reserve_not_needed, left_out (export.where names others)",
     ]
     replay_mode: Annotated[
         str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"
