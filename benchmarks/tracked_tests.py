@@ -37,8 +37,8 @@ REST_STEPS = 10
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--task", nargs="+", default=["libero_[!9]*/*"], help="patterns of <suite>/<task>")
-    parser.add_argument("--axis", nargs="+", default=["pose", "robot"])
-    parser.add_argument("--per-task", type=int, default=3)
+    parser.add_argument("--axis", nargs="+", default=["pose", "robot"], help="of LIBERO-Plus's tasks (both)")
+    parser.add_argument("--per-task", type=int, default=3, help="test tasks of each task and axis (3)")
     arguments = parser.parse_args()
     environment = EpisodeEnvironment()
     ended: dict[str, dict[str, Counter[str]]] = defaultdict(lambda: defaultdict(Counter))
@@ -58,7 +58,8 @@ def solve(environment: EpisodeEnvironment, test: EvaluationTask) -> str:
     known = reference(test.suite, test.base)
     if known is None:
         return "no_reference"
-    environment.reset(test)
+    if environment.reset(test).over:
+        return environment.progress.reason
     simulator = environment.simulator
     try:
         poses = {name: simulator.pose(name) for name in (*known.poses, *known.places)}
@@ -69,19 +70,24 @@ def solve(environment: EpisodeEnvironment, test: EvaluationTask) -> str:
                 break
     except RefusedError as error:
         return error.reason
-    return environment.progress.reason
+    return "success" if environment.progress.success else "goal_not_reached"
 
 
 @lru_cache
 def reference(suite: str, name: str) -> Reference | None:
-    """What is tracked: the demonstration open loop, where it reaches the goal."""
+    """What is tracked: the demonstration's own actions, settled or else as they were recorded, where they reach the
+    goal."""
     task = find_task(suite, name)
     environment = Environment(task)
-    trajectory = replay(environment, StarterSource().of(task), name, ReplayConfig(mode="open_loop"))
-    environment.close()
-    return (
-        Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions) if trajectory.verdict.kept else None
-    )
+    try:
+        for settle_steps in (ReplayConfig().settle_steps, 0):
+            config = ReplayConfig(mode="open_loop", settle_steps=settle_steps)
+            trajectory = replay(environment, StarterSource().of(task), name, config)
+            if trajectory.verdict.kept:
+                return Reference.of(trajectory.model_xml, trajectory.states, trajectory.actions)
+    finally:
+        environment.close()
+    return None
 
 
 if __name__ == "__main__":

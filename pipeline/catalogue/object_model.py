@@ -128,13 +128,13 @@ class ObjectModel:
         folders = {"meshdir", "texturedir", "assetdir"}
         redirected = any(folders & set(compiler.attrib) for compiler in root.iter("compiler"))
         turned = any(element.get("euler", "0 0 0") != "0 0 0" for element in root.iter())
-        placed = any(_PLACES & element.attrib.keys() for element in root.iter())
+        placed = any(_PLACES & element.attrib.keys() for tag in ("body", "geom") for element in root.iter(tag))
         if redirected or turned or placed or any(element.tag in _TAGS for element in root.iter()):
             raise PipelineError(
                 "the model uses defaults, includes, frames, asset folders or rotations that are no quat",
                 where=self.mjcf,
                 expected="paths relative to the model, pos and quat for places, every attribute on its element",
-                remedy="compile it and save it again with mujoco.mj_saveLastXML",
+                remedy="compile it, save it with mujoco.mj_saveLastXML, then resolve frames and defaults",
             )
         return root
 

@@ -37,11 +37,11 @@ TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
 
 class Speed(NamedTuple):
     """How fast this machine is: seconds of one core for a control step, and for a frame of the trial's scene by the
-    plain renderer, of the core or of a GPU."""
+    plain renderer: of the core, or of one of so many GPUs."""
 
     step_s: float
     frame_s: float
-    gpu: bool = False
+    gpus: int = 0
 
 
 class Trial(NamedTuple):
@@ -76,15 +76,15 @@ def trial() -> Trial:
     renderer.close()
     plain = Renderer(renderer.model, PlainDrawing(renderer.model))
     plain.restore(trajectory.states[-1], trajectory.site_alpha[-1])
-    gpu = not gl.choose().software
-    frame_s = _seconds(lambda: plain.frame("agentview"), gpu)
+    gpus = 0 if gl.choose().software else max(1, len(gl.gpus()))
+    frame_s = _seconds(lambda: plain.frame("agentview"), gpus > 0)
     plain.close()
     digests = {
         "OpenGL device": gl.choose().device,
         "ten steps": hashlib.sha256(trajectory.states.tobytes()).hexdigest()[:16],
         "one frame": hashlib.sha256(frame.tobytes()).hexdigest()[:16],
     }
-    return Trial(digests, Speed(step_s, frame_s, gpu))
+    return Trial(digests, Speed(step_s, frame_s, gpus))
 
 
 def _seconds(call: Callable[[], object], gpu: bool = False) -> float:

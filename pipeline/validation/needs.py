@@ -132,7 +132,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     arenas, weights = [bddl.read(task.bddl_file).arena for task in tasks], [sum(steps) for steps in tasks.values()]
     drawn_s = np.average([FRAME_S[arena] for arena in arenas], axis=0, weights=weights)
     slower = speed.frame_s / REFERENCE.frame_s
-    frame_s = [speed.frame_s] * len(drawn_s) if speed.gpu else [float(s) * slower for s in drawn_s]
+    frame_s = [speed.frame_s] * len(drawn_s) if speed.gpus else [float(s) * slower for s in drawn_s]
     maps_s = MAPS_S * slower * any(extra in MAP_KB for extra in config.render.extras)
     trajectories, rendered_s = amounts.twins, amounts.twin_steps * sum(view_s + maps_s for view_s in frame_s)
     encoded_s = amounts.twin_steps * len(frame_s) * ENCODE_S
@@ -150,11 +150,11 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     _, exported_steps = _exported(config, amounts)
     return {
         "replay": processor * trajectories * (SCENE_S + TRIES * amounts.mean_steps * STEP_S),
-        "render": encoded_s + rendered_s * (not speed.gpu),
+        "render": encoded_s + rendered_s * (not speed.gpus),
         "export": processor * exported_steps * sum(formats[name] for name in config.export.formats),
         "validate": processor * exported_steps * VALIDATE_S * len(config.export.formats),
         "rest": processor * FIXED_S,
-    } | ({"GPU": rendered_s} if speed.gpu else {})
+    } | ({"GPU": rendered_s / speed.gpus} if speed.gpus else {})
 
 
 def in_words(stages_s: Mapping[str, float], workers: int) -> str:

@@ -48,12 +48,13 @@ def test_maps_are_rendered_where_something_else_is_seen_and_only_what_is_exporte
 
 def test_it_follows_the_machine() -> None:
     here = needed_s(STARTER, REFERENCE)
-    gpu = needed_s(STARTER, Speed(REFERENCE.step_s, 0.0015, gpu=True))
+    gpu = needed_s(STARTER, Speed(REFERENCE.step_s, 0.0015, gpus=1))
     slow = needed_s(STARTER, Speed(REFERENCE.step_s * 2, REFERENCE.frame_s))
     assert gpu["render"] < 0.15 * here["render"], "what is left of a frame is its JPEG"
     assert {stage: gpu[stage] == here[stage] for stage in here} == {stage: stage != "render" for stage in here}
     # 9,438 frames, as the stage counts them; those with shadows take longer.
     assert gpu["GPU"] == pytest.approx(9438 * 0.0015, rel=0.15)
+    assert needed_s(STARTER, Speed(REFERENCE.step_s, 0.0015, gpus=4))["GPU"] == gpu["GPU"] / 4
     assert in_words({"GPU": 600.0}, 16) == in_words({"GPU": 600.0}, 1).replace("1 worker", "16 workers")
     assert slow["replay"] == pytest.approx(2 * here["replay"])
 
