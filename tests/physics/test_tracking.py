@@ -160,11 +160,19 @@ def test_what_moves_alike_is_followed_once() -> None:
     assert apart[[6, 12, 36, 45, 66, 71, 95]] == pytest.approx([0.04, 0.04, -0.02, -0.02, 0.03, 0.03, -0.04], abs=1e-4)
 
 
-def test_a_tilted_object_is_refused(milk: Reference) -> None:
-    pose = milk.poses["milk_1"][0].copy()
-    pose[3:] = (Rotation.from_euler("x", 0.3) * Rotation.from_quat(pose[[4, 5, 6, 3]])).as_quat()[[3, 0, 1, 2]]
+def tilted(pose: Floats, angle_rad: float) -> Floats:
+    tilt = Rotation.from_euler("x", angle_rad)
+    return np.append(pose[:3], (tilt * Rotation.from_quat(pose[3:], scalar_first=True)).as_quat(scalar_first=True))
+
+
+def test_what_has_fallen_over_is_refused_where_the_hand_meets_it(milk: Reference) -> None:
+    poses = {name: poses[0] for name, poses in milk.poses.items()}
     with pytest.raises(RefusedError, match="object_not_upright"):
-        Route.through(milk, start_of(milk), poses_of(milk, milk_1=pose))
+        Route.through(milk, start_of(milk), poses | {"milk_1": tilted(poses["milk_1"], 0.5)})
+    Route.through(milk, start_of(milk), poses | {"milk_1": tilted(poses["milk_1"], 0.1)})
+    beside = next(name for name in poses if not milk.held[name].any() and not milk.met[name].any())
+    route = Route.through(milk, start_of(milk), poses | {beside: tilted(poses[beside], 0.5)})
+    assert np.array_equal(route.positions_m, milk.positions_m)
 
 
 @settings(max_examples=20, deadline=None)
