@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -23,7 +24,7 @@ from pipeline.catalogue.scene_files import portable
 from pipeline.compute.pool import Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.identity import DISTRIBUTION, refuse_unasked
-from pipeline.libero import hdf5
+from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import smoothness
@@ -107,19 +108,19 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
 
 def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
     """A plan for ``expand``: in every candidate the arm starts elsewhere, and the target stands elsewhere where the
-    task moves an object; where it only opens or turns something, the arm alone."""
-    entries = demos.index().entries
-    target = PoseAxis(components=("target",))
-    axes = Axes(pose=target, robot=RobotAxis(components=("initial_joints",)))
+    task moves an object, with all of the scene where it stands on or in something; where the task only opens or turns
+    something, the arm alone."""
+    by_moved: dict[Literal["target", "scene"] | None, list[DemoEntry]] = defaultdict(list)
+    for entry in demos.index().entries:
+        known = bddl.read(entry.task.bddl_file)
+        carried = any(known.carriers[name] != name for name in known.targets)
+        by_moved[("scene" if carried else "target") if known.targets else None].append(entry)
     rows: list[plan.Row] = []
-    for moves in (True, False):
-        group = [entry for entry in entries if target.applies(entry.task) == moves]
-        if group:
-            name = "pose+robot" if moves else "robot"
-            drawn_from = axes if moves else Axes(robot=axes.robot)
-            tasks = {entry.task for entry in group}
-            wanted = PlanConfig(seed=seed, axes=drawn_from, episodes={name: per_task * len(tasks)}, reserve=RESERVE)
-            rows += plan.make(group, wanted, REPLAY, test)
+    for moved, group in by_moved.items():
+        pose = PoseAxis(components=(moved,)) if moved else None
+        axes = Axes(pose=pose, robot=RobotAxis(components=("initial_joints",)))
+        episodes = {"pose+robot" if moved else "robot": per_task * len({entry.task for entry in group})}
+        rows += plan.make(group, PlanConfig(seed=seed, axes=axes, episodes=episodes, reserve=RESERVE), REPLAY, test)
     return rows
 
 
