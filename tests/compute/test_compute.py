@@ -72,6 +72,16 @@ def test_progress_is_counted_in_what_items_hold(capsys: pytest.CaptureFixture[st
     assert [line.split(",")[1].split(": ")[1] for line in lines] == ["10/20", "20/20"]
 
 
+@pytest.mark.parametrize(("every_s", "lines"), [(60.0, 10), (0.0, 30)])
+def test_a_log_says_how_far_long_work_is(
+    every_s: float, lines: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not only at each tenth, which takes hours in a large run."""
+    monkeypatch.setattr("pipeline.compute.progress.SAID_EVERY_S", every_s)
+    loop(square, range(30), "squares")
+    assert len(capsys.readouterr().err.splitlines()) == lines
+
+
 @pytest.mark.slow
 def test_work_that_ends_its_workers_is_given_up_or_ends_the_run_with_words(tmp_path: Path) -> None:
     expendable = Expendable(die_or_hang, limit_s=lambda _: 2.0, lost=lambda number: -number)
