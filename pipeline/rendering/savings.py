@@ -6,6 +6,7 @@ times as long without a GPU.
 """
 
 import functools
+import importlib.util
 import logging
 import os
 from contextlib import closing
@@ -83,6 +84,8 @@ def why_plain() -> str | None:
         reason = f"savings were tested with MuJoCo {MUJOCO}, this is {mujoco.__version__}"
     elif not device.startswith(DEVICE):
         reason = f"savings were tested with {DEVICE}, this is {device}"
+    elif importlib.util.find_spec("pipeline.rendering.software") is None:
+        reason = "this installation has no savings"
     elif found := fault():
         reason = f"on {device} {found}"
     else:

@@ -99,9 +99,10 @@ def keep_speed(folder: Path, speed: Speed) -> None:
 
 
 def known_speed(folder: Path) -> Speed | None:
-    """What ``keep_speed`` wrote last."""
+    """What ``keep_speed`` wrote last; None where it did not, or another version did."""
     file = folder / SPEED
-    return Speed(**read_json(file)) if file.exists() else None
+    found = read_json(file) if file.exists() else {}
+    return Speed(**found) if found.keys() == set(Speed._fields) else None
 
 
 def record(folder: Path, trial: Mapping[str, str]) -> None:

@@ -2,13 +2,16 @@
 
 import logging
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import mujoco
 import pytest
+from conftest import REPOSITORY
 
 from pipeline import gl
 from pipeline.rendering import savings
@@ -89,3 +92,14 @@ print(type(Renderer({SCENE!r}).drawing).__name__, [name for name in sys.modules 
     environment = os.environ | {savings.PLAIN: "1"}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert (done.stdout.strip(), done.stderr) == ("PlainDrawing []", "")
+
+
+def test_without_the_folder_of_savings_scenes_are_drawn_plainly(tmp_path: Path) -> None:
+    for folder in ("pipeline", "schemas"):
+        shutil.copytree(REPOSITORY / folder, tmp_path / folder, ignore=shutil.ignore_patterns("software"))
+    program = f"from pipeline.rendering.renderer import Renderer\nprint(type(Renderer({SCENE!r}).drawing).__name__)"
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "PlainDrawing"
+    assert "this installation has no savings" in done.stderr

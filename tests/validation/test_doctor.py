@@ -245,6 +245,13 @@ def stored(folder: Path, *names: str) -> Path:
     return folder
 
 
+def test_a_speed_that_another_version_wrote_is_measured_anew(tmp_path: Path) -> None:
+    machine.keep_speed(tmp_path, REFERENCE)
+    assert machine.known_speed(tmp_path) == REFERENCE
+    (tmp_path / machine.SPEED).write_text('{"step_s": 0.01, "frame_s": 0.1, "devices": 2}')
+    assert machine.known_speed(tmp_path) is None
+
+
 def test_the_command_writes_nothing_and_a_run_begins_on_another_machine(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, trial: dict[str, str]
 ) -> None:
