@@ -16,6 +16,7 @@ def run(config: Config) -> None:
         episodes,
         places=registry.places(registry.formats_of(data, config.export, config.render.extras)),
         columns=registry.columns(),
+        where=config.export.where,
     )
     manifest.write(table, data / "manifest.parquet", manifest.Settings.of(config))
 

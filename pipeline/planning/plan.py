@@ -22,6 +22,9 @@ from pipeline.types import Task, Verdict
 
 _ATTEMPTS = 100
 
+NOT_NEEDED = "reserve_not_needed"
+"""The reason of a reserve for whose quota others were kept."""
+
 RESET = "reset"
 """What stands for the axis where nothing is perturbed and the start is a reset of LIBERO's environment."""
 
@@ -300,7 +303,7 @@ def _verdicts(
         for row in group:
             verdict = verdicts.get(row.trajectory_id)
             if not need:
-                verdict = Verdict(False, "reserve_not_needed")
+                verdict = Verdict(False, NOT_NEEDED)
             elif rejected and verdict and verdict.kept and row.episode_id in rejected:
                 verdict = Verdict(False, rejected[row.episode_id])
             # Until it is known, it is hoped for.

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
-from pipeline.run.outcome import LEFT_OUT, MADE
+from pipeline.planning.plan import NOT_NEEDED
+from pipeline.run.outcome import MADE
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -38,15 +38,10 @@ class Counts:
         return f"{self.planned}/{self.replayed}/{self.kept}" if self.planned else "-"
 
 
-_CHOSEN_BY = itemgetter("axis", "component", "level", "suite")
-"""The columns that ``export.where`` goes by."""
-
-
 def tried(rows: Rows) -> list[Mapping[str, Any]]:
     """All rows but the reserves that were not needed, and those that ``export.where`` leaves out, whatever became of
     them: without what they gave, their losses are no yield."""
-    left_out = {_CHOSEN_BY(row) for row in rows if row["reason"] == LEFT_OUT}
-    return [row for row in rows if row["reason"] != "reserve_not_needed" and _CHOSEN_BY(row) not in left_out]
+    return [row for row in rows if row["reason"] != NOT_NEEDED and row["chosen"]]
 
 
 def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:

@@ -87,7 +87,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
         if not (found := _faults(kept, rows, store)):
             break
         faults |= found
-    unwanted = {"kept", "reserve_not_needed"}
+    unwanted = {"kept", plan.NOT_NEEDED}
     reasons = [outcome[row.episode_id].reason for row in rows if row.role == "perturbed"]
     result = Expansion(dropped=Counter(reason for reason in reasons if reason not in unwanted))
     tasks = {f"{entry.task.suite}/{entry.task.name}": entry.task for entry in demos.index().entries}

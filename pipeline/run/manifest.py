@@ -14,9 +14,11 @@ from pydantic import ValidationError
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
+from pipeline.export_config import Where
 from pipeline.identity import DISTRIBUTION, VERSIONS, versions
 from pipeline.planning import plan
-from pipeline.run.outcome import Outcome
+from pipeline.planning.plan import NOT_NEEDED
+from pipeline.run.outcome import Outcome, rendered
 from pipeline.tables import column, columns_of, read_table, write_table
 from pipeline.types import Quality
 
@@ -38,6 +40,7 @@ class Result:
         "what a physics perturbation was refused for, the figure that `filter` refuses, not_replayed, "
         "reserve_not_needed, left_out (export.where names others)",
     ]
+    chosen: Annotated[bool, "of what export.where names; true where it is not set"]
     replay_mode: Annotated[
         str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"
     ]
@@ -69,26 +72,30 @@ class Settings(Frozen):
         return cls(source=config.demos.source, replay=config.replay, render=config.render)
 
 
-def build(run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequence[pa.Field]) -> pa.Table:
+def build(
+    run: Outcome, places: Mapping[str, Mapping[str, Any]], columns: Sequence[pa.Field], where: Where | None
+) -> pa.Table:
     """Join the plan with what became of it.
 
     Args:
         places: episode id to where it lies in the datasets, for every kept episode.
+        where: ``export.where``.
     """
     own_versions = {version_column(name): version for name, version in versions().items()}
     table = []
     for row in run.rows:
         verdict = run.verdicts[row.episode_id]
-        replayed = run.trajectories.get(row.trajectory_id, {})
-        rendered = run.frames.get(row.trajectory_id)
+        # The trajectory of a reserve that was not needed may be there for another episode.
+        replayed = run.trajectories.get(row.trajectory_id, {}) if verdict.reason != NOT_NEEDED else {}
         result = Result(
             kept=verdict.kept,
             reason=verdict.reason,
+            chosen=where is None or where.takes(row.axis, row.component, row.level, row.suite),
             replay_mode=replayed.get("mode"),
             steps=replayed.get("steps"),
             resolved=replayed.get("resolved"),
             path_ratio=_ratio(replayed, run.trajectories.get(run.row_of[row.twin_id].trajectory_id, {})),
-            gl_device=rendered.device if rendered else None,
+            gl_device=run.frames[row.trajectory_id].device if replayed and rendered(row, run.frames) else None,
         )
         quality = {each.name: replayed.get(each.name) for each in fields(Quality)}
         table.append({**asdict(row), **asdict(result), **quality, **places.get(row.episode_id, {}), **own_versions})

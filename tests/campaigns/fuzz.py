@@ -178,7 +178,7 @@ def _manifest() -> bytes:
     import pyarrow as pa
 
     def write(folder: Path) -> Path:
-        rows = [{**vars(row), "kept": True, "reason": "kept"} for row in _rows()]
+        rows = [{**vars(row), "kept": True, "reason": "kept", "chosen": True} for row in _rows()]
         write_table(pa.Table.from_pylist(rows, schema=manifest.schema()), folder / "manifest.parquet")
         return folder / "manifest.parquet"
 

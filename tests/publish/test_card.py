@@ -48,6 +48,7 @@ def row(axis: str, *changes: Perturbation, task: Task = MILK, reason: str = "kep
         "perturbations": to_json(list(changes)),
         "kept": kept,
         "reason": reason,
+        "chosen": True,
         "replay_mode": "open_loop",
         "steps": 100,
         "gl_device": "llvmpipe" if kept else None,
@@ -172,10 +173,11 @@ def test_tables_say_what_the_manifest_says(data: Path) -> None:
 
 
 def test_what_is_left_out_is_not_lost(data: Path) -> None:
-    """Nor is what failed of the same kind: of its level nothing is exported."""
+    """Nor is what failed of the same kind, also where all of it did."""
     before = written(data, "rlds")
-    others = [row("camera", CAMERA, reason=reason, level="1") for reason in ("left_out", "goal_not_reached")]
-    write_rows(data, [*ROWS, *others, row("noise", reason="left_out")])
+    reasons = ("left_out", "goal_not_reached")
+    others = [row("camera", CAMERA, reason=reason, level="1", chosen=False) for reason in reasons]
+    write_rows(data, [*ROWS, *others, row("noise", reason="goal_not_reached", chosen=False)])
     assert written(data, "rlds") == before
 
 

@@ -120,7 +120,7 @@ def test_twins_that_are_left_out_are_still_shown(config: Config, finished: Path)
 
 def test_a_combination_counts_with_each_of_its_axes() -> None:
     camera, light = _draw("camera", 0), _draw("light", 0)
-    columns = dict.fromkeys(("axis", "component", "level", "suite"), "") | {"steps": 9}
+    columns = dict.fromkeys(("axis", "component", "level", "suite"), "") | {"steps": 9, "chosen": True}
     lost = {**columns, "perturbations": to_json([camera]), "kept": False, "reason": "too_dark"}
     kept = {**columns, "perturbations": to_json([camera, light]), "kept": True, "reason": "kept"}
     table = yields.by_level("", [lost, kept, kept])
