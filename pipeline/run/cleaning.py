@@ -49,7 +49,7 @@ PARTS = {
 def found(data: Path, parts: Iterable[str]) -> dict[str, float]:
     """Of some parts, those that are there, to their megabytes."""
     there = {part: [path for name in PARTS[part].names if (path := data / name).exists()] for part in parts}
-    return {part: sum(map(_size_mb, paths)) for part, paths in there.items() if paths}
+    return {part: sum(map(size_mb, paths)) for part, paths in there.items() if paths}
 
 
 def delete(data: Path, parts: Iterable[str]) -> None:
@@ -64,6 +64,7 @@ def delete(data: Path, parts: Iterable[str]) -> None:
                 remove(data / name)
 
 
-def _size_mb(path: Path) -> float:
+def size_mb(path: Path) -> float:
+    """Megabytes of a file, or of all files in a folder; 0 where nothing is."""
     files = path.rglob("*") if path.is_dir() else [path]
     return sum(file.lstat().st_size for file in files if file.is_file()) / 1e6

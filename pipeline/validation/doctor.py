@@ -27,6 +27,7 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.planning import plan
 from pipeline.run import machine
+from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
 from pipeline.validation.needs import RUN_MB, free_gb, in_words, needed_mb, needed_s, workers_of
@@ -83,9 +84,9 @@ def run(config: Config, *, tried: bool = False) -> int:
     for column in ("", "what", "found", "try"):
         table.add_column(column, overflow="fold")
     styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
-    made_gb = sum(file.stat().st_size for file in config.data.rglob("*") if file.is_file()) / 1e9
-    # What is made already needs no more room, but for LeRobot's second copy while it is merged.
-    findings = check(config, max(sum(needed_mb(config).values()) / 1e3 - made_gb, RUN_MB / 1e3))
+    # What is made already needs no more room; another folder's files, such as a former dataset's, leave it as it is.
+    left_mb = (max(0.0, mb - size_mb(config.data / folder)) for folder, mb in needed_mb(config).items())
+    findings = check(config, max(sum(left_mb), RUN_MB) / 1e3)
     if all(finding.status != "fail" for finding in findings):
         speed = (machine.known_speed(config.data) if tried else None) or machine.trial().speed
         time = in_words(needed_s(config, speed), workers_of(config.compute))

@@ -18,6 +18,15 @@ from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
 
+MADE = {
+    "doctor": ["machine.json"],
+    "leakage": ["leakage.json"],
+    "manifest": ["manifest.parquet", "counts.json", "dataset_statistics.json"],
+    "recipe": ["finetune"],
+    "card": ["card"],
+}
+"""Stages that remember nothing, to what they make."""
+
 
 def told(config: Config) -> Iterator[str | Table]:
     """A run's state in a few paragraphs and tables."""
@@ -29,12 +38,16 @@ def told(config: Config) -> Iterator[str | Table]:
     verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), config.filter)
     frames = shown_of(FrameStore(config.data / "frames", config.render).rows())
     rejected = outcome.rejections(rows, frames)
-    yield _counts(config, rows, plan.select(rows, verdicts, rejected), frames)
+    judged = plan.select(rows, verdicts, rejected)
+    yield _counts(config, rows, judged, frames)
     steps = dict(_steps(config, rows, verdicts, frames, rejected))
     yield "would run:" if steps else "nothing would run: all of this configuration is made"
     yield from (f"  {step}: {why}" for step, why in steps.items())
     yield _disk(config)
-    yield from _time_left(config, rows, verdicts, frames) if steps else ()
+    # What is not replayed yet is hoped for.
+    needed = [row for row in rows if judged[row.episode_id].kept or row.trajectory_id not in verdicts]
+    needed = [row for row in needed if judged[row.episode_id].reason != plan.NOT_NEEDED]
+    yield from _time_left(config, needed, verdicts, frames, steps) if steps else ()
 
 
 def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]) -> Table:
@@ -63,10 +76,13 @@ def _steps(
 ) -> Iterator[tuple[str, str]]:
     changed = _changed(config)
     of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
-    if not rows or of_plan:
-        yield "plan", f"another configuration: {', '.join(of_plan)}" if rows else "there is no plan yet"
-        if not rows:
-            return
+    if not rows:
+        yield "plan", "there is no plan yet"
+        return
+    if files := _changed_files(config):
+        of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
+    if of_plan:
+        yield "plan", f"another configuration: {', '.join(of_plan)}"
     made_anew = outdated(rows, config)
     if needed := plan.pending(rows, verdicts, rejected):
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
@@ -84,6 +100,9 @@ def _steps(
 def _follow(config: Config) -> Iterator[tuple[str, str]]:
     run = outcome.read(config)
     sets = (config.data, config.export, config.render.extras)
+    for stage, names in MADE.items():
+        if gone := [name for name in names if not (config.data / name).exists()]:
+            yield stage, f"{gone[0]} is not there"
     stale = False
     for one in (*formats_of(*sets), *(failures_of(*sets) if run.missed else ())):
         episodes = export.episodes_of(one, config, run)
@@ -112,6 +131,15 @@ def _changed(config: Config) -> list[str]:
     return list(_differences(before, inputs.settings(config)))
 
 
+def _changed_files(config: Config) -> list[str]:
+    try:
+        before = read_json(config.data / "inputs.json")
+    except PipelineError:
+        return []
+    now = inputs.listing(config)
+    return sorted(file for file in before.keys() | now.keys() if before.get(file) != now.get(file))
+
+
 def _differences(before: Any, now: Any, field: str = "") -> Iterator[str]:
     if isinstance(before, dict) and isinstance(now, dict):
         for name in dict.fromkeys([*before, *now]):
@@ -126,20 +154,26 @@ def _of(made_anew: Counter[str], what: str) -> str:
 
 
 def _time_left(
-    config: Config, rows: list[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, Shown]
+    config: Config,
+    needed: list[plan.Row],
+    verdicts: Mapping[str, Verdict],
+    frames: Mapping[str, Shown],
+    steps: Mapping[str, str],
 ) -> Iterator[str]:
-    """By the speed that the stage ``doctor`` found, and the share of the wanted rows that is not made."""
+    """By the speed that ``doctor`` found, the share of the needed rows that is not made, and what would run."""
     speed = machine.known_speed(config.data)
-    if speed is None or not rows:
+    if speed is None or not needed:
         return
-    wanted = [row for row in rows if row.wanted]
+    anew = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
     left = {
-        "replay": sum(row.trajectory_id not in verdicts for row in wanted) / len(wanted),
-        "render": sum(not outcome.rendered(row, frames) for row in wanted) / len(wanted),
+        "replay": sum(row.trajectory_id not in verdicts for row in needed) / len(needed),
+        "render": sum(not outcome.rendered(row, frames) for row in needed) / len(needed),
+        "export": float(anew),
+        "validate": float(anew or any(step.startswith(("manifest", "validate")) for step in steps)),
     }
     left["GPU"] = left["render"]
-    needed = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(config, speed).items()}
-    yield f"time left: {in_words(needed, workers_of(config.compute))}"
+    left_s = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(config, speed).items()}
+    yield f"time left: {in_words(left_s, workers_of(config.compute))}"
 
 
 def _disk(config: Config) -> str:

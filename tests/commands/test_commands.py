@@ -134,6 +134,16 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     assert [cell.strip() for cell in next(x for x in told.splitlines() if "camera" in x).split("│")[1:-1]] == [
         *("camera", "3", "3", "3", "3"),
     ]
+    (clone / "data/tiny/card").rename(clone / "card")
+    assert would_run() == ["card"]
+    assert "render 0 s, export 0 s, validate 0 s" in call(clone, "status").stdout
+    (clone / "card").rename(clone / "data/tiny/card")
+    listed = clone / "data/tiny/inputs.json"
+    before_edit = listed.read_text()
+    listed.write_text(json.dumps(json.loads(before_edit) | {"demos.root/another": [1, 2]}))
+    assert would_run() == ["plan", "exports and all that follows"]
+    assert "files that it names (1, such as demos.root/another)" in call(clone, "status").stdout
+    listed.write_text(before_edit)
     configured(clone, export={"rlds": {"name": "libero_tiny", "shards": 3}, "lerobot": {"name": "tiny", "shards": 2}})
     assert would_run() == ["export_rlds", "manifest and all that follows"]
     configured(clone, export=tiny_config(clone)["export"])

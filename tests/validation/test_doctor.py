@@ -16,6 +16,7 @@ from pipeline import gl
 from pipeline.catalogue import downloads
 from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig, load
 from pipeline.errors import PipelineError
+from pipeline.export_config import ExportConfig, LeRobotConfig
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import machine
@@ -143,7 +144,10 @@ def test_what_a_run_has_made_already_needs_no_more_room(monkeypatch: pytest.Monk
     frames.parent.mkdir(parents=True)
     with frames.open("wb") as file:
         file.truncate(500_000_000)
-    assert run_doctor("starter", monkeypatch, free_gb=0.3) == 0
+    assert run_doctor("starter", monkeypatch, free_gb=0.5) == 0
+    frames.parents[1].rename(tmp_path / "data" / "starter" / "rlds")
+    of_one = ExportConfig(rlds=None, lerobot=LeRobotConfig(name="libero_starter"))
+    assert run_doctor("starter", monkeypatch, free_gb=0.3, export=of_one) == 1, "a former set makes no room"
 
 
 def test_memory_is_counted_for_the_workers_that_are_asked_for(
