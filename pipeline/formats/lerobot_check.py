@@ -19,7 +19,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from pipeline.episode_schema import MOTION, SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID
-from pipeline.formats.lerobot_read import copy_of, readable, rows, vectors, wrong_statistics
+from pipeline.formats.lerobot_read import QUANTILES, copy_of, readable, rows, vectors, wrong_statistics
 from pipeline.formats.read_back import Fault, sampled
 
 BY_LEROBOT = 8
@@ -54,9 +54,10 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str
             with av.open(str(file)) as video:
                 read[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
         statistics = json.loads((root / "meta" / "stats.json").read_text())
-        measured = (SCHEMA.action.lerobot_key, SCHEMA.state.lerobot_key)
-        steps = [vectors(file, measured) for file in sorted(root.glob("data/**/*.parquet"))]
-        wrong = list(wrong_statistics(statistics, steps))
+        files, wrong = sorted(root.glob("data/**/*.parquet")), []
+        for name in MOTION:  # One after another, as each takes memory.
+            key = getattr(SCHEMA, name).lerobot_key
+            wrong += wrong_statistics(statistics, [vectors(file, [key]) for file in files], QUANTILES)
         stored = (meta.total_episodes, data.num_frames)
         strangers = sorted(rows(root).keys() - kept.keys())
         samples = list(_samples(root, data))

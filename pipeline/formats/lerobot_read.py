@@ -39,6 +39,9 @@ UNREADABLE = (
 MARKS = ("frame_index", "timestamp")
 """LeRobot's columns that tell steps apart."""
 
+QUANTILES = ("q01", "q10", "q50", "q90", "q99")
+"""lerobot's statistics of a whole set beside mean, deviation and range; pi0.5 normalises by them."""
+
 SAME_SHARE, SAME = 1e-4, 1e-6
 """Largest relative and absolute difference between stored statistics and those of the columns."""
 
@@ -98,12 +101,18 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
     table = _steps(root / info["data_path"].format(chunk_index=chunk, file_index=number), row["first_row"], steps)
     refuse_others(table, row, row["dataset_from_index"])
     instructions = [info["tasks"][task] for task in table["task_index"].to_pylist()]
+    if row["dataset_to_index"] != row["dataset_from_index"] + steps or row["tasks"] != [instructions[0]]:
+        told = f"ends before step {row['dataset_to_index']} and has the tasks {row['tasks']}"
+        raise ValueError(f"episode {index} of {steps} steps, {instructions[0]!r}, {told}")
     videos = {}
     for view, key in ((view, spec.lerobot_key) for view, spec in SCHEMA.views.items()):
         if info["features"][key]["dtype"] == "video":
             chunk, number = _file(row, f"videos/{key}")
             path = root / info["video_path"].format(video_key=key, chunk_index=chunk, file_index=number)
-            videos[view] = path, row[f"videos/{key}/from_timestamp"]
+            first_s, end_s = (row[f"videos/{key}/{end}_timestamp"] for end in ("from", "to"))
+            if round((end_s - first_s) * SCHEMA.fps_hz) != steps:
+                raise ValueError(f"episode {index} of {steps} steps has {first_s} to {end_s} s of {path.name}")
+            videos[view] = path, first_s
     return Copy(
         dataset="lerobot",
         episode=episode(table, row, instructions[0], extras),
@@ -140,13 +149,18 @@ def vectors(file: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
 
 
 def wrong_statistics(
-    stored: Mapping[str, Any], steps: Sequence[Mapping[str, NDArray[Any]]]
+    stored: Mapping[str, Any], steps: Sequence[Mapping[str, NDArray[Any]]], quantiles: Sequence[str] = ()
 ) -> Iterator[tuple[str, str]]:
-    """What is off with the stored statistics of the ``vectors`` of some files, and what these come to."""
+    """What is off with the stored statistics of the ``vectors`` of some files, and what these come to.
+
+    Args:
+        quantiles: names of those to look at too, such as q01.
+    """
     for column in steps[0]:
         values = np.concatenate([of_file[column] for of_file in steps], dtype=float)
-        for name in ("mean", "std", "min", "max"):
-            expected = getattr(values, name)(axis=0)
+        wanted = {name: getattr(values, name)(axis=0) for name in ("mean", "std", "min", "max")}
+        wanted |= {name: np.quantile(values, int(name[1:]) / 100, axis=0) for name in quantiles}
+        for name, expected in (wanted | {"count": np.array([len(values)])}).items():
             if not np.allclose(stored[column][name], expected, rtol=SAME_SHARE, atol=SAME):
                 yield f"{name} of {column} is {stored[column][name]} in the statistics", f"{expected.tolist()}"
 

@@ -13,7 +13,16 @@ import pyarrow.parquet as pq
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID, Convention
-from pipeline.formats.lerobot_read import MARKS, decoded, episode, readable, refuse_others, vectors, wrong_statistics
+from pipeline.formats.lerobot_read import (
+    MARKS,
+    QUANTILES,
+    decoded,
+    episode,
+    readable,
+    refuse_others,
+    vectors,
+    wrong_statistics,
+)
 from pipeline.formats.lerobot_v21_write import data_path, video_path
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.types import Extra
@@ -74,7 +83,7 @@ def _wrong_statistics(
     measured = [convention.name(spec.lerobot_key) for spec in (SCHEMA.action, SCHEMA.state)]
     of_all = json.loads((root / "meta" / "stats.json").read_text())
     steps = {file: vectors(file, measured) for file in sorted(root.glob("data/**/*.parquet"))}
-    yield from wrong_statistics(of_all, [*steps.values()])
+    yield from wrong_statistics(of_all, [*steps.values()], QUANTILES)
     for index, stored in of_episodes.items():
         if (of_episode := steps.get(root / data_path(index))) is not None:
             for what, expected in wrong_statistics(stored, [of_episode]):

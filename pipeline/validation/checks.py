@@ -25,6 +25,13 @@ VIDEO_PSNR_DB = 32.0
 
 In colour it can be 20: a video holds colours at half the resolution, which a fine, colourful surface shows."""
 
+COLOURS_OFF = 0.5
+"""Share of a stored frame's colourfulness by which a video's colours may differ; the most of 282 frames was 0.16. Grey
+frames are off by 1, and those with red and blue exchanged by more."""
+
+PALE_LEVELS = 4.0
+"""Frames count as at least so colourful: the mean distance of Cb and Cr from grey, in levels, over 16 by 16 fields."""
+
 STILL_LEVELS = 0.5
 """Mean difference in grey levels up to which two frames count as the same; the least of 49 episodes was 1.4."""
 
@@ -80,6 +87,16 @@ class Case:
 def _grey_psnr_db(one: Frame, other: Frame) -> float:
     grey, other_grey = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (one, other))
     return float(cv2.PSNR(grey, other_grey))
+
+
+def _colours_off(one: Frame, stored: Frame) -> float:
+    """The mean distance of Cb and Cr over 16 by 16 fields, as a share of the stored frame's from grey."""
+    fields = (
+        cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2YCrCb), (16, 16), interpolation=cv2.INTER_AREA)[..., 1:]
+        for frame in (one, stored)
+    )
+    found, wanted = (field.astype(float) - 128 for field in fields)
+    return float(np.abs(found - wanted).mean() / max(np.abs(wanted).mean(), PALE_LEVELS))
 
 
 def length(case: Case) -> Iterator[Fault]:
@@ -197,11 +214,15 @@ def geometry(case: Case) -> Iterator[Fault]:
 
 
 def video(case: Case) -> Iterator[Fault]:
-    """Frames within ``VIDEO_PSNR_DB`` of the stored ones, where a dataset has others than those image files."""
+    """Frames within ``VIDEO_PSNR_DB`` and ``COLOURS_OFF`` of the stored ones, where a dataset has no image files."""
     for copy, view, step, shown in _shown(case):
-        reached = _grey_psnr_db(copy.decoded[view, step], shown[view])
-        if not copy.episode.frames and reached < VIDEO_PSNR_DB:
+        if copy.episode.frames:
+            continue
+        frame, stored = copy.decoded[view, step], shown[view]
+        if (reached := _grey_psnr_db(frame, stored)) < VIDEO_PSNR_DB:
             yield case.finding(copy.dataset, f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} or more")
+        elif (off := _colours_off(frame, stored)) > COLOURS_OFF:
+            yield case.finding(copy.dataset, f"{view} of step {step} has other colours ({off:.2f})", f"{COLOURS_OFF}")
 
 
 def cameras(case: Case) -> Iterator[Fault]:

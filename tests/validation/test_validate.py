@@ -331,6 +331,34 @@ def lose_a_task(root: Path, version: str) -> None:
         tasks[1:].to_parquet(root / "meta" / "tasks.parquet")
 
 
+def change_an_episode(root: Path, version: str) -> None:
+    """What lerobot reads of it, and its steps do not say."""
+    if version == "lerobot_v21":
+        file = root / "meta" / "episodes.jsonl"
+        change_lines(file, lambda rows: [{**rows[0], "tasks": ["another"]}, *rows[1:]])
+        return
+    file = min((root / "meta" / "episodes").rglob("*.parquet"))
+    table = pq.read_table(file)
+    place, field = table.schema.get_field_index("dataset_to_index"), table.schema.field("dataset_to_index")
+    pq.write_table(table.set_column(place, field, pa.array([int(end) + 7 for end in table[place].to_numpy()])), file)
+
+
+def change_a_quantile(root: Path, version: str) -> None:
+    file = root / "meta" / "stats.json"
+    found = json.loads(file.read_text())
+    found["action"]["q99"][0] += 0.01
+    file.write_text(json.dumps(found))
+
+
+def bleach(root: Path, version: str) -> None:
+    for file in root.glob("videos/**/*.mp4"):
+        with av.open(str(file)) as video:
+            grey = [frame.to_ndarray(format="gray") for frame in video.decode(video=0)]
+        with lerobot_video.Video(file) as again:
+            for frame in grey:
+                again.add(np.repeat(frame[..., None], 3, axis=2), first=False)
+
+
 def turn_the_gripper(root: Path, version: str) -> None:
     def change(found: Any) -> Any:
         command = -found[:, 6:] if version == "lerobot" else 1 - found[:, 6:]
@@ -356,6 +384,9 @@ def test_nothing_is_found_where_nothing_was_planted(
         (shorten, {"length", "readable"}),
         (lose_a_task, {"readable"}),
         (turn_the_gripper, {"motion"}),
+        (change_an_episode, {"readable"}),
+        (change_a_quantile, {"format"}),
+        (bleach, {"video"}),
     ],
 )
 def test_faults_of_either_version_are_found(
