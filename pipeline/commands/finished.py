@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 from typing import Any
 
 from pipeline.commands.base import add, add_config, argument, owned, value
@@ -98,6 +99,8 @@ def regenerate(arguments: argparse.Namespace) -> int:
         config = owned(arguments)
         manifest, demos = config.data / "manifest.parquet", config.demos.root
     found = regenerate(arguments.episode_id, manifest, arguments.out, demos)
+    if found["identical"] is None:
+        print(f"only made, in {arguments.out}: no RLDS set lies beside {manifest} to compare it with", file=sys.stderr)
     print(json.dumps(found))
     return int(found["identical"] is False or found["reason"] != "kept")
 

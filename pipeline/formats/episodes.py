@@ -81,7 +81,9 @@ class Episodes:
         """
         if not self.known:
             raise PipelineError(
-                "no episodes to write", expected="1 or more", remedy="read in the manifest why all were dropped"
+                "no episodes to write",
+                expected="1 or more",
+                remedy="`python -m pipeline status` says what reached its goal; else widen export.where, or filter",
             )
         if not validation:
             return {"train": list(self.ids)}

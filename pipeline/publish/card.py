@@ -97,6 +97,7 @@ def render(
     kept = [row for row in rows if row["kept"]]
     owed = attributions(row["perturbations"] for row in kept)
     free = all(FREE.match(one.licence) for one in owed)
+    axes = _axes(kept, shown)
     return TEMPLATES.get_template("card.md.j2").render(
         line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
         metadata=_metadata(shown, name, free).to_yaml(),
@@ -113,10 +114,10 @@ def render(
         planned=named(tried(rows), "axis"),
         counts=Counts.of,
         levels=LEVELS,
-        axes=_axes(kept, shown),
+        axes=axes,
         sheets=sheets,
         yields=_yields(rows),
-        leakage=leakage,
+        leakage={axis: finding for axis, finding in leakage.items() if axis in axes},
         schema=SCHEMA,
         gripper=shown.gripper,
         statistics=statistics,

@@ -83,7 +83,9 @@ def data(tmp_path: Path) -> Path:
     for name, report in {
         "leakage.json": {
             "camera": FINDING
-            | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint", "coverage": {"distance": COVERAGE}}
+            | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint", "coverage": {"distance": COVERAGE}},
+            # Of the plan, and of no episode that is kept.
+            "robot": FINDING | {"measure": "radians", "overlaps": 0, "verdict": "disjoint", "coverage": {}},
         },
         "validation.json": VALIDATION,
         "dataset_statistics.json": {
@@ -169,6 +171,7 @@ def test_tables_say_what_the_manifest_says(data: Path) -> None:
     assert cells(text, "camera", "Distance to the LIBERO-Plus test set")[-2:] == ["5.38", "disjoint"]
     assert "| camera | distance | 313 | 313 | 5.38 | 6.12 | 7.34 | 8.56 |" in text
     assert "hf download OWNER/NAME" in text
+    assert "radians" not in text.partition("## Distance")[2].partition("##")[0]
     assert re.search(rf"regenerate ({'|'.join(row['episode_id'] for row in ROWS if row['kept'])}) --manifest", text)
 
 

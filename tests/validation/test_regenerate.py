@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from conftest import BOWL, REPOSITORY
 
+from pipeline.__main__ import main
 from pipeline.errors import PipelineError
 from pipeline.formats.tfrecord import framed, records
 from pipeline.run import manifest
@@ -89,10 +90,18 @@ def test_says_what_differs(copy: Path, short_demos: Path, tmp_path: Path) -> Non
     assert found["differs"] == {"language_instruction": f"{steps} of {steps} steps, the first at step 0"}
 
 
-def test_without_the_dataset_it_is_only_made(copy: Path, short_demos: Path, tmp_path: Path) -> None:
+def test_without_the_dataset_it_is_only_made_and_says_so(
+    copy: Path, short_demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.rmtree(copy / "rlds")
-    found = regenerate(perturbed(copy)["episode_id"], copy / "manifest.parquet", tmp_path / "out", short_demos)
+    told = ["--manifest", copy / "manifest.parquet", "--out", tmp_path / "out", "--demos", short_demos]
+    command = ["pipeline", "regenerate", perturbed(copy)["episode_id"], *told]
+    monkeypatch.setattr(sys, "argv", [*map(str, command)])
+    assert main() == 0
+    shown = capsys.readouterr()
+    found = json.loads(shown.out.splitlines()[-1])
     assert (found["identical"], found["reason"], found["differs"]) == (None, "kept", {})
+    assert "no RLDS set lies beside" in shown.err
     assert list((tmp_path / "out" / "rlds").rglob("*.tfrecord-*"))
 
 
