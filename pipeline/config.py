@@ -15,6 +15,7 @@ from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
+from pipeline.files import StrictLoader
 from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.types import RenderedExtra
@@ -286,7 +287,7 @@ def load(path: Path) -> Config:
         PipelineError: naming the file, every field that is wrong, and what would have worked.
     """
     try:
-        return Config.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        return Config.model_validate(yaml.load(path.read_text(encoding="utf-8"), StrictLoader))
     except (OSError, UnicodeDecodeError) as error:
         there = sorted(map(str, Path("configs").glob("*")))
         raise PipelineError(f"cannot read the configuration ({error})", where=path, remedy=f"one of {there}") from error

@@ -115,6 +115,15 @@ def test_missing_and_broken_files(tmp_path: Path) -> None:
         load(tmp_path / "latin.yaml")
 
 
+@pytest.mark.parametrize(
+    "text", ["name: dup\nplan: {seed: 5}\nplan: {episodes: {light: 3}}", "plan: {episodes: {camera: 2, camera: 1}}"]
+)
+def test_a_key_that_is_given_twice_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "dup.yaml").write_text(text)
+    with pytest.raises(PipelineError, match=r"dup\.yaml.*not valid YAML: the key '(plan|camera)' is given twice"):
+        load(tmp_path / "dup.yaml")
+
+
 def test_aliases_that_unfold_without_end_are_refused_at_once(tmp_path: Path) -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 12)]

@@ -27,6 +27,7 @@ from pipeline import seeding
 from pipeline.axes.base import Axis, Level, TextPerturbation
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
+from pipeline.files import FastStrictLoader
 from pipeline.jit import compiled
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Task
@@ -156,7 +157,7 @@ def read_bank(file: Path) -> Bank:
         PipelineError: when the file does not have the bank's form.
     """
     try:
-        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), yaml.CSafeLoader) or {})
+        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), FastStrictLoader) or {})
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         raise PipelineError(
             f"not a bank of rewrites ({error})",

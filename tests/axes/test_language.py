@@ -284,6 +284,13 @@ def test_a_task_without_rewrites_has_no_wordings(test: TestSet) -> None:
     assert LanguageAxis().wordings(known, (), test) == ()
 
 
+def test_a_bank_with_a_task_given_twice_is_refused(tmp_path: Path) -> None:
+    bank = tmp_path / "bank.yaml"
+    bank.write_text("libero_goal:\n  stove: {paraphrase: []}\n  stove: {distraction: []}\n")
+    with pytest.raises(PipelineError, match="the key 'stove' is given twice"):
+        load_bank(bank)
+
+
 def test_a_further_bank_has_to_keep_the_goal(tmp_path: Path) -> None:
     bank = tmp_path / "bank.yaml"
     text = "kindly put the bowl next to the plate"
