@@ -118,6 +118,19 @@ def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, r
     return rows
 
 
+def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
+    """Refuse to replay by other settings than those that the ids stand for.
+
+    Raises:
+        PipelineError: when the plan was drawn under other settings of ``replay``.
+    """
+    if any(row.episode_id != _identity("episode", row.demo_sha256, replay, row.perturbations) for row in rows):
+        raise PipelineError(
+            "the section replay has changed since the plan",
+            remedy="`dvc repro`, or the stage plan, which plans again; or put the section back",
+        )
+
+
 def demonstrations(rows: Sequence[Row]) -> int:
     """Of the task that has most of them."""
     return max(Counter((row.suite, row.task) for row in rows if row.role == "twin").values())

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from conftest import REPOSITORY, STOVE, limited, tiny_config
+from conftest import REPOSITORY, STOVE, limited, run_stages, tiny_config
 
 from pipeline import __main__ as command_line
+from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.planning import plan
 from pipeline.run.stage import LOCK, OWNER, claimed, locked, owned
 
 
@@ -85,6 +87,18 @@ def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
     monkeypatch.chdir(other)
     with pytest.raises(PipelineError, match=f"the folder belongs to {clone / file}, and {other / file} has the same"):
         claimed(file)
+
+
+@pytest.mark.parametrize("stage", ["replay", "render"])
+def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> None:
+    """Else their replays would be stored under the ids of the settings before, and stay when these are put back."""
+    config = Config.model_validate(yaml.safe_load(Path("configs/tiny.yaml").read_text()))
+    rows = plan.twins(config.demos.index().entries, 0, config.replay)
+    plan.write(rows, clone / "data" / "tiny" / "plan.parquet")
+    edited = config.model_dump(mode="json") | {"replay": {"mode": "open_loop", "settle_steps": 10}}
+    with pytest.raises(AssertionError, match="the section replay has changed since the plan"):
+        run_stages(clone, edited, [stage])
+    plan.refuse_other_settings(rows, config.replay)
 
 
 def test_reading_a_run_writes_nothing(clone: Path) -> None:
