@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,7 +16,7 @@ from pipeline.axes.language import load_bank
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
 from pipeline.files import StrictLoader
-from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
+from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.types import RenderedExtra
 
@@ -54,6 +54,22 @@ class DemosConfig(Frozen):
     def index(self) -> DemoIndex:
         """The demonstrations that a run starts from, and those that cannot be used."""
         return self.open().index(select_tasks(self.tasks), self.per_task)
+
+    def refuse_tasks_without(self, entries: Sequence[DemoEntry]) -> None:
+        """Refuse a chosen task without any of ``entries``.
+
+        Other tasks would be planned in its place, and what was finished of it deleted.
+
+        Raises:
+            PipelineError: naming the tasks.
+        """
+        usable = {entry.task for entry in entries}
+        if without := [f"{task.suite}/{task.name}" for task in select_tasks(self.tasks) if task not in usable]:
+            raise PipelineError(
+                f"{len(without)} of the chosen tasks have no usable demonstration: {', '.join(without)}",
+                where=self.root,
+                remedy="get their demonstrations, or leave them out of demos.tasks",
+            )
 
 
 class PlanConfig(Frozen):

@@ -69,10 +69,8 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     perturbs one axis at a time, but so must each part of a combination keep clear.
 
     Raises:
-        PipelineError: when there is nothing to plan from, at all or for an axis.
+        PipelineError: when there is nothing to plan from for an axis.
     """
-    if not demos:
-        raise PipelineError("no demonstrations to plan from", remedy="widen demos.tasks or check demos.root")
     by_task: dict[str, list[DemoEntry]] = defaultdict(list)
     for demo in demos:
         by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)

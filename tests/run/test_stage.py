@@ -10,13 +10,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
-from conftest import REPOSITORY, STOVE, limited, run_stages, tiny_config
+from conftest import BOWL, REPOSITORY, STOVE, limited, link_testset, run_stages, starter_demo, tiny_config
 
 from pipeline import __main__ as command_line
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.libero import hdf5
 from pipeline.planning import plan
 from pipeline.run.stage import LOCK, OWNER, claimed, locked, owned
 
@@ -99,6 +101,24 @@ def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> 
     with pytest.raises(AssertionError, match="the section replay has changed since the plan"):
         run_stages(clone, edited, [stage])
     plan.refuse_other_settings(rows, config.replay)
+
+
+def test_a_plan_without_a_task_that_was_asked_for_is_refused(clone: Path) -> None:
+    """Else the other task would get its episodes, and the stage replay would delete what was finished of it."""
+    link_testset(clone)
+    for task in (STOVE, BOWL):
+        demo = starter_demo(task)
+        states = np.tile(demo.init_state, (len(demo.actions), 1))
+        recording = hdf5.Recording(demo.actions, states, states[:, :9], "<mujoco/>", {})
+        hdf5.write(clone / "demos" / task.suite / f"{task.name}_demo.hdf5", task, [recording])
+    demos = {"root": str(clone / "demos"), "tasks": [f"{task.suite}/{task.name}" for task in (STOVE, BOWL)]}
+    config = tiny_config(clone) | {"demos": demos, "plan": {"episodes": {"noise": 4}}}
+    run_stages(clone, config, ["plan"])
+    plan_of_both = (clone / "data" / "tiny" / "plan.parquet").read_bytes()
+    (clone / "demos" / BOWL.suite / f"{BOWL.name}_demo.hdf5").unlink()
+    with pytest.raises(AssertionError, match=rf"1 of the chosen tasks have no usable demonstration: .*{BOWL.name}"):
+        run_stages(clone, config, ["plan"])
+    assert (clone / "data" / "tiny" / "plan.parquet").read_bytes() == plan_of_both
 
 
 def test_reading_a_run_writes_nothing(clone: Path) -> None:
