@@ -79,6 +79,32 @@ def test_a_renamed_file_gets_the_folder_when_the_mark_is_deleted(clone: Path) ->
     assert json.loads(mark.read_text())["configuration"] == "configs/renamed.yaml"
 
 
+def test_a_moved_folder_stays_its_configurations_through_a_link(
+    clone: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    file, disk, data = Path("configs/tiny.yaml"), tmp_path_factory.mktemp("disk") / "tiny", Path("data/tiny")
+    claimed(file)
+    shutil.move(data, disk)
+    data.symlink_to(disk)
+    claimed(file)
+    (disk / OWNER).unlink()
+    claimed(file)
+    data.unlink()
+    shutil.move(disk, data)
+    claimed(file)
+
+
+def test_a_folder_that_was_moved_to_where_the_configuration_says_names_the_mark(
+    clone: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    file, disk = Path("configs/tiny.yaml"), tmp_path_factory.mktemp("disk")
+    claimed(file)
+    shutil.move("data/tiny", disk / "tiny")
+    file.write_text(file.read_text() + f"folder: {disk}\n")
+    with pytest.raises(PipelineError, match=f"if you moved the folder, (?s:.*)delete {disk / 'tiny' / OWNER}"):
+        claimed(file)
+
+
 def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
     clone: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
