@@ -13,11 +13,13 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, fie
 from pipeline.axes import AXES, Axes, Axis, axes_of, components_of
 from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank
+from pipeline.catalogue import object_sources, texture_sources
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
 from pipeline.files import StrictLoader
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.testset import benchmark
 from pipeline.types import RenderedExtra
 
 
@@ -288,6 +290,12 @@ class Config(Frozen):
         for field, names in known.items():
             if unknown := [name for name in getattr(self.export.where, field, None) or () if name not in names]:
                 raise ValueError(f"export.where.{field}: the run has no {unknown[0]!r}, expected of {sorted(names)}")
+        return self
+
+    @model_validator(mode="after")
+    def _not_what_runs_share(self) -> Config:
+        if self.data in (texture_sources.FOLDER, object_sources.FOLDER, benchmark.FOLDER):
+            raise ValueError(f"name: all runs share the folder {self.data}; take another name")
         return self
 
     @property

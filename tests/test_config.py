@@ -85,6 +85,7 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
         ({"level": [6]}, ("export", "where"), "export.where.level.0: Input should be less than or equal to 5"),
         ({"level": []}, ("export", "where"), "export.where.level"),
         ({"suite": ["libero_90"]}, ("export", "where"), "export.where.suite: the run has no 'libero_90'"),
+        ("objects", ("name",), "all runs share the folder data/objects"),
         ("carrier pigeon", ("compute",), "compute"),
         ("my_set", ("export", "rlds", "name"), "export.rlds.name"),
         ("libero_aloha", ("export", "rlds", "name"), "a name with libero and without aloha in it"),
