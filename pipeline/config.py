@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -13,10 +13,13 @@ from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, fie
 from pipeline.axes import AXES, Axes, Axis, axes_of, components_of
 from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank
+from pipeline.catalogue import object_sources, texture_sources
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
-from pipeline.libero.demonstrations import DemoIndex, DemoSource, HDF5Source, StarterSource
+from pipeline.files import StrictLoader
+from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.testset import benchmark
 from pipeline.types import RenderedExtra
 
 
@@ -53,6 +56,22 @@ class DemosConfig(Frozen):
     def index(self) -> DemoIndex:
         """The demonstrations that a run starts from, and those that cannot be used."""
         return self.open().index(select_tasks(self.tasks), self.per_task)
+
+    def refuse_tasks_without(self, entries: Sequence[DemoEntry]) -> None:
+        """Refuse a chosen task without any of ``entries``.
+
+        Other tasks would be planned in its place, and what was finished of it deleted.
+
+        Raises:
+            PipelineError: naming the tasks.
+        """
+        usable = {entry.task for entry in entries}
+        if without := [f"{task.suite}/{task.name}" for task in select_tasks(self.tasks) if task not in usable]:
+            raise PipelineError(
+                f"{len(without)} of the chosen tasks have no usable demonstration: {', '.join(without)}",
+                where=self.root,
+                remedy="get their demonstrations, or leave them out of demos.tasks",
+            )
 
 
 class PlanConfig(Frozen):
@@ -273,6 +292,12 @@ class Config(Frozen):
                 raise ValueError(f"export.where.{field}: the run has no {unknown[0]!r}, expected of {sorted(names)}")
         return self
 
+    @model_validator(mode="after")
+    def _not_what_runs_share(self) -> Config:
+        if self.data in (texture_sources.FOLDER, object_sources.FOLDER, benchmark.FOLDER):
+            raise ValueError(f"name: all runs share the folder {self.data}; take another name")
+        return self
+
     @property
     def data(self) -> Path:
         """The folder that everything this run makes lies in."""
@@ -286,7 +311,7 @@ def load(path: Path) -> Config:
         PipelineError: naming the file, every field that is wrong, and what would have worked.
     """
     try:
-        return Config.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+        return Config.model_validate(yaml.load(path.read_text(encoding="utf-8"), StrictLoader))
     except (OSError, UnicodeDecodeError) as error:
         there = sorted(map(str, Path("configs").glob("*")))
         raise PipelineError(f"cannot read the configuration ({error})", where=path, remedy=f"one of {there}") from error

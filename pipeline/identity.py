@@ -141,7 +141,7 @@ def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
     if not found:
         return
     told = "; ".join(f"{number} {what}" for what, number in found.items())
-    if os.environ.get(REMAKE, "0") != "0":
+    if os.environ.get(REMAKE) == "1":
         print(f"made anew: {told}")
         return
     raise PipelineError(

@@ -12,6 +12,7 @@ def run(config: Config) -> None:
     index = config.demos.index()
     for problem in index.problems:
         print(f"left out: {problem.error}", file=sys.stderr)
+    config.demos.refuse_tasks_without(index.entries)
     rows = plan.make(index.entries, config.plan, config.replay, benchmark.load())
     config.export.refuse_too_few(plan.demonstrations(rows))
     for axis, number in plan.shortage(rows, config.plan).items():

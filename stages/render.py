@@ -20,6 +20,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 def run(config: Config) -> None:
     print(gl.choose())
     rows = plan.read(config.data / "plan.parquet")
+    plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, config, gl.choose().device), config.data)
     # The configuration may be another one since the plan was made.
     config.export.refuse_too_few(plan.demonstrations(rows))

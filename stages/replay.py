@@ -13,6 +13,7 @@ from pipeline.stores.trajectory_store import TrajectoryStore
 
 def run(config: Config) -> None:
     rows = plan.read(config.data / "plan.parquet")
+    plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, config), config.data)
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:

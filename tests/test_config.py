@@ -85,6 +85,7 @@ def test_schema_file_is_that_of_the_code(name: str) -> None:
         ({"level": [6]}, ("export", "where"), "export.where.level.0: Input should be less than or equal to 5"),
         ({"level": []}, ("export", "where"), "export.where.level"),
         ({"suite": ["libero_90"]}, ("export", "where"), "export.where.suite: the run has no 'libero_90'"),
+        ("objects", ("name",), "all runs share the folder data/objects"),
         ("carrier pigeon", ("compute",), "compute"),
         ("my_set", ("export", "rlds", "name"), "export.rlds.name"),
         ("libero_aloha", ("export", "rlds", "name"), "a name with libero and without aloha in it"),
@@ -113,6 +114,15 @@ def test_missing_and_broken_files(tmp_path: Path) -> None:
     (tmp_path / "latin.yaml").write_bytes("name: übung\n".encode("latin-1"))
     with pytest.raises(PipelineError, match="cannot read the configuration"):
         load(tmp_path / "latin.yaml")
+
+
+@pytest.mark.parametrize(
+    "text", ["name: dup\nplan: {seed: 5}\nplan: {episodes: {light: 3}}", "plan: {episodes: {camera: 2, camera: 1}}"]
+)
+def test_a_key_that_is_given_twice_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "dup.yaml").write_text(text)
+    with pytest.raises(PipelineError, match=r"dup\.yaml.*not valid YAML: the key '(plan|camera)' is given twice"):
+        load(tmp_path / "dup.yaml")
 
 
 def test_aliases_that_unfold_without_end_are_refused_at_once(tmp_path: Path) -> None:

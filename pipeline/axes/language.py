@@ -27,6 +27,7 @@ from pipeline import seeding
 from pipeline.axes.base import Axis, Level, TextPerturbation
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
+from pipeline.files import FastStrictLoader
 from pipeline.jit import compiled
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Task
@@ -156,7 +157,7 @@ def read_bank(file: Path) -> Bank:
         PipelineError: when the file does not have the bank's form.
     """
     try:
-        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), yaml.CSafeLoader) or {})
+        return TypeAdapter(Bank).validate_python(yaml.load(file.read_text(encoding="ascii"), FastStrictLoader) or {})
     except (OSError, yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
         raise PipelineError(
             f"not a bank of rewrites ({error})",
@@ -193,8 +194,13 @@ def _dealt(
     task: Task, classes: tuple[Component, ...], levels: tuple[Level, ...], bank: Path | None
 ) -> tuple[LanguagePerturbation, ...]:
     banks = (load_bank(), load_bank(bank)) if bank else (load_bank(),)
-    of_task = [one.get(task.suite, {}).get(task.name, {}) for one in banks]
-    stored = {component: tuple(text for one in of_task for text in one.get(component, ())) for component in CLASSES}
+    # Of wordings that only case or punctuation tells apart, the first counts, whatever the classes.
+    first: dict[str, tuple[Component, str]] = {}
+    for bank_of_task in (one.get(task.suite, {}).get(task.name, {}) for one in banks):
+        for component, texts in bank_of_task.items():
+            for text in texts:
+                first.setdefault(normalise(text), (component, text))
+    stored = {name: tuple(text for component, text in first.values() if component == name) for name in CLASSES}
     turn = seeding.rng("language", task.suite, task.name).permutation(list(dict.fromkeys(classes)))
     columns = [_shuffled(task, component, stored[component], levels) for component in turn.tolist()]
     dealt = tuple(card for row in zip_longest(*columns) for card in row if card is not None)

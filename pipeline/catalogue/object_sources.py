@@ -121,7 +121,11 @@ def _sweethome3d() -> Iterator[ObjectModel]:
 
 
 def _own(source: Folder) -> Iterator[ObjectModel]:
-    paths = sorted(path for path in source.folder.glob("*/*") if path.suffix in (".obj", ".xml"))
+    paths = sorted(
+        path
+        for path in source.folder.glob("*/*")
+        if path.suffix.lower() in (".obj", ".xml") and not path.name.startswith(".")
+    )
     if not paths:
         raise PipelineError(
             "there are no models here",
@@ -139,8 +143,9 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
                 remedy="rename the folder",
             )
         # A model's materials and textures lie beside it.
-        beside = [file for file in sorted(path.parent.rglob("*")) if file.is_file()]
-        content = [(file.relative_to(path.parent).as_posix(), sha256(file.read_bytes()).hexdigest()) for file in beside]
+        beside = [file.relative_to(path.parent) for file in sorted(path.parent.rglob("*")) if file.is_file()]
+        shown = [file for file in beside if not any(part.startswith(".") for part in file.parts)]
+        content = [(file.as_posix(), sha256((path.parent / file).read_bytes()).hexdigest()) for file in shown]
         made_from = digest("object", RECIPE, path.name, content)
         # The name holds a hash of what it was made from, so that an earlier plan still finds its own objects.
         name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"
@@ -148,7 +153,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         about["attribution"] = f"{category}/{path.name}"
         if _about(name) != about:
             with _locked(), _made(name, about) as folder:
-                if path.suffix == ".obj":
+                if path.suffix.lower() == ".obj":
                     convert(path, folder)
                     _check_size(folder / "model.xml", path)
                 else:
@@ -191,7 +196,8 @@ def _copy(mjcf: Path, out: Path) -> None:
 
 @contextmanager
 def _made(name: str, about: dict[str, str]) -> Iterator[Path]:
-    """The folder of a converted model, to be filled; it is complete or absent."""
+    """The folder of a converted model, to be filled; it is complete or absent. Only while ``_locked``."""
+    remove_leftovers((FOLDER / name).parent)
     with replaced(FOLDER / name) as folder:
         folder.mkdir()
         yield folder

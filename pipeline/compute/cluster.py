@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, requires, version
+from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
@@ -20,7 +21,7 @@ from packaging.requirements import Requirement
 
 from pipeline.errors import PipelineError
 from pipeline.files import schema_file
-from pipeline.identity import DISTRIBUTION
+from pipeline.identity import DISTRIBUTION, PACKAGES
 from pipeline.machine_code import SETTINGS, in_shell, machine_code
 from pipeline.seeding import digest
 
@@ -95,7 +96,8 @@ def setup() -> dict[str, str]:
     # A worker of Dask has NumPy before it hears of this project, so it has what its environment asked for.
     versions = {"Python": platform.python_version(), "machine code": machine_code()}
     try:
-        for name in (DISTRIBUTION, *(Requirement(line).name for line in requires(DISTRIBUTION) or [])):
+        required = [Requirement(line).name for line in requires(DISTRIBUTION) or []]
+        for name in (DISTRIBUTION, *required, *chain.from_iterable(PACKAGES.values())):
             versions[name] = version(name)
     except PackageNotFoundError as error:
         versions[str(error.name)] = "not installed"

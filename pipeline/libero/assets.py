@@ -12,6 +12,9 @@ from pathlib import Path
 
 from pipeline.errors import PipelineError
 
+REINSTALL = "rm -rf .venv && bash setup.sh"
+"""What brings back all packages as they are pinned; to install one again by pip may change the others."""
+
 # Elements that make MuJoCo open or run something by a name of the document's choosing.
 _REFUSED = {"include", "model", "attach", "plugin", "extension"}
 # Attributes that make MuJoCo look in another folder than the one that a file attribute names.
@@ -28,7 +31,7 @@ def package_folder(package: str) -> Path:
     """
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:
-        raise PipelineError(f"the package {package} is not installed", remedy=f"pip install {package}")
+        raise PipelineError(f"the package {package} is not installed", remedy=REINSTALL)
     return Path(spec.submodule_search_locations[0]).resolve()
 
 

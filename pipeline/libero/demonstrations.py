@@ -17,7 +17,7 @@ import yaml
 
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
-from pipeline.libero.assets import package_folder, relocate
+from pipeline.libero.assets import REINSTALL, package_folder, relocate
 from pipeline.libero.tasks import SUITES, find_task, suites, tasks
 from pipeline.types import Demo, Floats, Task
 
@@ -122,7 +122,7 @@ class StarterSource:
             raise PipelineError(
                 f"no starter demonstration of {task.suite}/{task.name} ({error})",
                 where=folder,
-                remedy="pip install --force-reinstall robouse==0.2.0",
+                remedy=REINSTALL,
             ) from error
         return _Recorded(task, key, source, HUMAN, actions, init_state[None], None).checked(str(folder))
 

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 import httpx
-from huggingface_hub import snapshot_download
+from huggingface_hub import HfApi, snapshot_download
 
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import tasks
@@ -34,6 +34,8 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         "or use the starter set, demos.source: starter, which needs no hub"
     )
     try:
+        # Without a connection the download below is content with any folder that is not empty.
+        told = HfApi(endpoint, token=False).dataset_info(REPOSITORY, revision=REVISION, files_metadata=True)
         snapshot_download(
             REPOSITORY,
             repo_type="dataset",
@@ -50,11 +52,12 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         raise PipelineError(
             f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
         ) from error
-    # Without a connection the hub's library is content with any folder that is not empty.
-    missing = [name for name in wanted if not (out / name).is_file()]
+    size_bytes = {file.rfilename: file.size for file in told.siblings or ()}
+    there = {name: (out / name).stat().st_size for name in wanted if (out / name).is_file()}
+    missing = [name for name in wanted if name not in there or there[name] != size_bytes.get(name)]
     if missing:
         raise PipelineError(
-            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} could not be had, such as {missing[0]}",
+            f"{len(missing)} of {len(wanted)} files of {REPOSITORY} could not be had whole, such as {missing[0]}",
             where=out,
             remedy=remedy,
         )

@@ -69,10 +69,8 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     perturbs one axis at a time, but so must each part of a combination keep clear.
 
     Raises:
-        PipelineError: when there is nothing to plan from, at all or for an axis.
+        PipelineError: when there is nothing to plan from for an axis.
     """
-    if not demos:
-        raise PipelineError("no demonstrations to plan from", remedy="widen demos.tasks or check demos.root")
     by_task: dict[str, list[DemoEntry]] = defaultdict(list)
     for demo in demos:
         by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
@@ -116,6 +114,19 @@ def resets(demos: Sequence[DemoEntry], wanted: int, reserve: float, seed: int, r
         name = digest(RESET, row.trajectory_id, row.reset_seed)[:16]
         rows.append(replace(row, episode_id=name, trajectory_id=name))
     return rows
+
+
+def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
+    """Refuse to replay by other settings than those that the ids stand for.
+
+    Raises:
+        PipelineError: when the plan was drawn under other settings of ``replay``.
+    """
+    if any(row.episode_id != _identity("episode", row.demo_sha256, replay, row.perturbations) for row in rows):
+        raise PipelineError(
+            "the section replay has changed since the plan",
+            remedy="`dvc repro`, or the stage plan, which plans again; or put the section back",
+        )
 
 
 def demonstrations(rows: Sequence[Row]) -> int:

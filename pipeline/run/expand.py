@@ -14,6 +14,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
+import h5py
 import mujoco
 import numpy as np
 
@@ -23,6 +24,8 @@ from pipeline.axes.robot import RobotAxis
 from pipeline.catalogue.scene_files import portable
 from pipeline.compute.pool import Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
+from pipeline.errors import PipelineError
+from pipeline.files import remove
 from pipeline.identity import DISTRIBUTION, refuse_unasked
 from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
@@ -68,15 +71,20 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     """Make ``per_task`` demonstrations of each task and write them to ``<out>/<suite>/<task>_demo.hdf5``.
 
     A candidate is kept when it reaches the goal, moves about as smoothly as the human and starts unlike those
-    before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was.
+    before it. Replays lie in ``<out>/.replays``, so that a run that was stopped goes on where it was. The files of an
+    earlier expansion are replaced, or deleted where a task gets no demonstration.
 
     Args:
         demos: what the candidates are made from.
         rows: what ``candidates`` or ``resets`` drew for as many demonstrations.
 
     Raises:
-        PipelineError: when a demonstration cannot be read, or finished replays would be made anew unasked.
+        PipelineError: when a demonstration cannot be read, finished replays would be made anew unasked, or a file of
+            other demonstrations is there.
     """
+    file_of = {entry.task: out / entry.task.suite / f"{entry.task.name}_demo.hdf5" for entry in demos.index().entries}
+    for file in file_of.values():
+        _refuse_other_demonstrations(file)
     store = TrajectoryStore(out / ".replays")
     refuse_unasked(store.outdated({row.trajectory_id for row in rows}), store.root)
     faults: dict[str, str] = {}
@@ -90,20 +98,36 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     unwanted = {"kept", plan.NOT_NEEDED}
     reasons = [outcome[row.episode_id].reason for row in rows if row.role == "perturbed"]
     result = Expansion(dropped=Counter(reason for reason in reasons if reason not in unwanted))
-    tasks = {f"{entry.task.suite}/{entry.task.name}": entry.task for entry in demos.index().entries}
     by_task: dict[str, list[plan.Row]] = defaultdict(list)
     for row in kept:
         by_task[f"{row.suite}/{row.task}"].append(row)
-    for name, task in tasks.items():
-        made = by_task[name]
+    for task, file in file_of.items():
+        made = by_task[name := f"{task.suite}/{task.name}"]
         if len(made) < per_task:
             result.short[name] = per_task - len(made)
         if made:
-            file = out / task.suite / f"{task.name}_demo.hdf5"
             hdf5.write(file, task, (_recording(store.load(row.trajectory_id), row) for row in made))
             result.files.append(file)
             result.written += len(made)
+        else:
+            remove(file)
     return result
+
+
+def _refuse_other_demonstrations(file: Path) -> None:
+    if not file.exists():
+        return
+    with hdf5.opened(file) as opened:
+        data = hdf5.member(opened, "data", h5py.Group, str(file))
+        keys = hdf5.names(data, str(file))
+        groups = [hdf5.member(data, key, h5py.Group, f"{file} data/{key}") for key in keys]
+        if not all(hdf5.EXPANDED_FROM in group.attrs for group in groups):
+            raise PipelineError(
+                "holds demonstrations that no expansion made, and would be replaced",
+                where=file,
+                expected="no file, or one of an earlier expansion",
+                remedy="expand into another folder",
+            )
 
 
 def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pipeline.compute.pool import Expendable, Workers
 from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
+from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row, pending
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
@@ -37,6 +38,9 @@ class Replays:
 
         Returns:
             Trajectory id to verdict, for every trajectory that was needed.
+
+        Raises:
+            PipelineError: when workers leave work undone.
         """
         store = TrajectoryStore(self.folder)
         stored = verdicts_of(store.refresh(), self.limits)
@@ -48,6 +52,7 @@ class Replays:
                 if missing:
                     self._replay(missing, rows)
                     stored = verdicts_of(store.refresh(), self.limits)
+                    _refuse_undone([store.path(one) for one in missing if one not in stored])
                 verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed}
         return verdicts
 
@@ -61,3 +66,13 @@ class Replays:
         in_turn = sorted(map(row_of.__getitem__, missing), key=lambda row: row.demo_id)
         jobs = [ReplayJob(row, twin_of[row.demo_id], self.demos, self.config, self.folder) for row in in_turn]
         self.workers(Expendable(ReplayJob.__call__, ReplayJob.limit_s, ReplayJob.lost), jobs, "replay")
+
+
+def _refuse_undone(files: Sequence[Path]) -> None:
+    if files:
+        raise PipelineError(
+            f"{len(files)} trajectories were replayed and are still not there, such as this one",
+            where=files[0],
+            expected="files written there by workers",
+            remedy="check that all workers see this folder and have the same versions",
+        )

@@ -5,6 +5,8 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 
 import yaml
@@ -17,6 +19,9 @@ from pipeline.formats.registry import formats_of
 from pipeline.run.stage import PARAMS
 
 DVC = (sys.executable, "-m", "dvc")
+USERS = Path(".dvc/tmp/rwlock")
+"""Where DVC notes which of its processes work here."""
+
 HEADER = """\
 # The run that `dvc repro` makes: the name of a file in configs/, and its field `folder`. `run CONFIG` writes both.
 """
@@ -26,10 +31,11 @@ def run(file: Path) -> int:
     """Run all stages that have something to do; the exit status.
 
     Raises:
-        PipelineError: when DVC would not find the configuration.
+        PipelineError: when DVC would not find the configuration, or works here already.
     """
     config = load(file)
     _refuse_elsewhere(file, config)
+    _refuse_beside_another()
     choose(config)
     _mend()
     status = _repro()
@@ -77,6 +83,23 @@ def _refuse_elsewhere(file: Path, config: Config) -> None:
         )
 
 
+def _refuse_beside_another() -> None:
+    """Where a run was killed, but not its DVC, that works on; it would refuse too, once params.yaml was written."""
+    try:
+        noted = json.loads(USERS.read_text())
+    except (OSError, ValueError):
+        return
+    for user in (*noted.get("write", {}).values(), *chain.from_iterable(noted.get("read", {}).values())):
+        command = Path(f"/proc/{user['pid']}/cmdline")
+        with suppress(OSError):  # It has ended.
+            if b"dvc" in command.read_bytes():
+                raise PipelineError(
+                    f"a run goes on here as process {user['pid']}",
+                    where=Path.cwd(),
+                    remedy=f"wait for it, or stop it: kill -- -{user['pid']}",
+                )
+
+
 def _mend() -> None:
     """DVC writes two lock files in place, and refuses to start where it was killed meanwhile.
 
@@ -84,12 +107,11 @@ def _mend() -> None:
     """
     if subprocess.run([*DVC, "stage", "list"], capture_output=True, check=False).returncode:
         remove(Path("dvc.lock"))
-    running = Path(".dvc/tmp/rwlock")
     try:
-        if running.exists():
-            json.loads(running.read_text())
+        if USERS.exists():
+            json.loads(USERS.read_text())
     except ValueError:
-        remove(running)
+        remove(USERS)
 
 
 def _repro() -> int:

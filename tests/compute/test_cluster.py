@@ -19,13 +19,15 @@ from PIL import Image
 
 from pipeline import gl
 from pipeline.axes import Axes
-from pipeline.compute.cluster import Workplace
+from pipeline.compute.cluster import Workplace, setup
 from pipeline.compute.pool import runner
 from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
+from pipeline.identity import made_with
 from pipeline.machine_code import SETTINGS
 from pipeline.planning import plan
 from pipeline.run.render_job import RenderJob
+from pipeline.run.replay_stage import Replays
 from pipeline.testset.benchmark import TestSet
 
 Start = Callable[..., str]
@@ -176,3 +178,15 @@ def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path)
         work(RenderJob.__call__, [job], "render")
     assert device in str(caught.value)
     assert not (tmp_path / "frames").exists()
+
+
+def test_workers_have_all_that_files_are_made_with() -> None:
+    assert {name for name in made_with("encoding") if not name.startswith("recipe of")} <= setup().keys()
+
+
+def test_replays_that_workers_leave_undone_are_named(tmp_path: Path) -> None:
+    demos = DemosConfig(tasks=(f"{STOVE.suite}/{STOVE.name}",))
+    rows = plan.make(demos.index().entries, CLEAN, ReplayConfig(), NONE)
+    with pytest.raises(PipelineError, match="1 trajectories were replayed and are still not there") as caught:
+        Replays(demos, ReplayConfig(), tmp_path, lambda work, jobs, what: []).of(rows)
+    assert f"{rows[0].trajectory_id}.h5" in str(caught.value)

@@ -144,9 +144,14 @@ def test_starter_set_refuses_unknown_ids(demo_id: str, what: str) -> None:
         StarterSource().load(demo_id)
 
 
-def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_starter_package_names_the_remedy(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Not one by pip, which may change other packages that are pinned."""
+    with monkeypatch.context() as context:
+        context.setattr("pipeline.libero.demonstrations.package_folder", lambda _: tmp_path)
+        with pytest.raises(PipelineError, match=r"no starter demonstration of (?s:.*)try: rm -rf \.venv && bash setup"):
+            StarterSource().index([TASK])
     monkeypatch.setattr("pipeline.libero.assets.find_spec", lambda _: None)
-    with pytest.raises(PipelineError, match="pip install robouse"):
+    with pytest.raises(PipelineError, match=r"robouse is not installed\n  try: rm -rf \.venv && bash setup"):
         StarterSource().index([TASK])
 
 

@@ -51,7 +51,7 @@ class Hub:
                     self._send(json.dumps(tree).encode(), body)
                     return
                 if self.path.startswith(f"/api/datasets/{REPOSITORY}"):
-                    siblings = [{"rfilename": name} for name in hub.files]
+                    siblings = [{"rfilename": name, "size": len(data)} for name, data in hub.files.items()]
                     self._send(json.dumps({"id": REPOSITORY, "sha": commit, "siblings": siblings}).encode(), body)
                     return
                 # The later commit has none of the files.
@@ -151,6 +151,8 @@ def test_a_file_that_the_hub_lacks_is_named(hub: Hub, tmp_path: Path) -> None:
 def test_an_unreachable_hub_names_the_starter_set(tmp_path: Path, folder_in_use: bool) -> None:
     if folder_in_use:
         (tmp_path / "libero_goal").mkdir()
+        for task in tasks("libero_goal"):
+            (tmp_path / "libero_goal" / f"{task.name}_demo.hdf5").write_bytes(b"another's")
     with pytest.raises(PipelineError, match="starter set") as caught:
         fetch(tmp_path, ["libero_goal"], "http://127.0.0.1:9")
     assert REPOSITORY in str(caught.value)

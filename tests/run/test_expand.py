@@ -17,6 +17,8 @@ from machine_paths import told
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop, runner
 from pipeline.config import ComputeConfig, DemosConfig, ReplayConfig
+from pipeline.errors import PipelineError
+from pipeline.libero import hdf5
 from pipeline.libero.assets import libero_assets
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.control_env import control_env
@@ -156,3 +158,20 @@ def test_a_reserve_takes_the_place_of_one_that_starts_like_another(
     shutil.copytree(at_resets.parents[1] / ".replays", tmp_path / ".replays")
     made = expand(tmp_path, TASKS, resets(TASKS, 2, 1), 2, loop)
     assert (made.written, made.dropped) == (1, {"duplicate": 2})
+
+
+@pytest.mark.parametrize("attrs", [{}, {hdf5.EXPANDED_FROM: "libero_goal/turn_on_the_stove/demo_0"}])
+def test_only_what_an_expansion_made_is_replaced(tmp_path: Path, attrs: dict[str, str]) -> None:
+    """Here by nothing, as if no candidate reached the goal."""
+    file = tmp_path / STOVE.suite / f"{STOVE.name}_demo.hdf5"
+    demo = starter_demo(STOVE)
+    states = np.tile(demo.init_state, (len(demo.actions), 1))
+    hdf5.write(file, STOVE, [hdf5.Recording(demo.actions, states, states[:, :9], "<mujoco/>", {}, attrs)])
+    before = file.read_bytes()
+    if attrs:
+        assert expand(tmp_path, TASKS, [], 1, loop).short == {f"{STOVE.suite}/{STOVE.name}": 1}
+        assert not file.exists()
+    else:
+        with pytest.raises(PipelineError, match="that no expansion made"):
+            expand(tmp_path, TASKS, [], 1, loop)
+        assert file.read_bytes() == before

@@ -8,14 +8,21 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
-from conftest import REPOSITORY, STOVE, limited, tiny_config
+from conftest import BOWL, REPOSITORY, STOVE, limited, link_testset, run_stages, starter_demo, tiny_config
 
 from pipeline import __main__ as command_line
+from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.libero import hdf5
+from pipeline.planning import plan
+from pipeline.run import repro
 from pipeline.run.stage import LOCK, OWNER, claimed, locked, owned
 
 
@@ -75,6 +82,32 @@ def test_a_renamed_file_gets_the_folder_when_the_mark_is_deleted(clone: Path) ->
     assert json.loads(mark.read_text())["configuration"] == "configs/renamed.yaml"
 
 
+def test_a_moved_folder_stays_its_configurations_through_a_link(
+    clone: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    file, disk, data = Path("configs/tiny.yaml"), tmp_path_factory.mktemp("disk") / "tiny", Path("data/tiny")
+    claimed(file)
+    shutil.move(data, disk)
+    data.symlink_to(disk)
+    claimed(file)
+    (disk / OWNER).unlink()
+    claimed(file)
+    data.unlink()
+    shutil.move(disk, data)
+    claimed(file)
+
+
+def test_a_folder_that_was_moved_to_where_the_configuration_says_names_the_mark(
+    clone: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    file, disk = Path("configs/tiny.yaml"), tmp_path_factory.mktemp("disk")
+    claimed(file)
+    shutil.move("data/tiny", disk / "tiny")
+    file.write_text(file.read_text() + f"folder: {disk}\n")
+    with pytest.raises(PipelineError, match=f"if you moved the folder, (?s:.*)delete {disk / 'tiny' / OWNER}"):
+        claimed(file)
+
+
 def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
     clone: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,6 +118,36 @@ def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
     monkeypatch.chdir(other)
     with pytest.raises(PipelineError, match=f"the folder belongs to {clone / file}, and {other / file} has the same"):
         claimed(file)
+
+
+@pytest.mark.parametrize("stage", ["replay", "render"])
+def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> None:
+    """Else their replays would be stored under the ids of the settings before, and stay when these are put back."""
+    config = Config.model_validate(yaml.safe_load(Path("configs/tiny.yaml").read_text()))
+    rows = plan.twins(config.demos.index().entries, 0, config.replay)
+    plan.write(rows, clone / "data" / "tiny" / "plan.parquet")
+    edited = config.model_dump(mode="json") | {"replay": {"mode": "open_loop", "settle_steps": 10}}
+    with pytest.raises(AssertionError, match="the section replay has changed since the plan"):
+        run_stages(clone, edited, [stage])
+    plan.refuse_other_settings(rows, config.replay)
+
+
+def test_a_plan_without_a_task_that_was_asked_for_is_refused(clone: Path) -> None:
+    """Else the other task would get its episodes, and the stage replay would delete what was finished of it."""
+    link_testset(clone)
+    for task in (STOVE, BOWL):
+        demo = starter_demo(task)
+        states = np.tile(demo.init_state, (len(demo.actions), 1))
+        recording = hdf5.Recording(demo.actions, states, states[:, :9], "<mujoco/>", {})
+        hdf5.write(clone / "demos" / task.suite / f"{task.name}_demo.hdf5", task, [recording])
+    demos = {"root": str(clone / "demos"), "tasks": [f"{task.suite}/{task.name}" for task in (STOVE, BOWL)]}
+    config = tiny_config(clone) | {"demos": demos, "plan": {"episodes": {"noise": 4}}}
+    run_stages(clone, config, ["plan"])
+    plan_of_both = (clone / "data" / "tiny" / "plan.parquet").read_bytes()
+    (clone / "demos" / BOWL.suite / f"{BOWL.name}_demo.hdf5").unlink()
+    with pytest.raises(AssertionError, match=rf"1 of the chosen tasks have no usable demonstration: .*{BOWL.name}"):
+        run_stages(clone, config, ["plan"])
+    assert (clone / "data" / "tiny" / "plan.parquet").read_bytes() == plan_of_both
 
 
 def test_reading_a_run_writes_nothing(clone: Path) -> None:
@@ -153,3 +216,25 @@ def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
     (data / "frames").symlink_to(clone / "configs")
     with pytest.raises(PipelineError, match="data/tiny/frames: is a symbolic link"):
         claimed(Path("configs/tiny.yaml"))
+
+
+def test_a_run_beside_one_whose_command_alone_was_killed_is_refused(clone: Path) -> None:
+    shutil.copytree(REPOSITORY / ".dvc", ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
+    Path("dvc.yaml").write_text("stages: {replay: {cmd: touch begun; sleep 60, deps: [configs]}}")
+    subprocess.run(["git", "init", "--quiet"], check=True)
+    command = [sys.executable, "-m", "pipeline", "run", "configs/tiny.yaml"]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(REPOSITORY)}) as begun:
+        while not Path("begun").exists():
+            assert begun.poll() is None
+            time.sleep(0.1)
+        begun.kill()
+    other = Path("configs/other.yaml")
+    other.write_text(Path("configs/tiny.yaml").read_text().replace("name: tiny", "name: other"))
+    with pytest.raises(PipelineError, match="a run goes on here as process") as caught:
+        repro.run(other)
+    assert yaml.safe_load(Path("params.yaml").read_text())["run"] == "tiny"
+    kill, dvc = str(caught.value.remedy).split(": ")[1], Path("/proc", caught.value.what.split()[-1])
+    subprocess.run(kill.split(), check=True)
+    with suppress(OSError):  # It has ended.
+        while (dvc / "cmdline").read_bytes():
+            time.sleep(0.1)

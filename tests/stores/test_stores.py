@@ -5,6 +5,7 @@ import json
 import os
 import resource
 import shutil
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -292,6 +293,13 @@ def test_finished_work_is_made_anew_only_where_that_was_allowed(
         again.keep(render_plan(rows, config, replayed, tmp_path / "frames", loop))
         assert not outdated(rows, config, gl.choose().device), "a remake is asked for once"
         assert again._known().keys() == {again.made_by}
+
+
+@pytest.mark.parametrize("value", ["", "0", "no"])
+def test_only_remake_1_allows_it(value: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(identity.REMAKE, value)
+    with pytest.raises(PipelineError, match="finished work would be made anew: 2 files"):
+        identity.refuse_unasked(Counter({"files": 2}), tmp_path)
 
 
 def test_what_the_user_changed_is_made_without_a_question(

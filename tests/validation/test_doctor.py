@@ -182,9 +182,16 @@ def test_demonstrations_must_be_where_the_configuration_says(short_demos: Path, 
     file.touch()
     assert "demos" in failures(tmp_path, demos=demos), "it holds nothing"
     shutil.copy(short_demos / file.relative_to(tmp_path / "demos"), file)
-    told = found(tmp_path, demos=demos)["demos"]
-    assert told.status == "warn"
-    assert f"1 tasks have fewer than 1, such as {names[1]} with 0" in told.detail
+    assert (
+        f"1 of 2 tasks have none under {demos.root}, such as {names[1]}"
+        in failures(tmp_path, demos=demos)["demos"].detail
+    )
+    fewer = demos.model_copy(update={"tasks": names[:1], "per_task": 2})
+    told = found(tmp_path, demos=fewer)["demos"]
+    assert (told.status, told.detail.split("; ")[1]) == (
+        "warn",
+        f"1 tasks have fewer than 2, such as {names[0]} with 1",
+    )
 
 
 def test_starter_demonstrations_have_the_hashes_of_their_package(
