@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import version
 from itertools import count
 from typing import Annotated, Literal
@@ -22,7 +23,7 @@ def validating(share: float, demonstrations: int) -> int:
 
 
 def too_few(share: float, where: str) -> PipelineError:
-    """The error that no task has enough demonstrations for a share above 0."""
+    """The error that no task, of all or of a suite, has enough demonstrations for a share above 0."""
     least = next(number for number in count(max(2, int(0.5 / share))) if validating(share, number))
     return PipelineError(
         f"no task has enough demonstrations for {share:g} of them to go into the split val",
@@ -185,15 +186,18 @@ class ExportConfig(Frozen):
         }
         return self.model_copy(update=formats)
 
-    def refuse_too_few(self, demonstrations: int) -> None:
+    def refuse_too_few(self, demonstrations: Mapping[str, int]) -> None:
         """Refuse a validation split that nothing could be in.
 
+        RLDS has a set for each suite, and OpenVLA-OFT, when it validates, asks each for its ``val``.
+
         Args:
-            demonstrations: of the task that has most of them.
+            demonstrations: suite to the number of those of its task that has most of them.
 
         Raises:
             PipelineError: when a share holds none of them out.
         """
         for name, options in self.formats.items():
-            if options.validation and not validating(options.validation, demonstrations):
+            least = min if name == "rlds" else max
+            if options.validation and not validating(options.validation, least(demonstrations.values())):
                 raise too_few(options.validation, f"export.{name}.validation")

@@ -129,9 +129,12 @@ def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
         )
 
 
-def demonstrations(rows: Sequence[Row]) -> int:
-    """Of the task that has most of them."""
-    return max(Counter((row.suite, row.task) for row in rows if row.role == "twin").values())
+def demonstrations(rows: Sequence[Row]) -> dict[str, int]:
+    """Suite to the number of demonstrations of its task that has most of them."""
+    most: dict[str, int] = {}
+    for (suite, _), number in Counter((row.suite, row.task) for row in rows if row.role == "twin").items():
+        most[suite] = max(number, most.get(suite, 0))
+    return most
 
 
 def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:

@@ -51,6 +51,16 @@ def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
         episodes.by_split(0.1)
 
 
+def test_each_suite_of_rlds_must_have_a_validation_split() -> None:
+    """OpenVLA-OFT asks each set of a mixture for one."""
+    options = ExportConfig(rlds=RldsConfig(name=NAME, validation=0.1), lerobot=None)
+    options.refuse_too_few({"libero_goal": 10, "my_suite": 6})
+    with pytest.raises(PipelineError, match="no task has enough demonstrations"):
+        options.refuse_too_few({"libero_goal": 10, "my_suite": 4})
+    of_one = ExportConfig(rlds=None, lerobot=LeRobotConfig(name=NAME, validation=0.1))
+    of_one.refuse_too_few({"libero_goal": 10, "my_suite": 4})
+
+
 @pytest.mark.parametrize("share", [0.001, 0.01, 0.05, 0.07, 0.1, 0.125, 0.15, 0.2, 0.3, 1 / 3, 0.34, 0.35, 0.5])
 def test_as_many_demonstrations_as_a_refusal_asks_for_are_enough_and_one_fewer_is_not(share: float) -> None:
     def splits(demonstrations: int) -> dict[str, list[str]]:
