@@ -67,7 +67,8 @@ class AxisDistance:
         test_tasks: the benchmark's tasks of this axis.
         comparisons: pairs of an episode and a test task that were compared.
         not_compared: episodes that could be compared with none of the test tasks, such as those in another scene.
-        smallest: the least distance of all; None when there was nothing to compare with, or nothing similar.
+        smallest: the least distance of all, or of the overlaps where there are any; None when there was nothing to
+            compare with, or nothing similar.
         closest: the episode it belongs to.
         clearance: the least distance that is allowed, of this episode's kind where the axis has several.
         measure: what the distance is and its unit; of each kind.
@@ -132,7 +133,7 @@ def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
 def _finding(
     found: Sequence[tuple[Nearest, str, Perturbation]], test_tasks: int, coverage: dict[str, Coverage]
 ) -> AxisDistance:
-    nearest, closest, kind = min(found, key=lambda one: one[0].distance)
+    nearest, closest, kind = min(found, key=lambda one: (one[0].distance >= one[2].clearance, one[0].distance))
     not_compared = sum(not one.compared for one, _, _ in found) if test_tasks else 0
     overlaps = sum(one.distance < kind.clearance for one, _, kind in found)
     alike = math.isfinite(nearest.distance)

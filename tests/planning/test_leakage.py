@@ -318,6 +318,18 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     assert all(math.isfinite(finding["clearance"]) for finding in report.values())
 
 
+def test_an_overlap_is_explained_by_what_overlaps() -> None:
+    """Kinds differ in clearance: one object keeps 5 mm, a scene 10."""
+    task = find_task("libero_goal", "turn_on_the_stove")
+    test = TestSet((TestTask(task.suite, task.name, "name", "pose", "pose", {"moves": "plate_1:0,0"}),))
+    changed = {"axis": "pose", "level": 1}
+    one = {**changed, "component": "target", "moved": "plate_1", "dx_m": 0.0055, "dy_m": 0, "dyaw_deg": 0}
+    scene = {**changed, "component": "scene", "moves": [{"name": "plate_1", "dx_m": 0.008, "dy_m": 0}]}
+    rows = [row(task, from_json(json.dumps([fields])), str(fields["component"])) for fields in (one, scene)]
+    with pytest.raises(PipelineError, match=r"1 of 2 .* \(such as scene, distance 0\.008, clearance 0\.01\)"):
+        leakage.refuse_overlap(leakage.check(rows, test))
+
+
 def test_no_overlap_is_no_error(test: TestSet) -> None:
     leakage.refuse_overlap({})
     tested = test.of("noise")[0]
