@@ -16,6 +16,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
 from episode_results import result
+from scipy.stats import permutation_test
 
 from pipeline.__main__ import main
 from pipeline.config import ComputeConfig, load
@@ -323,7 +324,20 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
 
 def test_holms_correction() -> None:
     """By hand: 0.01 x 4, then 0.02 x 3, then 0.03 x 2, no less than the one before; 0.9 and more stay."""
-    assert comparison.holm([0.03, 0.01, None, 0.02]) == pytest.approx([0.06, 0.04, 1.0, 0.06])
+    assert comparison.holm([0.03, 0.01, 1.0, 0.02]) == pytest.approx([0.06, 0.04, 1.0, 0.06])
+
+
+def test_p_is_exact_where_few_tests_differ() -> None:
+    """Of five tests that all favour one arm, two of the 2^5 signs say as much. SciPy permutes the arms of each test."""
+    clean = [of_policy("clean", seed, 4) for seed in (0, 1)]
+    found = comparison.differences([*clean, *(of_policy("ours", seed, 9) for seed in (0, 1))])
+    assert next(one for one in found if one["line"] == "robot")["p_value"] == 2 / 2**5
+    for first, second in ((1, 8), (9, 3), (4, 4)):
+        ours = [of_policy("ours", 0, first), of_policy("ours", 1, second)]
+        solved = [np.sum([[one.success for one in each.rows[:10]] for each in arm], axis=0) for arm in (clean, ours)]
+        exact = permutation_test(solved, lambda a, b: (a - b).sum(), permutation_type="samples", n_resamples=2**10)
+        pairs = [pair for a, b in zip(clean, ours, strict=True) for pair in zip(a.rows[:10], b.rows[:10], strict=True)]
+        assert comparison.sign_flip(pairs) == pytest.approx(exact.pvalue)
 
 
 def test_the_page_shows_what_the_committed_rows_say(tmp_path: Path) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 from results import PolicyResults, read
 
-from pipeline.evaluation.results import EpisodeResult
-from pipeline.evaluation.statistics import compare, paired, success_rate, wilson
+from pipeline.evaluation.results import EpisodeResult, Trial
+from pipeline.evaluation.statistics import Pair, compare, paired, success_rate, wilson
 from pipeline.files import replaced
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -42,7 +42,8 @@ def lines_of(results: Sequence[PolicyResults]) -> list[str]:
 def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
     """Each two arms on each line: ``value`` (second minus first), ``low``, ``high``, ``p_value``, and ``holm``.
 
-    Episodes are paired by seed, test tasks are drawn anew within the tasks of the scene, each with all seeds. ``holm``
+    Episodes are paired by seed, test tasks are drawn anew within the tasks of the scene, each with all seeds.
+    ``p_value`` is the larger of that and of ``sign_flip``: where few tests differ, resampling says too little. ``holm``
     is the p-value by Holm (1979) over the lines of the two arms.
     """
     arms = list(dict.fromkeys(one.arm for one in results))
@@ -54,21 +55,38 @@ def differences(results: Sequence[PolicyResults]) -> list[dict[str, Any]]:
             seeds = of[first].keys() & of[second].keys()
             pairs = [pair for seed in sorted(seeds) for pair in paired(of[first][seed], of[second][seed])]
             if pairs:
-                lines.append({"first": first, "second": second, "line": line, **compare(pairs)["all"]["difference"]})
+                measured = compare(pairs)["all"]["difference"]
+                p_value = max(measured["p_value"] or 0.0, sign_flip(pairs))
+                lines.append({"first": first, "second": second, "line": line, **measured, "p_value": p_value})
         adjusted = holm([one["p_value"] for one in lines])
         found += [{**one, "holm": p_value} for one, p_value in zip(lines, adjusted, strict=True)]
     return found
 
 
-def holm(p_values: Sequence[float | None]) -> list[float]:
-    """Adjusted p-values: the smallest times their number, the next times one less, never falling (Holm, 1979).
+def sign_flip(pairs: Sequence[Pair]) -> float:
+    """The exact two-sided p-value of two arms' total difference (Fisher, 1935).
 
-    None, of outcomes that never differ, counts as 1.
+    Where the arms are equal, each test's difference, of all its seeds together, has either sign as likely.
     """
-    known = [1.0 if p is None else p for p in p_values]
-    adjusted, most = [1.0] * len(known), 0.0
-    for rank, place in enumerate(sorted(range(len(known)), key=known.__getitem__)):
-        most = max(most, min(1.0, (len(known) - rank) * known[place]))
+    by_trial: Counter[Trial] = Counter()
+    for one, other in pairs:
+        by_trial[one.trial] += other.success - one.success
+    totals = Counter({0: 1})
+    for value in by_trial.values():
+        flipped: Counter[int] = Counter()
+        for total, ways in totals.items():
+            flipped[total + value] += ways
+            flipped[total - value] += ways
+        totals = flipped
+    least = abs(sum(by_trial.values()))
+    return sum(ways for total, ways in totals.items() if abs(total) >= least) / totals.total()
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjusted p-values: the smallest times their number, the next times one less, never falling (Holm, 1979)."""
+    adjusted, most = [1.0] * len(p_values), 0.0
+    for rank, place in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
+        most = max(most, min(1.0, (len(p_values) - rank) * p_values[place]))
         adjusted[place] = most
     return adjusted
 

@@ -14,13 +14,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from enum import IntEnum
-from functools import cache
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field
 
+from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
 from pipeline.types import Frozen as Frozen
@@ -70,7 +69,8 @@ class Perturbation(Frozen):
         measure: what the distance to a test task is.
         unit: of that distance; None where it tells only same from other, not near from far.
         clearance: the least distance to any test task; a draw that comes closer is drawn anew.
-        per_task: whether only what is on the same LIBERO task can be compared.
+        same: what two changes must have in common to be compared, the LIBERO task or the scene that it begins in; None
+            where any two can be.
     """
 
     axis: str
@@ -82,7 +82,7 @@ class Perturbation(Frozen):
     measure: ClassVar[str] = "nothing to compare with: the benchmark has no such test"
     unit: ClassVar[str | None] = None
     clearance: ClassVar[float] = 0.0
-    per_task: ClassVar[bool] = False
+    same: ClassVar[Same | None] = None
 
     def distances(self, test: TestSet, task: Task) -> Floats:
         """The distance to each of the axis's test tasks (N,), in their order, for an episode of ``task``.
@@ -90,12 +90,12 @@ class Perturbation(Frozen):
         NaN where there is nothing to compare, such as the wordings of another task.
         """
         distances = np.full(len(test.of(self.axis)), np.nan)
-        if self.per_task:
-            distances[_on_task(test, task, self.axis)] = self.distances_on_task(test, task)
+        if self.same:
+            distances[test.places(task, self.axis, self.same)] = self.distances_on(test, task)
         return distances
 
-    def distances_on_task(self, test: TestSet, task: Task) -> Sequence[float] | Floats:
-        """Those of ``distances`` to the test tasks that perturb ``task``, where an axis compares ``per_task``."""
+    def distances_on(self, test: TestSet, task: Task) -> Sequence[float] | Floats:
+        """Those of ``distances`` to the test tasks that have the ``same`` in common with ``task``."""
         raise NotImplementedError
 
     def nearest(self, test: TestSet, task: Task) -> Nearest:
@@ -106,7 +106,7 @@ class Perturbation(Frozen):
 
     def apart(self, others: Sequence[Self]) -> Floats:
         """The distance to each of N draws of this class (N,), as ``distances`` measures it; NaN where there is nothing
-        to compare. At least one, on the same LIBERO task where the axis compares ``per_task``.
+        to compare. At least one, all of the ``same`` task or scene.
 
         By default 0 to a draw that is equal, else 1.
         """
@@ -160,12 +160,6 @@ class Axis(Frozen):
     def offered(self) -> dict[str, int]:
         """How many different things of others' there are to draw from, by kind; what is not installed is fetched."""
         return {}
-
-
-@cache
-def _on_task(test: TestSet, task: Task, axis: str) -> NDArray[np.intp]:
-    """Which of an axis's test tasks perturb ``task``: their places in ``test.of(axis)``."""
-    return np.flatnonzero([(one.suite, one.base) == (task.suite, task.name) for one in test.of(axis)])
 
 
 class TextPerturbation(Perturbation):

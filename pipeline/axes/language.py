@@ -29,6 +29,7 @@ from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
 from pipeline.files import FastStrictLoader
 from pipeline.jit import compiled
+from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Task
 
@@ -85,9 +86,9 @@ class LanguagePerturbation(TextPerturbation):
         """The wording that takes the place of ``instruction``."""
         return self.text
 
-    per_task: ClassVar[bool] = True
+    same: ClassVar[Same | None] = "task"
 
-    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
+    def distances_on(self, test: TestSet, task: Task) -> list[float]:
         """To the task's test instructions; a clearance of about one word in five."""
         return _distances(self.text, test, task)
 

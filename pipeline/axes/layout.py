@@ -15,6 +15,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, taken
 from pipeline.errors import PipelineError
+from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
@@ -53,7 +54,7 @@ class LayoutPerturbation(PhysicsPerturbation):
     objects: Annotated[tuple[AddedObject, ...], Field(min_length=1)]
     seed: int
 
-    measure: ClassVar[str] = "infinite where no category is shared with a test task of the same LIBERO task, else 0"
+    measure: ClassVar[str] = "infinite where no category is shared with a test task in the same scene, else 0"
     clearance: ClassVar[float] = 1.0
 
     def apply(self, scene: Scene, demo: Demo, roll_out: RollOut) -> Scene:
@@ -62,14 +63,14 @@ class LayoutPerturbation(PhysicsPerturbation):
 
         return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed, roll_out)
 
-    per_task: ClassVar[bool] = True
+    same: ClassVar[Same | None] = "scene"
 
-    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
-        """By category: infinite where a test task on this LIBERO task adds nothing of the same category.
+    def distances_on(self, test: TestSet, task: Task) -> list[float]:
+        """By category: infinite where a test task in this scene adds nothing of the same category.
 
         The rule is stricter than a distance between positions: every position of a shared category counts as 0 m.
         """
-        return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout")]
+        return [self._apart_from(_plain(other.parameters["category"])) for other in test.on(task, "layout", "scene")]
 
     def apart(self, others: Sequence[LayoutPerturbation]) -> Floats:
         return np.array([self._apart_from(added.category for added in other.objects) for other in others])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Annotated, ClassVar, Literal
 
@@ -19,6 +19,7 @@ from pipeline.axes.base import Axis, Frozen, Level, PhysicsPerturbation, pick, p
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.libero.task_goal import relation_holds
+from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
@@ -90,9 +91,9 @@ class PosePerturbation(PhysicsPerturbation):
 
         return move_one(scene, demo.task, self.moved, (self.dx_m, self.dy_m), self.dyaw_deg)
 
-    per_task: ClassVar[bool] = True
+    same: ClassVar[Same | None] = "scene"
 
-    def distances_on_task(self, test: TestSet, task: Task) -> Floats:
+    def distances_on(self, test: TestSet, task: Task) -> Floats:
         """Compared with the test tasks that move the same object, alone or with others.
 
         These move every other thing as well, each its own way, so even at distance zero the scenes would differ.
@@ -101,8 +102,7 @@ class PosePerturbation(PhysicsPerturbation):
 
     def apart(self, others: Sequence[PosePerturbation]) -> Floats:
         """Compared with the draws that move the same object."""
-        nowhere = (math.nan, math.nan)
-        return self._apart_m([(p.dx_m, p.dy_m) if p.moved == self.moved else nowhere for p in others])
+        return self._apart_m([(p.dx_m, p.dy_m) if p.moved == self.moved else NOWHERE for p in others])
 
     def _apart_m(self, moves_m: ArrayLike) -> Floats:
         """(N,) from moves (N, 2) of the same object."""
@@ -110,11 +110,15 @@ class PosePerturbation(PhysicsPerturbation):
         return distances_m
 
 
+NOWHERE = (math.nan, math.nan)
+"""In the place of a move where a thing stays."""
+
+
 @cache
 def _test_moves_m(test: TestSet, task: Task, moved: str) -> Floats:
-    """(N, 2) how far each of the axis's test tasks of ``task`` moves a thing; NaN where it stays."""
-    nowhere = (math.nan, math.nan)
-    return np.array([displacements(one.parameters).get(moved, nowhere) for one in test.on(task, "pose")]).reshape(-1, 2)
+    """(N, 2) how far each of the axis's test tasks in the scene of ``task`` moves a thing; NaN where it stays."""
+    tests = test.on(task, "pose", "scene")
+    return np.array([displacements(one.parameters).get(moved, NOWHERE) for one in tests]).reshape(-1, 2)
 
 
 Shifts = dict[str, tuple[float, float]]
@@ -158,29 +162,25 @@ class ScenePerturbation(PhysicsPerturbation):
 
         return move(scene, demo.task, self.shifts)
 
-    per_task: ClassVar[bool] = True
+    same: ClassVar[Same | None] = "scene"
 
-    def distances_on_task(self, test: TestSet, task: Task) -> list[float]:
+    def distances_on(self, test: TestSet, task: Task) -> Floats:
         """Compared in all things that both move."""
-        return [self._apart_m(shifts) for shifts in _test_scenes(test, task)]
+        return self._apart_m(lambda name: _test_moves_m(test, task, name))
 
     def apart(self, others: Sequence[ScenePerturbation]) -> Floats:
-        return np.array([self._apart_m(other.shifts) for other in others])
+        shifts = [other.shifts for other in others]
+        return self._apart_m(lambda name: [one.get(name, NOWHERE) for one in shifts])
 
     @property
     def shifts(self) -> Shifts:
         return {one.name: (one.dx_m, one.dy_m) for one in self.moves}
 
-    def _apart_m(self, shifts: Shifts) -> float:
-        own = self.shifts
-        both = own.keys() & shifts.keys()
-        return max((float(np.abs(np.subtract(own[name], shifts[name])).max()) for name in both), default=math.nan)
-
-
-@cache
-def _test_scenes(test: TestSet, task: Task) -> list[Shifts]:
-    """How far each test scene of ``task`` moves each thing."""
-    return [displacements(scene.parameters) for scene in test.on(task, "pose")]
+    def _apart_m(self, moves_m: Callable[[str], ArrayLike]) -> Floats:
+        """(N,) from the moves (N, 2) of each thing by its name."""
+        offsets_m = [np.subtract(moves_m(one.name), (one.dx_m, one.dy_m)) for one in self.moves]
+        distances_m: Floats = np.fmax.reduce([np.abs(offset_m).max(axis=1) for offset_m in offsets_m])
+        return distances_m
 
 
 def displacements(parameters: Mapping[str, object]) -> Shifts:

@@ -22,7 +22,7 @@ from pipeline import gl
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import check_settings
-from pipeline.evaluation.policies import NextLook, Wanted, checked_actions
+from pipeline.evaluation.policies import NextLook, Wanted, checked_actions, refuse_other_actions
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
@@ -45,6 +45,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
             nothing is rendered. 1 renders every step. After a chunk that a server answers with it is always looked.
         send_wrist_image, send_state, quat_no_antipodal: what the observation has, as vla-eval's own LIBERO benchmark
             names it. Its model servers set these.
+        absolute_action: as there; refused.
         env_seed: as there, of LIBERO's reset.
         out, label: folder for the rows of the policy of that name, as ``evaluate`` writes them; none by default.
         assets: folder of LIBERO-Plus's unpacked asset archive, for its light, background and layout tasks.
@@ -68,6 +69,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
         send_wrist_image: bool = False,
         send_state: bool = False,
         quat_no_antipodal: bool = False,
+        absolute_action: bool = False,
         env_seed: int | None = None,
         out: str | None = None,
         label: str = "",
@@ -76,6 +78,7 @@ class PerturbedLibero(StepBenchmark):  # type: ignore[misc]
     ):
         super().__init__()
         del seed
+        refuse_other_actions({"absolute_action": absolute_action}, {}, "model server")
         self._selection = Selection.model_validate(selection or {})
         given = {"seed": self._selection.seed, "look_every": look_every}
         given |= {} if env_seed is None else {"fixture_seed": env_seed}

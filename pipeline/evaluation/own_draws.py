@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections import Counter, defaultdict
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
-from pipeline.libero.tasks import find_task
+from pipeline.libero.tasks import find_task, shared
 from pipeline.physics.replay import roll_out
 from pipeline.planning import plan
 from pipeline.types import Demo, Scene, Task
@@ -112,27 +112,34 @@ class PlannedDraws:
     """
 
     def __init__(self, rows: Iterable[plan.Row]):
-        self.draws: dict[type[Perturbation], list[tuple[Perturbation, plan.Row]]] = defaultdict(list)
+        self._draws: dict[Hashable, list[tuple[Perturbation, str]]] = defaultdict(list)
+        self.counts = Counter[str]()
+        """Axis to the number of its draws."""
         for row in rows:
+            task = find_task(row.suite, row.task)
             for one in from_json(row.perturbations):
-                self.draws[type(one)].append((one, row))
+                self._draws[_comparable(one, task)].append((one, row.episode_id))
+                self.counts[one.axis] += 1
 
     def nearest(self, drawn: Perturbation, task: Task) -> tuple[float, str]:
         """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
         episode, where there is none to compare with."""
-        others = self.draws[type(drawn)]
-        if drawn.per_task:
-            others = [(one, row) for one, row in others if (row.suite, row.task) == (task.suite, task.name)]
+        others = self._draws.get(_comparable(drawn, task), [])
         distances = drawn.apart([other for other, _ in others]) if others else np.array([])
         if not np.isfinite(distances).any():
             return math.inf, ""
         closest = int(np.nanargmin(distances))
-        return float(distances[closest]), others[closest][1].episode_id
+        return float(distances[closest]), others[closest][1]
 
     def overlap(self, drawn: Perturbation, task: Task) -> bool:
         """Whether a draw is a planned one, or closer to one than the axis keeps from the benchmark's test tasks."""
         distance, _ = self.nearest(drawn, task)
         return distance == 0 or distance < drawn.clearance
+
+
+def _comparable(drawn: Perturbation, task: Task) -> Hashable:
+    """Equal for draws that have a distance."""
+    return type(drawn), drawn.same and shared(task, drawn.same)
 
 
 def planned(file: Path) -> PlannedDraws:
@@ -185,7 +192,7 @@ def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: Plan
         compared = math.isfinite(smallest)
         found[axis] = {
             "draws": len(draws),
-            "planned": sum(len(planned_draws.draws[kind]) for kind in AXES[axis].draws),
+            "planned": planned_draws.counts[axis],
             "overlaps": sum(planned_draws.overlap(one, task) for _, one, task in draws),
             "smallest": smallest if compared else None,
             "closest": (name, episode) if compared else None,

@@ -1,7 +1,7 @@
 """What acts: the questions that a policy is asked, and policies behind a model server or in a lerobot checkpoint."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -62,6 +62,38 @@ def checked_actions(answer: Any, policy: str) -> Floats:
     return np.atleast_2d(actions)
 
 
+FORMATS = {
+    "position": ("delta_xyz", "raw"),
+    # GR00T's server says euler_xyz of what its policy learns from LIBERO's data, which is an axis-angle.
+    "rotation": ("axis_angle", "euler_xyz", "raw"),
+    "gripper": ("binary_close_positive", "raw"),
+}
+"""Part of an action to the formats that can be executed, as vla-eval names them; ``raw`` says nothing."""
+
+
+def refuse_other_actions(params: Mapping[str, Any], spec: Mapping[str, Mapping[str, Any]], server: str) -> None:
+    """Have a model server answer with deltas and a gripper that opens below 0.
+
+    Args:
+        params, spec: ``observation_params`` and ``action_spec``, as the server announces them.
+
+    Raises:
+        PipelineError: when it announces other actions.
+    """
+    other = ["absolute_action"] if params.get("absolute_action") else []
+    other += [
+        f"{part} {one['format']}" for part, one in spec.items() if one["format"] not in FORMATS.get(part, ("raw",))
+    ]
+    if other:
+        raise PipelineError(
+            f"the server's actions cannot be executed: it announces {', '.join(other)}",
+            where=server,
+            expected="deltas of position and axis-angle, and a gripper that opens below 0 and else closes",
+            remedy="GR00T's server has --args.invert_gripper for the gripper. Absolute actions, such as X-VLA's with "
+            "--args.benchmark_profile libero, are executed by vla-eval's own LIBERO benchmark alone",
+        )
+
+
 class Policy(Protocol):
     """Asked for actions until the episode is over."""
 
@@ -112,7 +144,7 @@ class Server:
         address: such as ``ws://localhost:8000``.
 
     Raises:
-        PipelineError: when no server answers there.
+        PipelineError: when no server answers there, or its actions cannot be executed.
     """
 
     def __init__(self, address: str, timeout_s: float = 120.0, look_every: int = 1):
@@ -157,7 +189,7 @@ class Server:
         self._loop.close()
 
     def _connect(self) -> None:
-        """Raises: PipelineError: when no server answers, which is not the fault of one episode."""
+        """Raises: PipelineError: when no server answers, or with other actions: not the fault of one episode."""
         try:
             self._run(self._connection.connect(benchmark="PerturbedLibero"))
         except PolicyError as error:
@@ -168,7 +200,13 @@ class Server:
                 remedy="check its address and its log, start it, and run the same command again: finished episodes are "
                 "kept",
             ) from error
-        wanted = self._connection.server_info.get("observation_params") or {}
+        announced = self._connection.server_info
+        wanted = announced.get("observation_params") or {}
+        try:
+            refuse_other_actions(wanted, announced.get("action_spec") or {}, self.name)
+        except PipelineError:
+            self.close()
+            raise
         self.wanted = Wanted(
             bool(wanted.get("send_wrist_image")), bool(wanted.get("send_state")), not wanted.get("quat_no_antipodal")
         )

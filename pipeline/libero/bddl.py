@@ -1,7 +1,7 @@
 """What a BDDL file says of a task: its instruction, what is in its scene, where things start, and its goal."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -56,6 +56,13 @@ class Bddl:
     def places(self) -> dict[str, str]:
         """Object or fixture to the region or thing that it starts on or in."""
         return {fact[1]: fact[2] for fact in self.start if fact[0] in ("on", "in")}
+
+    @property
+    def scene(self) -> Hashable:
+        """Equal for tasks that begin in the same scene: the arena, and of what kind and where each thing is."""
+        kinds = {**self.fixtures, **self.objects}
+        where = {name: self.regions.get(place, place) for name, place in self.places.items()}
+        return self.arena, frozenset((name, kinds[name], where[name]) for name in where)
 
     @property
     def carriers(self) -> dict[str, str]:

@@ -3,11 +3,11 @@
 import difflib
 import fnmatch
 import re
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from functools import cache
 from pathlib import Path
 from runpy import run_path
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.errors import PipelineError
 from pipeline.libero import bddl
@@ -15,6 +15,9 @@ from pipeline.libero.assets import libero_folder
 from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
+
+Same = Literal["task", "scene"]
+"""What two changes may have in common: the LIBERO task, or the scene that their tasks begin in."""
 
 OWN = Path("tasks")
 """Tasks of one's own: ``<suite>/<task>.bddl`` below this folder of the one that a run is started in, as workers are."""
@@ -80,6 +83,11 @@ def find_task(suite: str, name: str) -> Task:
         closest = difflib.get_close_matches(name, by_name, cutoff=0)
         raise PipelineError(f"{suite} has no task {name!r}", expected=" or ".join(closest))
     return by_name[name]
+
+
+def shared(task: Task, same: Same) -> Hashable:
+    """Equal for tasks that have the ``same`` in common."""
+    return (task.suite, task.name) if same == "task" else bddl.read(task.bddl_file).scene
 
 
 def select_tasks(patterns: Iterable[str]) -> list[Task]:

@@ -66,18 +66,22 @@ class AxisDistance:
         rows: planned episodes that the axis perturbs, reserves among them.
         test_tasks: the benchmark's tasks of this axis.
         comparisons: pairs of an episode and a test task that were compared.
-        smallest: the least distance of all; None when there was nothing to compare with, or nothing similar.
+        not_compared: episodes that could be compared with none of the test tasks, such as those in another scene.
+        smallest: the least distance of all, or of the overlaps where there are any; None when there was nothing to
+            compare with, or nothing similar.
         closest: the episode it belongs to.
         clearance: the least distance that is allowed, of this episode's kind where the axis has several.
         measure: what the distance is and its unit; of each kind.
         overlaps: episodes that are closer than that.
-        verdict: ``disjoint``, ``overlap``, or ``unknown`` when what the test tasks change cannot be read offline.
+        verdict: ``overlap``, ``disjoint``, ``disjoint where compared`` when some episodes were not compared, or
+            ``unknown`` when none was, as what the test tasks change cannot be read offline.
         coverage: component of the test tasks to how far these are from the wanted episodes, reserves left out.
     """
 
     rows: int
     test_tasks: int
     comparisons: int
+    not_compared: int
     smallest: float | None
     closest: str | None
     clearance: float
@@ -129,20 +133,27 @@ def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
 def _finding(
     found: Sequence[tuple[Nearest, str, Perturbation]], test_tasks: int, coverage: dict[str, Coverage]
 ) -> AxisDistance:
-    nearest, closest, kind = min(found, key=lambda one: one[0].distance)
-    comparisons = sum(one.compared for one, _, _ in found)
+    nearest, closest, kind = min(found, key=lambda one: (one[0].distance >= one[2].clearance, one[0].distance))
+    not_compared = sum(not one.compared for one, _, _ in found) if test_tasks else 0
     overlaps = sum(one.distance < kind.clearance for one, _, kind in found)
     alike = math.isfinite(nearest.distance)
+    if overlaps:
+        verdict = "overlap"
+    elif not_compared == len(found):
+        verdict = "unknown"
+    else:
+        verdict = "disjoint where compared" if not_compared else "disjoint"
     return AxisDistance(
         rows=len(found),
         test_tasks=test_tasks,
-        comparisons=comparisons,
+        comparisons=sum(one.compared for one, _, _ in found),
+        not_compared=not_compared,
         smallest=nearest.distance if alike else None,
         closest=closest if alike else None,
         clearance=kind.clearance,
         measure="; ".join(dict.fromkeys(f"{f'{k.unit}: ' if k.unit else ''}{k.measure}" for _, _, k in found)),
         overlaps=overlaps,
-        verdict="overlap" if overlaps else "unknown" if test_tasks and not comparisons else "disjoint",
+        verdict=verdict,
         coverage=coverage,
     )
 
@@ -170,7 +181,13 @@ def report(findings: dict[str, AxisDistance]) -> Group:
             figures = (one.smallest, one.median, one.p90, one.largest)
             shown = ("-" if figure is None else f"{figure:.3g}" for figure in figures)
             covered.add_row(axis, component, f"{one.test_tasks:,}", *shown)
-    return Group(table, covered, *(Text(f"{axis}: {finding.measure}") for axis, finding in findings.items()))
+    lines = [f"{axis}: {finding.measure}" for axis, finding in findings.items()]
+    lines += [
+        f"{axis}: {finding.not_compared:,} of {finding.rows:,} episodes could be compared with no test task"
+        for axis, finding in findings.items()
+        if finding.not_compared
+    ]
+    return Group(table, covered, *map(Text, lines))
 
 
 def refuse_overlap(findings: dict[str, AxisDistance]) -> None:

@@ -189,18 +189,18 @@ def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
 
 
 def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
-    run = {(row.axis, row.component) for row in rows}
-    components = {kind: count for kind, count in _sizes(axes, 2).items() if kind not in run}
-    tests = [kind for kind in _tests() if kind[0] in {axis for axis, _ in run}]
-    suites = {suite for *_, suite in tests} - {row.suite for row in rows}
-    levels = {level for _, _, level, _ in tests} - {row.level for row in rows}
-    return ", ".join(
-        [
-            *(f"{NAMES.get(kind, kind[1])} ({count:,} tasks)" for kind, count in sorted(components.items())),
-            *sorted(suites),
-            *(f"level {level}" for level in sorted(levels)),
-        ]
-    )
+    run, sizes = {(row.axis, row.component, row.level) for row in rows}, _sizes(axes, 3)
+    missing: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for axis, component, level in sorted(sizes.keys() - run):
+        missing[axis, component].append(level)
+    told = []
+    for kind, levels in missing.items():
+        partly = any(stratum[:2] == kind for stratum in run)
+        which = f" level {' and '.join(map(str, levels))}" if partly else ""
+        count = sum(sizes[(*kind, level)] for level in levels)
+        told.append(f"{NAMES.get(kind, kind[1])}{which} ({count:,} tasks)")
+    suites = {suite for axis, _, _, suite in _tests() if axis in {axis for axis, *_ in run}}
+    return ", ".join([*told, *sorted(suites - {row.suite for row in rows})])
 
 
 def _sizes(axes: Sequence[str], columns: int) -> Counter[Any]:

@@ -6,7 +6,7 @@ The wheel is fetched and hash-checked, never installed, imported or unpacked; no
 import math
 import zipfile
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
@@ -14,6 +14,7 @@ from pathlib import Path
 from pipeline.catalogue import downloads
 from pipeline.catalogue.downloads import Wheel
 from pipeline.errors import PipelineError
+from pipeline.libero.tasks import Same, find_task, shared
 from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
 
@@ -89,11 +90,15 @@ class TestSet:
 
     def of(self, axis: str) -> tuple[TestTask, ...]:
         """The test tasks of one axis."""
-        return self._groups.get((axis,), ())
+        return self._by_axis.get(axis, ())
 
-    def on(self, task: Task, axis: str) -> tuple[TestTask, ...]:
-        """The test tasks of one axis that perturb ``task``."""
-        return self._groups.get((task.suite, task.name, axis), ())
+    def on(self, task: Task, axis: str, same: Same = "task") -> tuple[TestTask, ...]:
+        """The test tasks of one axis that perturb ``task``, or any task with the same scene."""
+        return tuple(self.of(axis)[place] for place in self.places(task, axis, same))
+
+    def places(self, task: Task, axis: str, same: Same) -> list[int]:
+        """Where those of ``on`` stand in ``of``."""
+        return _places(self, axis, same).get(shared(task, same), [])
 
     def find(self, suite: str, name: str) -> TestTask:
         """The test task of that name.
@@ -111,12 +116,19 @@ class TestSet:
         return {(task.suite, task.name): task for task in self.tasks}
 
     @cached_property
-    def _groups(self) -> dict[tuple[str, ...], tuple[TestTask, ...]]:
-        groups: dict[tuple[str, ...], list[TestTask]] = defaultdict(list)
+    def _by_axis(self) -> dict[str, tuple[TestTask, ...]]:
+        groups: dict[str, list[TestTask]] = defaultdict(list)
         for task in self.tasks:
-            for key in ((task.axis,), (task.suite, task.base, task.axis)):
-                groups[key].append(task)
-        return {key: tuple(group) for key, group in groups.items()}
+            groups[task.axis].append(task)
+        return {axis: tuple(group) for axis, group in groups.items()}
+
+
+@cache
+def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
+    places: dict[Hashable, list[int]] = defaultdict(list)
+    for place, one in enumerate(test.of(axis)):
+        places[shared(find_task(one.suite, one.base), same)].append(place)
+    return dict(places)
 
 
 @cache

@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from conftest import PLATE, REPOSITORY, STOVE, starter_demo
+from conftest import MILK, PLATE, REPOSITORY, STOVE, starter_demo
 
 from pipeline import seeding
 from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
@@ -27,7 +27,7 @@ from pipeline.scenes.placement import CLEARANCE_M, HIDDEN, SEEN_PX, enough_seen,
 from pipeline.scenes.regions import REGIONS, Region
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
-from pipeline.types import Demo, Scene
+from pipeline.types import Demo, Scene, Task
 
 ROBOT = ("robot0_", "gripper0_")
 
@@ -275,11 +275,12 @@ def test_an_object_that_is_another_now_is_refused(three: LayoutPerturbation, bas
         LayoutPerturbation(level=1, objects=(stale,), seed=0).apply(base, demo, roll_out)
 
 
-def test_distance_to_the_test_set_is_by_category_on_the_same_task(three: LayoutPerturbation) -> None:
-    def test_task(base: str, category: str) -> TestTask:
-        return TestTask("libero_goal", base, f"{base}_add_1", "layout", "objects", {"category": category})
+def test_distance_to_the_test_set_is_by_category_in_the_same_scene(three: LayoutPerturbation) -> None:
+    def test_task(base: Task, category: str) -> TestTask:
+        return TestTask(base.suite, base.name, f"{base.name}_add_1", "layout", "objects", {"category": category})
 
-    test = TestSet((test_task(PLATE.name, "canned_food__1,can_of_sardines"), test_task(STOVE.name, "bag_of_yeast")))
+    # All tasks of the goal suite begin in one scene.
+    test = TestSet((test_task(STOVE, "canned_food__1,can_of_sardines"), test_task(MILK, "bag_of_yeast")))
     assert three.nearest(test, PLATE) == (float("inf"), 1)
     same = three.objects[0].model_copy(update={"category": "canned_food"})
     nearest = three.model_copy(update={"objects": (*three.objects, same)}).nearest(test, PLATE)

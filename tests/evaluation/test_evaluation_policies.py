@@ -3,19 +3,25 @@
 import json
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from anyio.from_thread import start_blocking_portal
 from conftest import REPOSITORY
 from model_server import running
+from vla_eval.model_servers.base import ModelServer
+from vla_eval.model_servers.groot import GR00TModelServer
+from vla_eval.model_servers.serve import serve_async
+from vla_eval.model_servers.xvla import _PROFILE_OBS_PARAMS as XVLA
 
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment, evaluate
-from pipeline.evaluation.policies import PolicyError, checked_actions
+from pipeline.evaluation.policies import PolicyError, Server, checked_actions
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
@@ -33,6 +39,26 @@ def test_answers_are_checked_before_any_is_taken() -> None:
     for answer in (None, "left", [[0.0] * 7, [0.0] * 6], np.zeros((2, 6)), np.zeros((0, 7)), [np.inf] * 7):
         with pytest.raises(PolicyError, match="policy"):
             checked_actions(answer, "policy")
+
+
+def test_a_server_of_other_actions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """vla-eval's own server without its weights, with X-VLA's parameters for LIBERO, and with those of LIBERO."""
+    monkeypatch.setattr(GR00TModelServer, "_init_policy", lambda self: None)
+    with start_blocking_portal() as portal:
+
+        def address(server: ModelServer) -> str:
+            _, port = portal.start_task(serve_async, server, "127.0.0.1", 0)
+            return f"ws://127.0.0.1:{port}"
+
+        for server, told in (
+            (GR00TModelServer(invert_gripper=True, observation_params=XVLA["libero"]), "announces absolute_action"),
+            (GR00TModelServer(), "announces gripper continuous_01"),
+        ):
+            with pytest.raises(PipelineError, match=f"{told}(?s:.*)args.invert_gripper"):
+                Server(address(server))
+        with closing(Server(address(GR00TModelServer(invert_gripper=True)))) as taken:
+            assert taken.wanted.state
+        portal.call(portal.stop, True)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -96,6 +96,11 @@ def short() -> Any:
     opened().close()
 
 
+def test_the_harness_refuses_absolute_actions() -> None:
+    with pytest.raises(PipelineError, match="absolute_action"):
+        PerturbedLibero(absolute_action=True)
+
+
 def test_rows_of_the_harness_need_a_folder_and_a_label(tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match="out: DIR"):
         PerturbedLibero(label="act")

@@ -24,6 +24,7 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis, displacements
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
+from pipeline.evaluation.own_draws import PlannedDraws
 from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
@@ -115,9 +116,31 @@ def test_every_test_scene_is_found_when_it_is_drawn(test: TestSet) -> None:
         fields = {"axis": "pose", "component": "scene", "level": 1, "moves": moves}
         rows.append(row(find_task(tested.suite, tested.base), from_json(json.dumps([fields])), f"{number}"))
     finding = leakage.check(rows, test)["pose"]
-    assert finding.overlaps == finding.rows == 696
+    assert (finding.overlaps, finding.rows, finding.not_compared) == (696, 696, 0)
     assert finding.smallest == pytest.approx(0, abs=1e-5)
     assert finding.coverage["pose"].compared == 696
+
+
+def test_a_test_scene_is_found_on_every_task_that_begins_in_it(test: TestSet) -> None:
+    """LIBERO-90 has 35 tasks in scenes of the long suite; all of the goal suite begin in one."""
+    stove = "KITCHEN_SCENE3_turn_on_the_stove"
+    tested = test.on(find_task("libero_10", f"{stove}_and_put_the_moka_pot_on_it"), "pose")[0]
+    moves = [{"name": name, "dx_m": dx, "dy_m": dy} for name, (dx, dy) in displacements(tested.parameters).items()]
+    planted = from_json(json.dumps([{"axis": "pose", "component": "scene", "level": 1, "moves": moves}]))
+    same, another = (
+        find_task("libero_90", stove),
+        find_task("libero_90", "KITCHEN_SCENE1_put_the_black_bowl_on_the_plate"),
+    )
+    assert planted[0].nearest(test, same).distance == 0
+    held_clear = PlannedDraws([row(same, planted, "planned")])
+    assert held_clear.nearest(planted[0], find_task(tested.suite, tested.base)) == (0, "planned")
+    assert held_clear.nearest(planted[0], another) == (math.inf, "")
+    both = [row(same, planted, "planted"), row(another, planted, "elsewhere")]
+    found = leakage.check(both, test)["pose"]
+    assert (found.overlaps, found.not_compared, found.closest, found.verdict) == (1, 1, "planted", "overlap")
+
+    bowl = repeated(test.on(find_task("libero_goal", "put_the_bowl_on_the_plate"), "pose")[0])
+    assert bowl.nearest(test, find_task("libero_goal", "put_the_bowl_on_the_stove")).distance == 0
 
 
 @pytest.mark.slow
@@ -153,6 +176,7 @@ def test_draws_are_mostly_clear_and_the_rest_is_counted(axis: str, test: TestSet
     assert (finding.rows, finding.overlaps, finding.test_tasks) == (160, overlaps, len(test.of(axis)))
     assert finding.measure
     assert overlaps <= 16
+    assert finding.not_compared == (160 if axis in ("light", "disturbance") and finding.test_tasks else 0)
     if finding.comparisons:
         assert finding.verdict == ("overlap" if overlaps else "disjoint")
 
@@ -251,6 +275,12 @@ def test_an_axis_that_cannot_be_compared_is_not_called_disjoint(test: TestSet) -
     assert leakage.check(rows, TestSet((other,)))["noise"].smallest is None
     assert leakage.check(rows, TestSet(()))["noise"].verdict == "disjoint"
     assert leakage.check([], test) == {}
+    severity = other.parameters["severity"]
+    near = next(
+        one for one in test.of("noise") if one.component == other.component and one.parameters["severity"] != severity
+    )
+    some = leakage.check([*rows, row(task, [repeated(near)], "two")], TestSet((other,)))["noise"]
+    assert (some.not_compared, some.verdict) == (1, "disjoint where compared")
 
 
 def run_stage(folder: Path, rows: list[Row]) -> subprocess.CompletedProcess[str]:
@@ -286,6 +316,18 @@ def test_the_stage_stops_where_an_episode_overlaps(test: TestSet, tmp_path: Path
     report = json.loads((tmp_path / "data" / "tiny" / "leakage.json").read_text())
     assert (report["language"]["overlaps"], report["language"]["verdict"]) == (1, "overlap")
     assert all(math.isfinite(finding["clearance"]) for finding in report.values())
+
+
+def test_an_overlap_is_explained_by_what_overlaps() -> None:
+    """Kinds differ in clearance: one object keeps 5 mm, a scene 10."""
+    task = find_task("libero_goal", "turn_on_the_stove")
+    test = TestSet((TestTask(task.suite, task.name, "name", "pose", "pose", {"moves": "plate_1:0,0"}),))
+    changed = {"axis": "pose", "level": 1}
+    one = {**changed, "component": "target", "moved": "plate_1", "dx_m": 0.0055, "dy_m": 0, "dyaw_deg": 0}
+    scene = {**changed, "component": "scene", "moves": [{"name": "plate_1", "dx_m": 0.008, "dy_m": 0}]}
+    rows = [row(task, from_json(json.dumps([fields])), str(fields["component"])) for fields in (one, scene)]
+    with pytest.raises(PipelineError, match=r"1 of 2 .* \(such as scene, distance 0\.008, clearance 0\.01\)"):
+        leakage.refuse_overlap(leakage.check(rows, test))
 
 
 def test_no_overlap_is_no_error(test: TestSet) -> None:

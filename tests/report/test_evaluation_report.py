@@ -47,7 +47,8 @@ def test_an_episode_counts_for_the_test_tasks_that_it_stands_for() -> None:
     assert line["total"] is None
     assert line["shared"] is not None
     assert line["shared"]["rate"] == line["cells"]["robot"]["rate"]
-    assert "level 2" in line["cells"]["robot"]["absent"]
+    absent = "initial_joints level 2 and 3 and 4 (1,023 tasks), libero_goal, libero_object, libero_spatial"
+    assert line["cells"]["robot"]["absent"] == absent
 
 
 def test_all_tasks_of_a_column_weigh_the_same() -> None:
@@ -64,6 +65,17 @@ def test_a_column_says_what_it_does_not_rest_on() -> None:
     (line,) = paper_table({"mine": rows})["evaluated"]
     assert line["cells"]["layout"]["episodes"] == 696
     assert line["cells"]["layout"]["absent"] == "confounding objects (829 tasks)"
+
+
+def test_levels_that_only_other_components_were_run_at_are_absent() -> None:
+    run = {"spherical": (1,), "distance": (2, 3, 4, 5), "orientation": (1,)}
+    every = select(Selection(source="libero_plus", axes=("camera",)))
+    rows = [result(task, True, "mine") for task in every if task.level in run[task.component]]
+    (line,) = paper_table({"mine": rows})["evaluated"]
+    assert line["cells"]["camera"]["absent"] == (
+        "distance level 1 (10 tasks), orientation level 2 and 3 and 4 and 5 (288 tasks), "
+        "spherical level 2 and 3 and 4 and 5 (875 tasks)"
+    )
 
 
 def test_mcnemars_test_is_exact() -> None:
