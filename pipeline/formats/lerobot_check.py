@@ -54,7 +54,8 @@ def check(root: Path, cache: Path, kept: Mapping[str, Row], columns: Mapping[str
             with av.open(str(file)) as video:
                 read[name], wanted[name] = float(video.streams.video[0].average_rate or 0), SCHEMA.fps_hz
         statistics = json.loads((root / "meta" / "stats.json").read_text())
-        files, wrong = sorted(root.glob("data/**/*.parquet")), []
+        files = sorted(root.glob("data/**/*.parquet"))
+        wrong: list[tuple[str, str]] = []
         for name in MOTION:  # One after another, as each takes memory.
             key = getattr(SCHEMA, name).lerobot_key
             wrong += wrong_statistics(statistics, [vectors(file, [key]) for file in files], QUANTILES)
