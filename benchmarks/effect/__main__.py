@@ -31,7 +31,7 @@ from experiment import Experiment, read
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles
-from pipeline.evaluation.tasks import write_tasks
+from pipeline.evaluation.task_list import write_tasks
 from pipeline.files import checksum
 
 HERE = Path(__file__).resolve().parent

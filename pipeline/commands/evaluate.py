@@ -164,7 +164,7 @@ def construct(arguments: argparse.Namespace) -> None:
     """
     from pipeline.evaluation import own_draws, selection
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.tasks import write_tasks
+    from pipeline.evaluation.task_list import write_tasks
 
     rows = [row for row, _ in stored(arguments.results)]
     plan = own_draws.planned(arguments.plan) if arguments.plan else None
@@ -178,7 +178,7 @@ def grade(arguments: argparse.Namespace) -> None:
     """difficulty of tasks, 1 to 5, by how many of several models solve each"""
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.statistics import grade
-    from pipeline.evaluation.tasks import write_tasks
+    from pipeline.evaluation.task_list import write_tasks
 
     results = [stored([folder]) for folder in arguments.results]
     seed, *others = sorted({row.seed for of_model in results for row, _ in of_model})

@@ -28,7 +28,7 @@ from scipy.stats import chi2_contingency
 
 from pipeline.axes import axes_of
 from pipeline.errors import PipelineError
-from pipeline.evaluation.results import REFUSED, Stored, one_setting, refuse_different
+from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
 from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
 from pipeline.types import Floats
@@ -117,26 +117,28 @@ def pairs(found: Iterable[Stored]) -> list[Pair]:
     refuse_different(of_pairs)
     listed = [row for row, _ in of_pairs]
     # The combinations of a trial share suite, LIBERO task and number of the initial state.
-    drawn = {(row.axis, row.level, (row.suite, row.base, row.number)): row.success for row in listed}
+    drawn = {(row.axis, row.level, (row.suite, row.base, row.number)): row for row in listed}
     axes = _in_order(axis for joined, _, _ in drawn if joined != "clean" for axis in joined.split("+"))
     counted = [pair for one, other in combinations(axes, 2) if (pair := _pair(one, other, drawn)) is not None]
     if not counted:
         raise PipelineError(
-            "no trial has all four combinations of two axes",
+            "no trial has all four combinations of two axes, the pair with the draws of its singles",
             remedy="python -m pipeline evaluate DIR --server URL --source pairs",
         )
     return counted
 
 
-def _pair(one: str, other: str, drawn: Mapping[tuple[str, int, tuple[str, str, int]], bool]) -> Pair | None:
+def _pair(one: str, other: str, drawn: Mapping[tuple[str, int, tuple[str, str, int]], EpisodeResult]) -> Pair | None:
     """Two axes' trials counted; None where there is none. What has one initial state, at whichever level, is drawn
-    together."""
+    together. A pair that does not have the draws of its singles is left out."""
     starts, outcomes = [], []
     for axis, level, start in drawn:
         four = (("clean", 0, start), (one, level, start), (other, level, start), (f"{one}+{other}", level, start))
         if axis == f"{one}+{other}" and drawn.keys() >= {*four}:
-            starts.append(start)
-            outcomes.append([drawn[combination] for combination in four])
+            _, first, second, joined = rows = [drawn[combination] for combination in four]
+            if joined.perturbations == [*first.perturbations, *second.perturbations]:
+                starts.append(start)
+                outcomes.append([row.success for row in rows])
     if not starts:
         return None
     measured = interval([start[:2] for start in starts], starts, np.array(outcomes), gap)

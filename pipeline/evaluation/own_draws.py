@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json
+from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json, to_json
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
 from pipeline.libero.tasks import find_task, shared
 from pipeline.physics.replay import roll_out
 from pipeline.planning import plan
+from pipeline.seeding import digest
 from pipeline.types import Demo, Scene, Task
 
 OWN_AXES = tuple(name for name, axis in AXES.items() if not axis.not_held_out)
@@ -58,6 +59,11 @@ def draw(task: EvaluationTask, seed: int, attempt: int = 0, axis: str = "") -> P
     key = seeding.rng("evaluation", seed, name, task.suite, task.base, task.level, task.number, attempt)
     ranges = held_out(name).model_copy(update={"levels": (task.level,)})
     return ranges.sample(key, find_task(task.suite, task.base), task.number)
+
+
+def first_draws(task: EvaluationTask, seed: int) -> str:
+    """Digest of a task's first draw on each axis, by which another version tells whether it draws the same."""
+    return digest(to_json(draw(task, seed, axis=axis) for axis in axes_of(task.axis)))[:16]
 
 
 @cache

@@ -21,6 +21,9 @@ ALIKE = {"black": "none", "initial_states": "libero", "fixture_seed": 0}
 """What results on one suite of one source must have in common to be compared, beside prompt and step limit: settings,
 and what they are where a result leaves them out."""
 
+PER_TASK = ("draws", "files of the benchmark")
+"""The versions of a result that each task has its own of."""
+
 Trial = tuple[EvaluationTask, int, str]
 """The whole task, the seed, and what was drawn: the same for results that can be compared one by one."""
 
@@ -37,7 +40,8 @@ class EpisodeResult(EvaluationTask):
         perturbations: held-out perturbations as they were used.
         policy, identity: the policy's name, and what is the same for the same policy alone.
         settings: what held for all episodes, and what the policy looks at.
-        versions: what computed it, by name: recipes, packages, machine code, content of the benchmark's files, OpenGL.
+        versions: what computed it, by name: recipes, packages, machine code, content of the benchmark's files, first
+            draws, OpenGL.
     """
 
     episode: str

@@ -16,11 +16,11 @@ from pipeline import gl, identity
 from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
-from pipeline.evaluation import libero_plus
+from pipeline.evaluation import libero_plus, own_draws
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, checked_actions, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
-from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, refuse_shared_names
+from pipeline.evaluation.results import PER_TASK, EpisodeFiles, EpisodeResult, refuse_shared_names
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
@@ -135,7 +135,7 @@ class Evaluation:
         known = [(row.policy, row.identity, self.folder) for row in self.files.rows()]
         refuse_shared_names([*known, (self.policy.name(self.identity), self.identity, self.folder)])
         rows = ((task, self.files.row(self.episode(task))) for task in tasks)
-        differing = (identity.differences(_deciding(row), self.versions(task)) for task, row in rows if row is not None)
+        differing = (_differences(_deciding(row), self.versions(task)) for task, row in rows if row is not None)
         outdated = Counter(f"episodes, made with {reason}" for reason in differing if reason)
         identity.refuse_unasked(outdated, self.folder, REMAKE)
 
@@ -147,6 +147,8 @@ class Evaluation:
         if task.source == "libero_plus":
             contents = libero_plus.contents(benchmark.load().find(task.suite, task.name), self.archive)
             found |= {"files of the benchmark": digest(contents)[:16]} if contents else {}
+        if task.source == "own":
+            found["draws"] = own_draws.first_draws(task, self.settings.seed)
         return found
 
     def save(self, environment: EpisodeEnvironment, wanted: Wanted) -> None:
@@ -181,6 +183,13 @@ class Evaluation:
 
 def _deciding(row: EpisodeResult) -> dict[str, str]:
     return {name: value for name, value in row.versions.items() if name not in RECORDED}
+
+
+def _differences(then: dict[str, str], now: dict[str, str]) -> str:
+    """See ``identity.differences``; in the same words for all tasks."""
+    own = [f"other {name}" for name in PER_TASK if then.get(name) != now.get(name)]
+    common = [{name: value for name, value in each.items() if name not in PER_TASK} for each in (then, now)]
+    return ", ".join(filter(None, [*own, identity.differences(*common)]))
 
 
 @cache

@@ -21,7 +21,8 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw, drawn_task
 from pipeline.evaluation.results import REFUSED, EpisodeResult
-from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task, read_tasks, replacements
+from pipeline.evaluation.task_list import read_tasks
+from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_task, replacements
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.testset.benchmark import TESTED_SUITES, load
 from pipeline.types import Task

@@ -1,4 +1,4 @@
-"""The tasks that policies are evaluated on: what names one, LIBERO's initial states, lists of them, and other goals.
+"""The tasks that policies are evaluated on: what names one, LIBERO's initial states, and other goals.
 
 LIBERO's tasks can be asked for another object of their scene, which the instruction and the BDDL goal name then. A
 policy that knows a scene by heart does what it always did there. The scene, the initial states and the predicates are
@@ -7,24 +7,20 @@ LIBERO's own, so its environment judges the new goal.
 
 from __future__ import annotations
 
-import json
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import zip_longest
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel
 
 from pipeline import seeding
 from pipeline.axes.language_goal import pattern, words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
 from pipeline.libero import bddl
 from pipeline.libero.assets import libero_folder
 from pipeline.libero.bddl import Bddl
@@ -109,39 +105,6 @@ def _in_turn(wanted: list[EvaluationTask], columns: tuple[str, ...], seed: int) 
     names = sorted(groups, key=lambda name: seeding.digest("turn", seed, column, name, str(min(groups[name]))))
     rows = [_in_turn(groups[name], tuple(rest), seed) for name in names]
     return [task for turn in zip_longest(*rows) for task in turn if task is not None]
-
-
-class _TaskList(BaseModel):
-    """What a file of tasks holds; the tasks may have more fields, such as ``difficulty``."""
-
-    seed: int
-    tasks: list[EvaluationTask]
-
-
-def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
-    """The tasks that ``analyse construct`` or ``analyse grade`` listed.
-
-    Raises:
-        PipelineError: when the file is not such a list, or its draws were made under another seed.
-    """
-    try:
-        listed = _TaskList.model_validate_json(file.read_bytes())
-    except (OSError, ValueError) as error:
-        raise PipelineError(
-            f"not a list of tasks ({error})", where=file, expected="a file that `analyse construct` wrote"
-        ) from error
-    if listed.seed != seed:
-        raise PipelineError(
-            f"these tasks were drawn under seed {listed.seed}, not {seed}", where=file, remedy=f"--seed {listed.seed}"
-        )
-    return listed.tasks
-
-
-def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
-    """Write a list of tasks that ``evaluate --tasks-from`` reads."""
-    lines = ",\n".join(json.dumps(task if isinstance(task, dict) else asdict(task)) for task in listed)
-    with replaced(file) as temporary:
-        temporary.write_text(f'{{"seed": {seed}, "tasks": [\n{lines}\n]}}\n')
 
 
 @dataclass(frozen=True)

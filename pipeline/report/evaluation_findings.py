@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.evaluation.results import EpisodeResult, Evaluated
+from pipeline.evaluation.results import PER_TASK, EpisodeResult, Evaluated
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary, wilson
 from pipeline.testset import benchmark
 
@@ -84,7 +84,7 @@ def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
 
 
 def _versions(rows: Sequence[EpisodeResult]) -> dict[str, list[str]]:
-    names = dict.fromkeys(name for row in rows for name in row.versions)
+    names = dict.fromkeys(name for row in rows for name in row.versions if name not in PER_TASK)
     return {name: sorted({row.versions[name] for row in rows if name in row.versions}) for name in names}
 
 

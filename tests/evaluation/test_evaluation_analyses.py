@@ -14,9 +14,10 @@ from episode_results import result
 
 from pipeline.__main__ import parser
 from pipeline.axes import Perturbation, to_json
+from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.errors import PipelineError
-from pipeline.evaluation import composition, own_draws, tasks
+from pipeline.evaluation import composition, own_draws
 from pipeline.evaluation.composition import Pair
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw
@@ -24,6 +25,7 @@ from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.results import EpisodeFiles, read, stored
 from pipeline.evaluation.selection import Selection, candidates, construct, select
 from pipeline.evaluation.statistics import difficulty
+from pipeline.evaluation.task_list import write_tasks
 from pipeline.evaluation.tasks import EvaluationTask, find_replacement, replacements
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
@@ -105,6 +107,15 @@ def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys
         analyse("gap", str(tmp_path))
 
 
+def test_the_gap_leaves_out_a_pair_of_other_draws_than_its_singles(tmp_path: Path) -> None:
+    for task in some_pairs(axes=("robot", "noise"), episodes=2):
+        axes = task.axis.split("+") if task.axis != "clean" else ()
+        drawn = json.loads(to_json(draw(task, task.number if len(axes) == 2 else 0, axis=axis) for axis in axes))
+        EpisodeFiles(tmp_path).save(result(task, perturbations=drawn))
+    (pair,) = composition.pairs(stored([tmp_path]))
+    assert pair.trials == 1, "the second pair was drawn under another seed"
+
+
 def test_difficulty_is_the_papers_for_four_models_and_even_for_others() -> None:
     assert [difficulty(solved, 4) for solved in range(5)] == [5, 4, 3, 2, 1]
     assert [difficulty(solved, 2) for solved in range(3)] == [5, 3, 1]
@@ -158,7 +169,7 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
     assert not set(refused) & set(chosen)
     assert set(chosen) < set(drawn)
     file = tmp_path / "tasks.json"
-    tasks.write_tasks(chosen, 3, file)
+    write_tasks(chosen, 3, file)
     assert select(Selection(file=file, seed=3)) == chosen
     lights = select(Selection(file=file, seed=3, axes=("light",), subset=10))
     assert len(lights) == 10
@@ -167,6 +178,17 @@ def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) ->
         select(Selection(file=file))
     file.write_text("[]")
     with pytest.raises(PipelineError, match="not a list of tasks"):
+        select(Selection(file=file))
+
+
+def test_a_list_is_of_the_draws_that_it_was_made_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("camera",)))
+    file = tmp_path / "tasks.json"
+    write_tasks(drawn, 0, file)
+    assert select(Selection(file=file)) == drawn
+    ranges = CameraAxis(spherical=SphericalRange(elevation_deg=((0.0, 1.0),)))
+    monkeypatch.setattr(own_draws, "held_out", lambda _: ranges)
+    with pytest.raises(PipelineError, match="this version draws other perturbations"):
         select(Selection(file=file))
 
 

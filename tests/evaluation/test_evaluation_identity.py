@@ -16,9 +16,10 @@ from episode_results import result
 from model_server import running
 
 from pipeline import identity
+from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
-from pipeline.evaluation import environment, results
+from pipeline.evaluation import environment, own_draws, results
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
 from pipeline.evaluation.policies import Checkpoint
@@ -227,6 +228,26 @@ def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     episode, versions = replayed.episode(tasks[0]), replayed.versions(tasks[0])
     EpisodeFiles(tmp_path).save(result(tasks[0], episode=episode, versions=versions))
     assert job.lost() == [f"worker_lost ({tasks[1]})"]
+
+
+def test_a_perturbation_that_is_drawn_otherwise_now_is_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where its name stays; and said once, not for each task."""
+    chosen = CHOSEN.model_copy(update={"source": "own", "axes": ("camera",), "levels": (4,), "episodes": 9})
+    tasks = select(chosen)
+    replayed = evaluation(PolicyConfig(kind="open_loop"), tmp_path)
+    for task in tasks:
+        EpisodeFiles(tmp_path).save(result(task, episode=replayed.episode(task), versions=replayed.versions(task)))
+    replayed.check(tasks)
+    assert all(replayed.result(task) for task in tasks)
+    ranges = CameraAxis(spherical=SphericalRange(elevation_deg=((0.0, 1.0),)))
+    monkeypatch.setattr(own_draws, "held_out", lambda _: ranges)
+    assert select(chosen) == tasks
+    changed = sum(replayed.result(task) is None for task in tasks)
+    assert 0 < changed < len(tasks), "of one component alone"
+    with pytest.raises(PipelineError, match=rf"anew: {changed} episodes, made with other draws\n"):
+        replayed.check(tasks)
 
 
 def test_a_folder_has_frames_of_one_device(tmp_path: Path) -> None:

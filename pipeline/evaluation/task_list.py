@@ -1,0 +1,69 @@
+"""Lists of tasks in a file, for ``evaluate --tasks-from``."""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from pipeline.errors import PipelineError
+from pipeline.evaluation.own_draws import first_draws
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.files import replaced
+from pipeline.seeding import digest
+
+
+class TaskList(BaseModel):
+    """What a file of tasks holds.
+
+    Attributes:
+        draws: of all held-out perturbations, by which another version tells whether it has the same.
+        tasks: may have more fields, such as ``difficulty``.
+    """
+
+    seed: int
+    draws: str = ""
+    tasks: list[EvaluationTask]
+
+    def drawn(self) -> str:
+        """What ``draws`` is in this version; empty without held-out perturbations."""
+        drawn = [first_draws(task, self.seed) for task in self.tasks if task.source == "own"]
+        return digest(*drawn)[:16] if drawn else ""
+
+
+def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
+    """The tasks that ``analyse construct`` or ``analyse grade`` listed.
+
+    Raises:
+        PipelineError: when the file is not such a list, or has other draws: of another seed or version.
+    """
+    try:
+        listed = TaskList.model_validate_json(file.read_bytes())
+        drawn = listed.drawn()
+    except (OSError, ValueError, LookupError) as error:
+        raise PipelineError(
+            f"not a list of tasks ({error})", where=file, expected="a file that `analyse construct` wrote"
+        ) from error
+    if listed.seed != seed:
+        raise PipelineError(
+            f"these tasks were drawn under seed {listed.seed}, not {seed}", where=file, remedy=f"--seed {listed.seed}"
+        )
+    if listed.draws != drawn:
+        raise PipelineError(
+            "this version draws other perturbations for these tasks",
+            where=file,
+            expected="a list that it made",
+            remedy="make the list anew with the command that made it, or evaluate with the version that made it",
+        )
+    return listed.tasks
+
+
+def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:
+    """Write a list of tasks that ``evaluate --tasks-from`` reads."""
+    content = [task if isinstance(task, dict) else asdict(task) for task in listed]
+    drawn = TaskList.model_validate({"seed": seed, "tasks": content}).drawn()
+    lines = ",\n".join(map(json.dumps, content))
+    with replaced(file) as temporary:
+        temporary.write_text(f'{{"seed": {seed}, "draws": "{drawn}", "tasks": [\n{lines}\n]}}\n')
