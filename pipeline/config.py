@@ -16,9 +16,9 @@ from pipeline.axes.language import load_bank
 from pipeline.catalogue import object_sources, texture_sources
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
-from pipeline.files import StrictLoader
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
 from pipeline.types import RenderedExtra
 

@@ -27,9 +27,9 @@ from pipeline import seeding
 from pipeline.axes.base import Axis, Level, TextPerturbation
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
-from pipeline.files import FastStrictLoader
 from pipeline.jit import compiled
 from pipeline.libero.tasks import Same
+from pipeline.strict_yaml import FastStrictLoader
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Task
 
