@@ -78,9 +78,10 @@ class Progress:
 
     Attributes:
         steps: actions taken, without the settling steps.
-        reason: ``running``, ``not_begun``, or why it is over: ``success``, ``step_limit``, ``simulation_unstable``, or
-            ``refused`` where the scene does not take what was drawn. Such an episode is over before its first look and
-            says nothing of a policy.
+        reason: ``running``, ``not_begun``, or why it is over: ``success``, ``step_limit``, ``simulation_unstable``, a
+            failure also where LIBERO's or the benchmark's own scene does not settle, or ``refused`` where the scene
+            does not take a held-out perturbation. Such an episode is over before its first look and says nothing of a
+            policy.
     """
 
     steps: int = 0
@@ -128,8 +129,8 @@ class EpisodeEnvironment:
         try:
             starts.get(task.source, self._start_libero)()
             self.progress = Progress(reason="running")
-        except RefusedError:
-            self.progress = Progress(reason=REFUSED)
+        except RefusedError as error:
+            self.progress = Progress(reason=REFUSED if task.source == "own" else error.reason)
         return self.progress
 
     def step(self, action: ArrayLike) -> Progress:

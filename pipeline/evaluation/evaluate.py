@@ -126,6 +126,16 @@ def check_settings(selection: Selection, wanted: Sequence[EvaluationTask], setti
             raise PipelineError(
                 "no task has held-out perturbations to keep clear of a plan", where="plan", expected="--source own"
             )
+    if settings.prompt == "benchmark" and not any(task.source == "libero_plus" for task in wanted):
+        raise PipelineError(
+            "no task has an instruction of the benchmark", where="prompt", expected="--source libero_plus"
+        )
+    if settings.step_limits == "lerobot" and not any(task.suite == "libero_spatial" for task in wanted):
+        raise PipelineError(
+            "lerobot's limits differ in libero_spatial alone, and no task is of it",
+            where="step_limits",
+            expected="openvla",
+        )
     if settings.initial_states == "demonstration":
         if others := {task.source for task in wanted} & {"libero_plus", "goals"}:
             raise PipelineError(

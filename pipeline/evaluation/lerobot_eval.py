@@ -99,11 +99,11 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
             named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
             chosen = {"suites": (suite.strip(),), **{name: getattr(self, name) for name in named}}
             selection = Selection.model_validate(chosen)
-            of_suite = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
-            check_settings(selection, of_suite, settings)
-            tasks[suite.strip()] = of_suite
+            tasks[suite.strip()] = sorted(select(selection, archive), key=lambda task: (task.base, task.name))
+        every = [task for of_suite in tasks.values() for task in of_suite]
+        check_settings(selection, every, settings)
         if evaluation is not None:
-            evaluation.check(task for suite in tasks.values() for task in suite)
+            evaluation.check(every)
         print(gl.choose())  # before the worker processes, which inherit it
         found: dict[str, dict[int, gym.vector.VectorEnv]] = {}
         for suite, of_suite in tasks.items():

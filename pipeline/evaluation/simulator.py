@@ -166,7 +166,8 @@ class Simulator(Environment):
         """Run one control step (50 ms), and keep what LIBERO observes of it in ``observed``.
 
         Raises:
-            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
+            RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with, also where
+                MuJoCo has reset the scene by itself because of that.
         """
         data = self._env.sim.data._data
         qpos = data.qpos.copy()
@@ -178,6 +179,8 @@ class Simulator(Environment):
                 qpos = data.qpos.copy()
         except (np.linalg.LinAlgError, mujoco.FatalError) as error:
             raise RefusedError("simulation_unstable") from error
+        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+            raise RefusedError("simulation_unstable")
 
     def _observe(self, qpos: Floats) -> Observed:
         """Args: qpos: (nq,) that the data's geometry was computed from, one substep before the data's own."""

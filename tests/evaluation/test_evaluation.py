@@ -13,6 +13,7 @@ import av
 import numpy as np
 import pytest
 from conftest import REPOSITORY, STOVE
+from episode_results import result
 
 from pipeline import gl
 
@@ -33,6 +34,8 @@ from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings 
 from pipeline.evaluation.evaluate import _environment  # noqa: E402
 from pipeline.evaluation.policies import Wanted  # noqa: E402
 from pipeline.evaluation.selection import Selection, select  # noqa: E402
+from pipeline.evaluation.simulator import Simulator  # noqa: E402
+from pipeline.evaluation.statistics import summary  # noqa: E402
 from pipeline.evaluation.tasks import EvaluationTask, libero_states  # noqa: E402
 from pipeline.images.jpeg import to_policy  # noqa: E402
 from pipeline.physics.control_env import control_env  # noqa: E402
@@ -91,6 +94,32 @@ def test_episodes_are_liberos_bit_for_bit(
             assert np.array_equal(ours["images"]["agentview"], to_policy(theirs["agentview_image"])), step
             assert np.array_equal(ours["images"]["wrist"], to_policy(theirs["robot0_eye_in_hand_image"])), step
         assert ours["task_description"] == STOVE.instruction
+
+
+@pytest.mark.slow
+def test_what_mujoco_resets_by_itself_ends_the_episode(evaluated: EpisodeEnvironment) -> None:
+    evaluated.reset(FIRST)
+    evaluated.simulator.sim.data.qvel[-1] = 1e8
+    assert evaluated.step(np.zeros(7)).reason == "simulation_unstable"
+
+
+@pytest.mark.slow
+def test_a_test_scene_that_does_not_settle_is_a_failure(
+    evaluated: EpisodeEnvironment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (task,) = select(Selection(source="libero_plus", suites=("libero_goal",), axes=("robot",), subset=1))
+    settle = Simulator.settle
+
+    def thrown(simulator: Simulator, steps: int) -> None:
+        simulator.sim.data.qvel[-1] = 1e8
+        settle(simulator, steps)
+
+    monkeypatch.setattr(Simulator, "settle", thrown)
+    progress = evaluated.reset(task)
+    assert (progress.over, progress.success, progress.reason) == (True, False, "simulation_unstable")
+    assert summary([result(task, reason=progress.reason)])["all"]["episodes"] == 1
+    own = select(Selection(source="own", suites=("libero_goal",), axes=("robot",), tasks=(STOVE.name,), levels=(1,)))
+    assert evaluated.reset(own[0]).reason == "refused"
 
 
 @pytest.mark.slow
