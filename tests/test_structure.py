@@ -38,6 +38,7 @@ FLOORS = (
     "jit",
     "tables",
     "files",
+    "strict_yaml",
     "rotations",
     "types",
     "exit_status",

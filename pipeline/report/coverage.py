@@ -180,7 +180,7 @@ def _layout(draws: Sequence[Draw], test: TestSet) -> AxisPlots:
     number = {"benchmark": np.array([float(known["count"]) for known in tested]), "layout": np.array(counts, float)}
     return AxisPlots(
         f"{len(tested):,} test tasks. Objects of {len(categories)} categories were added; a run stops where a test "
-        "task of the same LIBERO task adds one of these.",
+        "task in the same scene adds one of these.",
         [
             scatter("where objects stand", groups, "x from the surface's centre (m)", "y (m)", equal=True),
             histogram("objects added", number, np.arange(0.5, 7.0), "objects"),
