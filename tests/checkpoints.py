@@ -6,9 +6,9 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.act.modeling_act import ACTPolicy
-from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
-from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.vqbet.configuration_vqbet import VQBeTConfig
+from lerobot.policies.vqbet.modeling_vqbet import VQBeTPolicy
 from safetensors.torch import load_file, save_file
 
 CHUNK = 2
@@ -46,23 +46,25 @@ def save(folder: Path, action: float, scale: float = 1.0) -> Path:
     return folder
 
 
-def save_diffusion(folder: Path) -> Path:
-    """A diffusion policy with random weights, which begins each chunk from random numbers."""
-    config = DiffusionConfig(
+def save_random(folder: Path) -> Path:
+    """A VQ-BeT policy with random weights, which draws its codes from random numbers."""
+    config = VQBeTConfig(
         input_features={
-            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 32, 32)),
+            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
             "observation.state": PolicyFeature(FeatureType.STATE, (8,)),
         },
         output_features={"action": PolicyFeature(FeatureType.ACTION, (7,))},
-        **{"horizon": 4, "n_action_steps": 1, "down_dims": (8, 16), "n_groups": 4, "crop_shape": None},
-        **{"num_train_timesteps": 2, "num_inference_steps": 2, "diffusion_step_embed_dim": 8},
+        **{"n_obs_steps": 2, "n_action_pred_token": 1, "action_chunk_size": 2, "crop_shape": (64, 64)},
+        **{"bet_softmax_temperature": 100.0},
+        **{"vqvae_embedding_dim": 8, "vqvae_enc_hidden_dim": 8, "pretrained_backbone_weights": None},
+        **{"gpt_input_dim": 8, "gpt_output_dim": 8, "gpt_n_layer": 1, "gpt_n_head": 1, "gpt_hidden_dim": 8},
         device="cpu",
         push_to_hub=False,
     )
-    ones = {"observation.images.image": (3, 1, 1), "observation.state": (8,), "action": (7,)}
-    bounds = {name: {"min": -torch.ones(size), "max": torch.ones(size)} for name, size in ones.items()}
+    sizes = {"observation.images.image": (3, 1, 1), "observation.state": (8,), "action": (7,)}
+    bounds = {name: {"min": -torch.ones(size), "max": torch.ones(size)} for name, size in sizes.items()}
     stats = {name: {**one, "mean": one["max"] * 0, "std": one["max"]} for name, one in bounds.items()}
-    for part in (DiffusionPolicy(config), *make_pre_post_processors(config, dataset_stats=stats)):
+    for part in (VQBeTPolicy(config), *make_pre_post_processors(config, dataset_stats=stats)):
         part.save_pretrained(folder)
     return folder
 

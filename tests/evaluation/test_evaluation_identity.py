@@ -201,7 +201,7 @@ def test_a_video_shows_what_the_policy_does_not_look_at(
 @pytest.mark.slow
 def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Path) -> None:
     """So that an episode's result depends neither on those before it nor on the worker."""
-    policy = Checkpoint(checkpoints.save_diffusion(tmp_path / "policy"))
+    policy = Checkpoint(checkpoints.save_random(tmp_path / "policy"))
     one, other = select(CHOSEN.model_copy(update={"episodes": 2}))
     shown = {
         "images": {view: np.zeros((256, 256, 3), np.uint8) for view in ("agentview", "wrist")},
