@@ -156,5 +156,6 @@ def _forget() -> None:
     for name, module in list(sys.modules.items()):
         if name.startswith(f"{PACKAGE}.") and name != __name__:
             for value in list(vars(module).values()):
-                if hasattr(value, "cache_clear"):
+                # Of its type: what looks things up when they are asked for, such as OpenGL, is not to be asked.
+                if hasattr(type(value), "cache_clear"):
                     value.cache_clear()

@@ -48,7 +48,10 @@ def cluster(tmp_path: Path) -> Iterator[Start]:
             process = subprocess.Popen(
                 [sys.executable, "-m", f"distributed.cli.{command}", *options],
                 cwd=elsewhere,
-                env=os.environ | {"PYTHONPATH": str(REPOSITORY)} | environment,
+                # What renders here, a worker finds out by itself.
+                env={name: value for name, value in os.environ.items() if "GL" not in name}
+                | {"PYTHONPATH": str(REPOSITORY)}
+                | environment,
                 stdout=logs,
                 stderr=logs,
             )
