@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.axes import Perturbation
-from pipeline.errors import RefusedError
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
 from pipeline.physics.stepping import ControlStep
@@ -172,15 +171,11 @@ class Simulator(Environment):
         data = self._env.sim.data._data
         qpos = data.qpos.copy()
         self._act_from_outside()
-        try:
+        with self._stable():
             for _ in self._control_step.substeps(action):
                 if self._clock.tick():
                     self.observed = self._observe(qpos)
                 qpos = data.qpos.copy()
-        except (np.linalg.LinAlgError, mujoco.FatalError) as error:
-            raise RefusedError("simulation_unstable") from error
-        if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
-            raise RefusedError("simulation_unstable")
 
     def _observe(self, qpos: Floats) -> Observed:
         """Args: qpos: (nq,) that the data's geometry was computed from, one substep before the data's own."""

@@ -2,7 +2,8 @@
 
 import copy
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import lru_cache, partial
 from typing import Any
 
@@ -204,8 +205,14 @@ class Environment:
             RefusedError: ``simulation_unstable`` when the numbers grow beyond what can be computed with.
         """
         self._act_from_outside()
-        try:
+        with self._stable():
             self._control_step(action)
+
+    @contextmanager
+    def _stable(self) -> Iterator[None]:
+        """Raises: RefusedError: ``simulation_unstable`` when numbers grow beyond what can be computed with."""
+        try:
+            yield
         except (np.linalg.LinAlgError, mujoco.FatalError) as error:
             raise RefusedError("simulation_unstable") from error
         # MuJoCo then goes on from the model's own pose, and raises nothing.
