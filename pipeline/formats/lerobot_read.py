@@ -159,7 +159,8 @@ def wrong_statistics(
     for column in steps[0]:
         values = np.concatenate([of_file[column] for of_file in steps], dtype=float)
         wanted = {name: getattr(values, name)(axis=0) for name in ("mean", "std", "min", "max")}
-        wanted |= {name: np.quantile(values, int(name[1:]) / 100, axis=0) for name in quantiles}
+        shares = [int(name[1:]) / 100 for name in quantiles]
+        wanted |= dict(zip(quantiles, np.quantile(values, shares, axis=0), strict=True))
         for name, expected in (wanted | {"count": np.array([len(values)])}).items():
             if not np.allclose(stored[column][name], expected, rtol=SAME_SHARE, atol=SAME):
                 yield f"{name} of {column} is {stored[column][name]} in the statistics", f"{expected.tolist()}"
