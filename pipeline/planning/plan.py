@@ -25,6 +25,9 @@ _ATTEMPTS = 100
 NOT_NEEDED = "reserve_not_needed"
 """The reason of a reserve for whose quota others were kept."""
 
+NOT_REPLAYED = "not_replayed"
+"""The reason of what is needed, as far as is known, and has no trajectory yet."""
+
 RESET = "reset"
 """What stands for the axis where nothing is perturbed and the start is a reset of LIBERO's environment."""
 
@@ -297,7 +300,7 @@ def select(
         verdicts: trajectory id to its verdict.
         rejected: episode id to the reason why its frames were rejected.
     """
-    unknown = Verdict(False, "not_replayed")
+    unknown = Verdict(False, NOT_REPLAYED)
     return {row.episode_id: verdict or unknown for row, verdict in _verdicts(rows, verdicts, rejected)}
 
 

@@ -45,8 +45,8 @@ def told(config: Config) -> Iterator[str | Table]:
     yield from (f"  {step}: {why}" for step, why in steps.items())
     yield _disk(config)
     # What is not replayed yet is hoped for.
-    needed = [row for row in rows if judged[row.episode_id].kept or row.trajectory_id not in verdicts]
-    needed = [row for row in needed if judged[row.episode_id].reason != plan.NOT_NEEDED]
+    hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == plan.NOT_REPLAYED}
+    needed = [row for row in rows if row.episode_id in hopes]
     yield from _time_left(config, needed, verdicts, frames, steps) if steps else ()
 
 

@@ -137,7 +137,7 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
     for (axis, suite, task), members in quotas.items():
         wanted = sum(row["wanted"] for row in members)
         kept = sum(row["reason"] in outcome.MADE for row in members)
-        left = any(row["reason"] in (plan.NOT_NEEDED, "not_replayed") for row in members)
+        left = any(row["reason"] in (plan.NOT_NEEDED, plan.NOT_REPLAYED) for row in members)
         if kept > wanted or (kept < wanted and left):
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
     if read_json(data / "counts.json") != by_axis_and_suite(rows):
