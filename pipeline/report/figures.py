@@ -148,7 +148,7 @@ def strips(title: str, rows: Mapping[str, Groups], label: str) -> Panel:
         axes.xaxis.set_major_locator(
             MaxNLocator(6, steps=[1, 2, 5, 10], integer=bool((plotted == plotted.round()).all()))
         )
-        if len(plotted) and plotted.min() == plotted.max():
+        if len(plotted) and np.isclose(plotted.min(), plotted.max()):
             # A scale around one single value would show thousandths.
             axes.set_xlim(plotted[0] - 1, plotted[0] + 1)
 
