@@ -31,12 +31,14 @@ class TrainingConfig(Frozen):
         batch_size: frames of a step.
         learning_rate: AdamW's, which falls to a hundredth along a cosine.
         save_every: steps between two checkpoints; what a kill costs at most.
+        proprioception: whether policies get the state; without it they see the two views and the sentence.
     """
 
     steps: int = Field(ge=1)
     batch_size: int = Field(ge=1)
     learning_rate: float = Field(gt=0)
     save_every: int = Field(ge=1)
+    proprioception: bool = True
 
 
 class EvaluationConfig(Frozen):
@@ -135,7 +137,7 @@ class Experiment(Frozen):
         """
         if seed not in self.seeds:
             raise PipelineError(f"no seed {seed}", where="seeds", expected=" or ".join(map(str, self.seeds)))
-        training = self.training.model_dump(exclude={"save_every"})
+        training = self.training.model_dump(exclude={"save_every"}, exclude_defaults=True)
         return f"{arm}_seed{seed}_{digest(self.dataset_name(arm), self.policy, training, seed)[:8]}"
 
     def _names(self, arm: str) -> tuple[str, ...]:

@@ -103,10 +103,11 @@ def train(experiment: Experiment, seed: int, dataset: Dataset, vectors: Vectors,
 def configuration(experiment: Experiment) -> ACTConfig:
     """Of the experiment's policy."""
     picture = (3, experiment.frame_px, experiment.frame_px)
+    state = {STATE: PolicyFeature(FeatureType.STATE, (8,))} if experiment.training.proprioception else {}
     return ACTConfig(
         input_features={
             **{key: PolicyFeature(FeatureType.VISUAL, picture) for key in IMAGES.values()},
-            STATE: PolicyFeature(FeatureType.STATE, (8,)),
+            **state,
             SENTENCE: PolicyFeature(FeatureType.ENV, (SIZE,)),
         },
         output_features={ACTION: PolicyFeature(FeatureType.ACTION, (7,))},
