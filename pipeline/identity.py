@@ -42,6 +42,9 @@ RECIPES: dict[Step, int] = {
 ``evaluation``: an episode's start, its limit, what a policy is shown. ``checks``: what ``validate`` finds.
 ``pictures``: what ``summary`` shows, and the report."""
 
+MAPS_RECIPE = 2
+"""The recipe of depth and segmentation; only the files of runs that ask for them depend on it."""
+
 AFTER: dict[Step, tuple[Step, ...]] = {
     "pixels": ("physics",),
     "encoding": ("physics", "pixels"),

@@ -87,7 +87,13 @@ class PlainDrawing:
     def surfaces(self, data: mujoco.MjData, camera: str) -> Surfaces:
         """What each pixel of a frame shows."""
         self._gl.make_current()
-        self._update(data, camera)
+        groups = self._model.site_group.copy()
+        # robosuite hides sites by a negative opacity. A segmentation would show all that are not at 0.
+        self._model.site_group[self._model.site_rgba[:, 3] <= 0] = mujoco.mjNGROUP - 1
+        try:
+            self._update(data, camera)
+        finally:
+            self._model.site_group[:] = groups
         # A geom's colour is its number in the scene, and one more.
         flags = self._scene.flags
         flags[mujoco.mjtRndFlag.mjRND_SEGMENT] = flags[mujoco.mjtRndFlag.mjRND_IDCOLOR] = 1

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA
 from pipeline.errors import PipelineError
+from pipeline.identity import MAPS_RECIPE
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
@@ -65,7 +66,8 @@ class FrameStore(Store):
 
     def __init__(self, root: Path, config: RenderConfig):
         shown = [SCHEMA.model_dump(include=_OF_THE_SCHEMA), SCHEMA.image_rotation_deg]
-        super().__init__(root, config.model_dump(mode="json"), {"episode schema": shown})
+        maps = {"recipe of maps": MAPS_RECIPE} if {*MAPS} & {*config.extras} else {}
+        super().__init__(root, config.model_dump(mode="json"), {"episode schema": shown, **maps})
 
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:

@@ -125,9 +125,23 @@ def test_extras_change_no_frame_and_need_asking_for(rendered: Rendered, middle: 
         np.testing.assert_array_equal(geometry.extrinsics, rendered.geometry[name].extrinsics)
 
 
+def test_maps_show_no_site_that_is_hidden(middle: Trajectory) -> None:
+    """robosuite hides the rod along the gripper's axis by a negative opacity; at 0 MuJoCo leaves a site out."""
+    renderer = Renderer(middle.model_xml)
+    assert (middle.site_alpha[0] < 0).any()
+    for view in SCHEMA.views.values():
+        shown = []
+        for site_alpha in (middle.site_alpha[0], middle.site_alpha[0].clip(0)):
+            renderer.restore(middle.states[0], site_alpha)
+            shown.append(renderer.surfaces(view.camera))
+        for mine, right in zip(*shown, strict=True):
+            np.testing.assert_array_equal(mine, right)
+    renderer.close()
+
+
 def test_depth_is_mujocos_own(middle: Trajectory) -> None:
     renderer = Renderer(middle.model_xml)
-    renderer.restore(middle.states[0], middle.site_alpha[0])
+    renderer.restore(middle.states[0], middle.site_alpha[0].clip(0))
     option = mujoco.MjvOption()
     option.geomgroup[0] = 0
     for view in SCHEMA.views.values():
