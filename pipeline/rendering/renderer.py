@@ -23,10 +23,14 @@ class Renderer:
     Args:
         scene: its MJCF, or a compiled model, which belongs to the renderer from then on.
         drawing: renders the model already; by default one is made.
+
+    Attributes:
+        site_alpha: (nsite,) the sites' opacity in the first state.
     """
 
     def __init__(self, scene: str | mujoco.MjModel, drawing: PlainDrawing | None = None):
         self.model = compiled(scene) if isinstance(scene, str) else scene
+        self.site_alpha = self.model.site_rgba[:, 3].copy()
         self.data = mujoco.MjData(self.model)
         self.drawing = drawing or drawing_of(self.model)
         self._perturbations: tuple[RenderPerturbation, ...] = ()

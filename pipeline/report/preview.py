@@ -71,12 +71,11 @@ class Stage:
         for physics in of_layer(changes, PhysicsPerturbation):
             scene = physics.apply(scene, self.demo, partial(roll_out, config=self.replay))
         renderer = self.opened.renderer(scene.model_xml)
-        site_alpha = renderer.model.site_rgba[:, 3].copy()
         if (push := scene.push) is None:
             state = first_look(scene, self.demo.task, self.replay)
         else:
             state = roll_out(scene, self.demo, self.replay)[push.first_step + push.steps]
-        return frames_of(renderer, state, site_alpha, [Stream(view, changes) for view in views], 0)
+        return frames_of(renderer, state, renderer.site_alpha, [Stream(view, changes) for view in views], 0)
 
     @cached_property
     def _twin(self) -> Trajectory:
@@ -204,11 +203,11 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
 def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
     if not isinstance(push, DisturbancePerturbation):
         return []
+    caption = f"without and with {describe(push)}"
     try:
         shown = stage.strip(push)
-    except RefusedError:
-        return []
-    caption = f"without and with {describe(push)}"
+    except RefusedError as refused:
+        return [_refused(refused, stage.frames(["image"])[0], caption)]
     return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in shown]
 
 
@@ -219,9 +218,6 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
 
     Args:
         test: the benchmark's test tasks, which the plan's draws keep clear of.
-
-    Raises:
-        RefusedError: when the scene refuses every draw of an axis.
     """
     demo, view = stage.demo, "image"
     tiles = [Tile(Image.fromarray(stage.frames([view])[0]), f"clean twin: {demo.task.instruction}")]
@@ -234,16 +230,20 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
 
 def _strongest(stage: Stage, drawn: Sequence[Perturbation], view: str) -> Tile:
     for perturbation in sorted(drawn, key=lambda p: -p.level):
+        caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
         try:
             (frame,) = stage.frames([view], perturbation)
-        except RefusedError as error:
-            refused = error
+        except RefusedError as refused:
+            last, reason = caption, refused
         else:
-            caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
             for text in of_layer((perturbation,), TextPerturbation):
                 caption += f": {text.apply(stage.demo.task.instruction)}"
             return Tile(Image.fromarray(frame), caption)
-    raise refused
+    return _refused(reason, stage.frames([view])[0], last)
+
+
+def _refused(why: RefusedError, like: Frame, caption: str) -> Tile:
+    return Tile(Image.fromarray(np.full_like(like, REFUSED_GREY)), f"refused, {why.reason}: {caption}")
 
 
 def for_run(config: Config, folder: Path, workers: Workers) -> None:

@@ -190,6 +190,13 @@ def test_what_a_scene_refuses_is_grey(stage: preview.Stage, monkeypatch: pytest.
     assert np.array_equal(variants[0], variants[2])
 
 
+def test_the_original_is_the_same_after_a_state_with_a_lit_burner(stage: preview.Stage) -> None:
+    (before,) = stage.frames(["image"])
+    renderer = stage.opened.renderer(stage.scene.model_xml)
+    renderer.restore(stage.scene.state, np.full(renderer.model.nsite, 1.0, np.float32))
+    np.testing.assert_array_equal(stage.frames(["image"])[0], before)
+
+
 def test_the_original_is_what_a_run_renders(stage: preview.Stage) -> None:
     environment = Environment(BOWL)
     environment.restore(stage.scene)
@@ -259,6 +266,12 @@ def test_an_overview_shows_the_strongest_draw_that_the_scene_takes(
     assert captions[0] == f"clean twin: {BOWL.instruction}"
     # Level 5 is refused.
     assert captions[1:] == ["lift: lamp, level 2"] * len(Axes.model_fields)
+    monkeypatch.setattr(preview, "configured", lambda name, config: Drawn(kind=Lift, levels=(5,)))
+    captions.clear()
+    preview.overview(stage, STARTER, NO_TESTS)
+    refused = {f"refused, too_high: lift: {component}, level 5" for component in ("lamp", "window")}
+    assert len(captions) == 1 + len(Axes.model_fields)
+    assert set(captions[1:]) <= refused
 
 
 @pytest.mark.slow
