@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from pipeline import seeding
-from pipeline.axes.base import Axis, Level, TextPerturbation
+from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
 from pipeline.axes.language_goal import changed_goal
 from pipeline.errors import PipelineError
 from pipeline.jit import compiled
@@ -91,6 +91,11 @@ class LanguagePerturbation(TextPerturbation):
     def distances_on(self, test: TestSet, task: Task) -> list[float]:
         """To the task's test instructions; a clearance of about one word in five."""
         return _distances(self.text, test, task)
+
+    def nearest(self, test: TestSet, task: Task) -> Nearest:
+        """As the base class says; 0 where it is word for word a test instruction of any task."""
+        found = super().nearest(test, task)
+        return found._replace(distance=0.0) if normalise(self.text) in _all_test_wordings(test) else found
 
 
 class LanguageAxis(Axis):
@@ -270,6 +275,11 @@ def _distances(text: str, test: TestSet, task: Task) -> list[float]:
 @cache
 def _test_wordings(test: TestSet, task: Task) -> tuple[NDArray[np.uint8], ...]:
     return tuple(_characters(str(tested.parameters["text"])) for tested in test.on(task, "language"))
+
+
+@cache
+def _all_test_wordings(test: TestSet) -> frozenset[str]:
+    return frozenset(normalise(str(tested.parameters["text"])) for tested in test.of("language"))
 
 
 def lint(text: str, task: Task, component: Component) -> str | None:

@@ -3,8 +3,9 @@
 The goal is that of the BDDL file, the words for it are those of ``language_words.yaml``. No grammar is parsed: each
 thing and each place must be called by a word that nothing else in the scene shares, the relation is given by the words
 right before a place, and where two things go to different places, the first goes to the first. What LIBERO's own
-wording does not say by these words is not asked of a rewrite. So a changed goal is found, where things are named and
-where they are described; whether a description fits one thing only must be checked by its writer.
+wording does not say by these words is not asked of a rewrite. So a goal that is left out is found, where things are
+named and where they are described. What is asked for beside it is not, such as a second goal or the opposite ("do
+not"), nor whether a description fits one thing only: writers check that.
 """
 
 import re
