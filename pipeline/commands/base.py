@@ -73,6 +73,14 @@ def positive(text: str) -> int:
     return number
 
 
+def at_least_zero(text: str) -> int:
+    """Type of an argument that is a number from 0 on."""
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{number} is less than 0")
+    return number
+
+
 def _positive_number(text: str) -> float:
     number = float(text)
     if not number > 0:

@@ -5,7 +5,7 @@ import json
 from dataclasses import asdict
 from typing import Any
 
-from pipeline.commands.base import add, add_group, argument, positive, value
+from pipeline.commands.base import add, add_group, argument, at_least_zero, positive, value
 
 TITLE = "get demonstrations"
 
@@ -36,7 +36,7 @@ def add_commands(commands: Any) -> None:
         verbs,
         check,
         value("folder", "DIR", "folder with <suite>/<task>_demo.hdf5"),
-        value("--replay", "N", replays, int, default=2),
+        value("--replay", "N", replays, at_least_zero, default=2),
     )
 
 
@@ -54,7 +54,7 @@ def fetch(arguments: argparse.Namespace) -> None:
     print(f"{len(files)} files are in {arguments.out}: write `demos: {{root: {arguments.out}}}` into a configuration")
 
 
-def expand(arguments: argparse.Namespace) -> None:
+def expand(arguments: argparse.Namespace) -> int:
     """make many demonstrations of each task from the starter set's one, where the hub cannot be reached
 
     Replays each human demonstration from other starts and writes those that reach the goal in LIBERO's own HDF5 layout
@@ -73,11 +73,12 @@ def expand(arguments: argparse.Namespace) -> None:
         rows = candidates(demos, arguments.per_task, arguments.seed, benchmark.load())
     with runner(ComputeConfig(), arguments.out) as workers:
         made = expand(arguments.out, demos, rows, arguments.per_task, workers)
-    print(
-        f"{made.written} demonstrations in {len(made.files)} files: write `demos: {{root: {arguments.out}}}` into a "
-        "configuration"
-    )
+    print(f"{made.written} demonstrations in {len(made.files)} files", end="")
+    print(f": write `demos: {{root: {arguments.out}}}` into a configuration" if made.files else "")
+    for task, missing in made.short.items():
+        print(f"{missing} fewer than asked for of {task}")
     print(json.dumps({"written": made.written, "dropped": dict(made.dropped.most_common()), "short": made.short}))
+    return int(not made.files)
 
 
 def check(arguments: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ import httpx
 from huggingface_hub import HfApi, snapshot_download
 
 from pipeline.errors import PipelineError
+from pipeline.libero import hdf5
 from pipeline.libero.tasks import tasks
 
 REPOSITORY = "yifengzhu-hf/LIBERO-datasets"
@@ -26,9 +27,17 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         endpoint: address of a mirror of the hub, when not the hub itself.
 
     Raises:
-        PipelineError: for an unknown suite, and when the hub could not be reached or lacks a file.
+        PipelineError: for an unknown suite, when a file of an expansion is there, and when the hub could not be reached
+            or lacks a file.
     """
     wanted = [f"{task.suite}/{task.name}_demo.hdf5" for suite in suites for task in tasks(suite)]
+    for file in (out / name for name in wanted):
+        if file.exists() and any(_expanded(file)):
+            raise PipelineError(
+                "holds demonstrations of `demos expand`, and would be replaced",
+                where=file,
+                remedy="fetch into another folder",
+            )
     remedy = (
         "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, it goes on where it stopped; "
         "or use the starter set, demos.source: starter, which needs no hub"
@@ -62,3 +71,10 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
             remedy=remedy,
         )
     return [out / name for name in wanted]
+
+
+def _expanded(file: Path) -> list[bool]:
+    try:
+        return hdf5.expanded(file)
+    except PipelineError:
+        return []  # A damaged file is fetched anew.

@@ -206,3 +206,15 @@ def _write_demo(group: h5py.Group, recording: Recording) -> None:
         group.create_dataset(name, data=values)
     group.attrs.update(num_samples=steps, model_file=recording.model_file, init_state=recording.states[0])
     group.attrs.update(recording.attrs)
+
+
+def expanded(file: Path) -> list[bool]:
+    """Of each demonstration of a file whether an expansion made it.
+
+    Raises:
+        PipelineError: when it is no such file.
+    """
+    with opened(file) as content:
+        data = member(content, "data", h5py.Group, str(file))
+        groups = [member(data, key, h5py.Group, f"{file} data/{key}") for key in names(data, str(file))]
+        return [EXPANDED_FROM in group.attrs for group in groups]

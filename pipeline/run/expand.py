@@ -14,7 +14,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
-import h5py
 import mujoco
 import numpy as np
 
@@ -22,7 +21,7 @@ from pipeline.axes import Axes
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.catalogue.scene_files import portable
-from pipeline.compute.pool import Workers
+from pipeline.compute.pool import LOST, Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import remove
@@ -115,19 +114,13 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
 
 
 def _refuse_other_demonstrations(file: Path) -> None:
-    if not file.exists():
-        return
-    with hdf5.opened(file) as opened:
-        data = hdf5.member(opened, "data", h5py.Group, str(file))
-        keys = hdf5.names(data, str(file))
-        groups = [hdf5.member(data, key, h5py.Group, f"{file} data/{key}") for key in keys]
-        if not all(hdf5.EXPANDED_FROM in group.attrs for group in groups):
-            raise PipelineError(
-                "holds demonstrations that no expansion made, and would be replaced",
-                where=file,
-                expected="no file, or one of an earlier expansion",
-                remedy="expand into another folder",
-            )
+    if file.exists() and not all(hdf5.expanded(file)):
+        raise PipelineError(
+            "holds demonstrations that no expansion made, and would be replaced",
+            where=file,
+            expected="no file, or one of an earlier expansion",
+            remedy="expand into another folder",
+        )
 
 
 def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> list[plan.Row]:
@@ -159,11 +152,14 @@ def resets(demos: DemosConfig, per_task: int, seed: int) -> list[plan.Row]:
 def _faults(rows: Sequence[plan.Row], planned: Sequence[plan.Row], store: TrajectoryStore) -> dict[str, str]:
     """Episode id to what is wrong with a replay that reached its goal, where something is."""
     twins = {row.demo_id: row.trajectory_id for row in planned if row.role == "twin"}
+    reasons = {trajectory_id: row["reason"] for trajectory_id, row in store.rows().items()}
     accepted: dict[tuple[str, str], list[_Motion]] = defaultdict(list)
     faults: dict[str, str] = {}
     for row in rows:
         task, before = find_task(row.suite, row.task), accepted[row.suite, row.task]
-        motion, human = (_motion(store, one, task) for one in (row.trajectory_id, twins[row.demo_id]))
+        motion, twin = _motion(store, row.trajectory_id, task), twins[row.demo_id]
+        # Of a twin that workers were lost over there is nothing to compare with.
+        human = motion if reasons[twin] == LOST else _motion(store, twin, task)
         if any(motion.smoothness[name] > limit * human.smoothness[name] for name, limit in ROUGH.items()):
             faults[row.episode_id] = "not_smooth"
         elif any(motion.starts_like(other) for other in before):
@@ -208,9 +204,8 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
         compiled.restore(flattened)
         hand, arm = proprioception(compiled.data)
         w, *xyz = compiled.data.body("robot0_right_hand").xquat
-        if number < len(trajectory.actions):
-            robot.append([*hand[6:], *hand[:3], *xyz, w])
         if number:
+            robot.append([*hand[6:], *hand[:3], *xyz, w])
             state.append(hand)
             joints.append(arm)
     seen = np.array(state, np.float64)

@@ -8,6 +8,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.metadata import version
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from conftest import served
@@ -118,6 +119,17 @@ def test_fetches_the_suites_asked_for(hub: Hub, tmp_path: Path) -> None:
     hub.sent.clear()
     assert fetch(out, ["libero_goal"], hub.endpoint) == paths
     assert hub.sent == []
+
+
+def test_an_expansion_is_not_replaced(hub: Hub, tmp_path: Path) -> None:
+    name = "libero_goal/turn_on_the_stove_demo.hdf5"
+    (tmp_path / name).parent.mkdir()
+    with h5py.File(tmp_path / name, "w") as file:
+        file.create_group("data/demo_0").attrs["expanded_from"] = "libero_goal/turn_on_the_stove/demo_0"
+    before = (tmp_path / name).read_bytes()
+    with pytest.raises(PipelineError, match="demos expand"):
+        fetch(tmp_path, ["libero_goal"], hub.endpoint)
+    assert ((tmp_path / name).read_bytes(), hub.sent) == (before, [])
 
 
 def test_goes_on_where_it_stopped(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,6 +44,25 @@ def test_as_many_as_asked_for_in_liberos_layout(expanded: tuple[Path, Expansion]
     index = HDF5Source(root).index([STOVE])
     assert not index.problems
     assert [entry.origin for entry in index.entries] == ["expanded", "expanded"]
+    with h5py.File(next(root.rglob("*.hdf5"))) as file:
+        for demo in file["data"].values():
+            # As create_dataset.py writes them: the robot's state, fingers and hand, is observed after the action.
+            robot, seen = np.array(demo["robot_states"]), demo["obs"]
+            np.testing.assert_array_equal(robot[:, :2], seen["gripper_states"])
+            np.testing.assert_array_equal(robot[:, 2:5], seen["ee_pos"])
+
+
+def test_the_command_tells_what_is_short_and_fails_where_nothing_was_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("pipeline.run.expand.expand", lambda *_: Expansion(short={"libero_goal/turn_on_the_stove": 2}))
+    link_testset(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["pipeline", "demos", "expand", "out", "--tasks", *TASKS.tasks, "--per-task", "2"])
+    assert main() == 1
+    told = capsys.readouterr().out
+    assert "2 fewer than asked for of libero_goal/turn_on_the_stove" in told
+    assert "configuration" not in told
 
 
 def test_each_succeeds_again_open_loop_and_starts_elsewhere(expanded: tuple[Path, Expansion]) -> None:
