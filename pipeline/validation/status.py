@@ -1,7 +1,7 @@
 """Where a run stands: what is kept of what is wanted, what would run and why, and the disk. Nothing is changed."""
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.table import Table
@@ -11,6 +11,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
 from pipeline.run import cleaning, export, finished, inputs, machine, outcome
 from pipeline.run.outcome import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
@@ -160,20 +161,31 @@ def _time_left(
     frames: Mapping[str, Shown],
     steps: Mapping[str, str],
 ) -> Iterator[str]:
-    """By the speed that ``doctor`` found, the share of the needed rows that is not made, and what would run."""
+    """By the speed that ``doctor`` found, what the needed rows lack, and what would run."""
     speed = machine.known_speed(config.data)
     if speed is None or not needed:
         return
     anew = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
-    left = {
-        "replay": sum(row.trajectory_id not in verdicts for row in needed) / len(needed),
-        "render": sum(not outcome.rendered(row, frames) for row in needed) / len(needed),
+    left = not_made(needed, verdicts, frames) | {
         "export": float(anew),
         "validate": float(anew or any(step.startswith(("manifest", "validate")) for step in steps)),
     }
     left["GPU"] = left["render"]
     left_s = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(config, speed).items()}
     yield f"time left: {in_words(left_s, workers_of(config.compute))}"
+
+
+def not_made(
+    needed: Sequence[plan.Row], verdicts: Mapping[str, Verdict], frames: Mapping[str, Shown]
+) -> dict[str, float]:
+    """Shares in [0, 1] of what ``replay`` and ``render`` do for these rows; what several rows share counts once."""
+    trajectories = {row.trajectory_id for row in needed}
+    streams = {(row.trajectory_id, one.stream_id) for row in needed for one in streams_of(row.perturbations).values()}
+    rendered = {(trajectory, stream) for trajectory, shown in frames.items() for stream in shown.streams}
+    return {
+        "replay": len(trajectories - verdicts.keys()) / len(trajectories),
+        "render": len(streams - rendered) / len(streams),
+    }
 
 
 def _disk(config: Config) -> str:
