@@ -109,7 +109,7 @@ class Reader:
             _, text = self._heading(suite, f"{base.name}_language_{number}")
             return base.name, name, "language", "rewrite", {"text": text}
         if (number := match["robot"]) and int(number):
-            return base.name, name, "robot", "initial_joints", {"id": int(number)}
+            return base.name, name, "robot", "controller_posture", {"id": int(number)}
         if view := match["view"]:
             return base.name, name, "camera", *_camera(*map(int, view.split("_")))
         if match["layout"]:

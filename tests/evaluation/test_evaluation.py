@@ -148,7 +148,7 @@ def test_a_camera_task_is_seen_from_the_axis_camera(evaluated: EpisodeEnvironmen
 def test_a_robot_task_starts_at_the_state_and_drifts_to_its_posture(evaluated: EpisodeEnvironment) -> None:
     evaluated.reset(FIRST)
     clean = evaluated.simulator.observed.joint_state
-    task = some_test_task("robot", "initial_joints")
+    task = some_test_task("robot", "controller_posture")
     evaluated.reset(task)
     drift_rad = np.linalg.norm(evaluated.simulator.observed.joint_state - clean)
     # The benchmark's postures are 0.1 to 0.5 rad away; ten settling steps reach some of it.

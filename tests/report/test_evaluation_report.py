@@ -47,7 +47,7 @@ def test_an_episode_counts_for_the_test_tasks_that_it_stands_for() -> None:
     assert line["total"] is None
     assert line["shared"] is not None
     assert line["shared"]["rate"] == line["cells"]["robot"]["rate"]
-    absent = "initial_joints level 2 and 3 and 4 (1,023 tasks), libero_goal, libero_object, libero_spatial"
+    absent = "controller_posture level 2 and 3 and 4 (1,023 tasks), libero_goal, libero_object, libero_spatial"
     assert line["cells"]["robot"]["absent"] == absent
 
 

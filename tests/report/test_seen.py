@@ -20,7 +20,7 @@ from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats
 
-KINDS = {("robot", "initial_joints"): "controller_posture", ("pose", "pose"): "scene"}
+KINDS = {("pose", "pose"): "scene"}
 """What this project calls what the benchmark's test tasks do, where the names differ."""
 TOLD = [name for name in AXES if name not in ("light", "language")]
 """The axes whose kinds of tests are known by name."""

@@ -22,7 +22,7 @@ COUNTS = {
     ("camera", "distance"): (76, 82, 78, 77),
     ("camera", "spherical"): (238, 237, 259, 258),
     ("camera", "orientation"): (62, 77, 71, 84),
-    ("robot", "initial_joints"): (350, 398, 409, 393),
+    ("robot", "controller_posture"): (350, 398, 409, 393),
     ("language", "rewrite"): (390, 354, 410, 383),
     ("light", "unknown"): (292, 297, 279, 274),
     ("background", "surface"): (140, 147, 158, 168),
@@ -135,7 +135,7 @@ def test_parameters_are_those_the_benchmark_was_measured_to_have(test: TestSet) 
         ),
         (
             "libero_goal", "open_the_middle_drawer_of_the_cabinet", "_view_0_0_100_0_0_initstate_331", "robot",
-            "initial_joints", {"id": 331},
+            "controller_posture", {"id": 331},
         ),
         (
             "libero_goal", "open_the_middle_drawer_of_the_cabinet", "_view_0_0_100_0_0_initstate_0_noise_1", "noise",
