@@ -2,6 +2,9 @@
 
 from functools import partial
 
+MAKE_AGAIN = "python -m pipeline run CONFIG"
+"""The remedy where something that a run makes is missing or damaged. `dvc repro` would run what params.yaml names."""
+
 
 class PipelineError(Exception):
     """Says what is wrong, where, what was expected and what to try.

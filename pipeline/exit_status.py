@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 
 GO_ON = "run the same command again: what is finished is kept"
 
@@ -17,7 +17,7 @@ SURROUNDINGS = {
     errno.EROFS: ("this file system cannot be written to", f"mount it for writing, and {GO_ON}"),
     errno.EACCES: ("you may not read or write this", f"change its permissions or its owner, and {GO_ON}"),
     errno.EPERM: ("you may not change this", f"change its permissions or its owner, and {GO_ON}"),
-    errno.ENOENT: ("not there", "`dvc repro` makes everything that a stage needs, in order"),
+    errno.ENOENT: ("not there", f"`{MAKE_AGAIN}` makes everything that a stage needs, in order"),
     errno.ENOTDIR: ("a file is where a folder should be", f"move it away, and {GO_ON}"),
     errno.EEXIST: ("something else is where a folder should be", f"move it away, and {GO_ON}"),
     errno.EISDIR: ("a folder is where a file should be", f"move it away, and {GO_ON}"),

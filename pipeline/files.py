@@ -11,7 +11,7 @@ from hashlib import file_digest
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 
 
 def schema_file(name: str) -> Path:
@@ -56,7 +56,7 @@ def checksum_of(version: Edition) -> str:
     return checksum(version.path)
 
 
-def read_json(file: Path, remedy: str = "dvc repro") -> dict[str, Any]:
+def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
     """A JSON object that a stage wrote.
 
     Raises:

@@ -116,7 +116,9 @@ class Work:
             "seconds": self._seconds(),
             "cores": os.cpu_count(),
         }
-        settings = self.experiment.model_dump(mode="json", exclude={"data", "decisions", "seeds"}, exclude_defaults=True)
+        settings = self.experiment.model_dump(
+            mode="json", exclude={"data", "decisions", "seeds"}, exclude_defaults=True
+        )
         settings["run"] = self.experiment.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"})
         rows = [row for row in EpisodeFiles(folder).rows() if row.trial[0] in tested]
         return PolicyResults(arm, seed, settings, made, rows, reading).write(kept)

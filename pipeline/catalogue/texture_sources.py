@@ -167,7 +167,7 @@ def kept(name: str, sha256: str) -> Texture:
         raise PipelineError(
             f"the texture {name} is {'missing' if texture is None else 'damaged: delete its file'}",
             where=file,
-            remedy=f"copy {FOLDER} from where the plan was made, or `dvc repro --force --single-item plan`",
+            remedy=f"copy {FOLDER} from where the plan was made, or python stages/plan.py CONFIG",
         )
     return texture
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import read_json
 from pipeline.formats import exact_statistics
 from pipeline.formats.tfrecord import METADATA, columns, records
@@ -85,7 +85,10 @@ def datasets(root: Path) -> list[Path]:
     found = sorted(file.parent for file in root.glob("*/*/dataset_info.json"))
     if not found:
         raise PipelineError(
-            "no RLDS dataset", where=root, expected="NAME/1.0.0/dataset_info.json", remedy="run `dvc repro`"
+            "no RLDS dataset",
+            where=root,
+            expected="NAME/1.0.0/dataset_info.json",
+            remedy=MAKE_AGAIN,
         )
     return found
 
@@ -195,7 +198,7 @@ def check_run(data: Path) -> dict[str, dict[str, Any]]:
         PipelineError: when there is no dataset, or a file that cannot be read.
     """
     folders = datasets(data / "rlds")
-    known = read_json(data / "dataset_statistics.json", "dvc repro manifest")
+    known = read_json(data / "dataset_statistics.json", MAKE_AGAIN)
     return {folder.parent.name: check(folder, known) for folder in folders}
 
 

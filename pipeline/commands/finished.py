@@ -95,6 +95,10 @@ def regenerate(arguments: argparse.Namespace) -> int:
     from pipeline.validation.regenerate import regenerate
 
     manifest, demos = arguments.manifest, arguments.demos
+    if (manifest is None and demos is not None) or (manifest is not None and arguments.config is not None):
+        raise PipelineError(
+            "two places to take the demonstrations from", where="options", expected="CONFIG, or --manifest and --demos"
+        )
     if manifest is None:
         config = owned(arguments)
         manifest, demos = config.data / "manifest.parquet", config.demos.root

@@ -44,7 +44,11 @@ def _clean_arguments(command: argparse.ArgumentParser) -> None:
 
     add_config(command)
     command.add_argument(
-        "--only", nargs="+", choices=cleaning.PARTS, metavar="PART", help=f"any of {', '.join(cleaning.PARTS)}"
+        "--only",
+        action="append",
+        choices=cleaning.PARTS,
+        metavar="PART",
+        help=f"{', '.join(cleaning.PARTS)}; may be given several times",
     )
     command.add_argument("--yes", action="store_true", help="do not ask")
 

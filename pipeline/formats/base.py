@@ -15,7 +15,7 @@ import pyarrow as pa
 from pydantic import BaseModel
 
 from pipeline.episode_schema import SCHEMA, GripperSpec
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.formats.episodes import Episodes, Load, Piece
 from pipeline.formats.read_back import Copy, Fault, Written
 from pipeline.identity import Step
@@ -115,7 +115,7 @@ class Format(ABC, Generic[Options]):
             raise PipelineError(
                 f"no finished dataset ({error})",
                 where=self.record_file,
-                remedy=f"dvc repro export_{self.stage_record.stem}",
+                remedy=MAKE_AGAIN,
             ) from error
 
     def written(self) -> list[Written]:

@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, LANGUAGE, OBJECT_POSES, camera_column
 from pipeline.formats.read_back import Copy, sampled
@@ -64,7 +64,10 @@ def readable(root: Path, version: str = "v3.0", also: tuple[type[Exception], ...
         yield
     except (*UNREADABLE, *also) as error:
         raise PipelineError(
-            f"{type(error).__name__}: {error}", where=root, expected=f"a LeRobot {version} dataset", remedy="dvc repro"
+            f"{type(error).__name__}: {error}",
+            where=root,
+            expected=f"a LeRobot {version} dataset",
+            remedy=MAKE_AGAIN,
         ) from error
 
 

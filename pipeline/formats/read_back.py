@@ -7,6 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from pipeline.errors import MAKE_AGAIN
 from pipeline.files import checksum
 from pipeline.types import Episode, Frame
 
@@ -68,7 +69,7 @@ class Written:
 
     def faults(self) -> list[Fault]:
         """What is off with it, by reading all of it: nothing, or that it is not what was written."""
-        expected = f"what its checksum in {self.dataset}.json is of; delete it, and `dvc repro` makes it again"
+        expected = f"what its checksum in {self.dataset}.json is of; delete it, and `{MAKE_AGAIN}` makes it again"
         try:
             same = checksum(self.file) == self.sha256
         except OSError as error:

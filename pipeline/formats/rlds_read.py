@@ -9,7 +9,7 @@ from typing import Any
 import tensorflow_datasets as tfds
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named, provenance_of
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Copy, Fault, sampled
@@ -103,7 +103,10 @@ def _info(folder: Path) -> Any:
         return _opened(edition(folder / "dataset_info.json"))
     except (OSError, ValueError, KeyError) as error:
         raise PipelineError(
-            f"{type(error).__name__}: {error}", where=folder, expected="a set that TFDS opens", remedy="dvc repro"
+            f"{type(error).__name__}: {error}",
+            where=folder,
+            expected="a set that TFDS opens",
+            remedy=MAKE_AGAIN,
         ) from error
 
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from pipeline.axes import Axis, Perturbation, PhysicsPerturbation, TextPerturbation, in_order, of_layer, to_json
 from pipeline.config import PlanConfig, ReplayConfig
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
 from pipeline.tables import read_table, write_table
@@ -128,7 +128,7 @@ def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
     if any(row.episode_id != _identity("episode", row.demo_sha256, replay, row.perturbations) for row in rows):
         raise PipelineError(
             "the section replay has changed since the plan",
-            remedy="`dvc repro`, or the stage plan, which plans again; or put the section back",
+            remedy=f"`{MAKE_AGAIN}`, which plans again; or put the section back",
         )
 
 
@@ -276,7 +276,7 @@ def read(path: Path) -> list[Row]:
         PipelineError: when it is missing, damaged or not a plan of this version.
     """
     names = [column.name for column in fields(Row)]
-    columns = read_table(path, names, "dvc repro plan").select(names).to_pydict()
+    columns = read_table(path, names, MAKE_AGAIN).select(names).to_pydict()
     return [Row(*row) for row in zip(*columns.values(), strict=True)]
 
 

@@ -17,7 +17,7 @@ import httpx
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, errors, get_token
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import read_json
 from pipeline.formats.base import Format
 from pipeline.publish.card import REPORTS, REPOSITORY
@@ -136,10 +136,10 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
             f"{len(foreign)} files that are not of the dataset, {len(linked)} that lie elsewhere, such as "
             f"{(foreign + linked)[0]}",
             where=root,
-            remedy="move them away (training may leave files), or dvc repro to write the dataset anew",
+            remedy=f"move them away (training may leave files), or delete the dataset and `{MAKE_AGAIN}`",
         )
     if missing := sorted(wanted - found.keys()):
-        raise PipelineError(f"lacks {len(missing)} files, such as {missing[0]}", where=root, remedy="dvc repro")
+        raise PipelineError(f"lacks {len(missing)} files, such as {missing[0]}", where=root, remedy=MAKE_AGAIN)
     return found
 
 
@@ -153,10 +153,10 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
             f"{len(failed)} of {len(checks)} checks failed: {'; '.join(failed)}",
             where=report,
             expected="at least one check, and no findings",
-            remedy="mend what it finds, and dvc repro",
+            remedy=f"mend what it finds, and `{MAKE_AGAIN}`",
         )
     if not card.is_file():
-        raise PipelineError("not there", where=card, remedy="dvc repro")
+        raise PipelineError("not there", where=card, remedy=MAKE_AGAIN)
     newest = max(*files.values(), data / "manifest.parquet", key=_written)
     for before, after in pairwise((newest, report, card)):
         if _written(after) < _written(before):
@@ -164,7 +164,7 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
                 f"older than {before}, which it is about",
                 where=after,
                 # Forced: where a file was written anew with the same content, DVC sees nothing to do.
-                remedy="dvc repro --force --single-item validate card",
+                remedy="python stages/validate.py CONFIG && python stages/card.py CONFIG",
             )
 
 

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import Where
 from pipeline.identity import DISTRIBUTION, VERSIONS, versions
 from pipeline.planning import plan
@@ -138,7 +138,7 @@ def read(path: Path) -> list[dict[str, Any]]:
     Raises:
         PipelineError: when it is missing, damaged or not a manifest of this version.
     """
-    return list(read_table(path, schema().names, "dvc repro manifest").to_pylist())
+    return list(read_table(path, schema().names, MAKE_AGAIN).to_pylist())
 
 
 def settings(path: Path) -> Settings:
@@ -157,7 +157,7 @@ def settings(path: Path) -> Settings:
             f"not a manifest of this version ({error})",
             where=path,
             expected="the columns of schemas/manifest.json, and the settings that its episodes were made under",
-            remedy="run `dvc repro manifest`",
+            remedy=MAKE_AGAIN,
         ) from error
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import Config, FilterConfig
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import ExportConfig
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
@@ -146,7 +146,7 @@ def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
         raise PipelineError(
             f"what the plan needs is missing, damaged or not current in {len(missing)} places, such as this one",
             where=missing[0],
-            remedy=f"call `dvc repro`, or run the {stage} stage again: it makes only those",
+            remedy=f"`{MAKE_AGAIN}`, or python stages/{stage}.py CONFIG: makes only those",
         )
 
 

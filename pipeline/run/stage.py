@@ -12,7 +12,7 @@ from pathlib import Path
 import yaml
 
 from pipeline.config import Config, load
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.exit_status import exit_status
 from pipeline.files import remove_leftovers, write_json
 from pipeline.identity import REMAKE
@@ -85,7 +85,7 @@ def locked(folder: Path) -> Iterator[None]:
                 "another stage of this run is running, here or on another machine",
                 where=folder,
                 expected="one stage at a time, as each reads what the one before it has finished",
-                remedy="wait for it, or stop it; `dvc repro` runs all stages in order",
+                remedy=f"wait for it, or stop it; `{MAKE_AGAIN}` runs all stages in order",
             ) from error
         except OSError as error:  # Such as Lustre, mounted without them.
             raise PipelineError(

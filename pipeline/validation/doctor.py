@@ -22,6 +22,7 @@ from pipeline import gl
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
 from pipeline.config import ComputeConfig, Config, DemosConfig
 from pipeline.errors import PipelineError
+from pipeline.formats.registry import FORMATS
 from pipeline.identity import DISTRIBUTION
 from pipeline.libero.assets import REINSTALL
 from pipeline.libero.demonstrations import HDF5Source
@@ -235,6 +236,9 @@ def _has_pip() -> bool:
 def _disk(data: Path, need_gb: float) -> Diagnosis:
     there_gb = free_gb(data)
     detail = f"{there_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
+    # What changes a dataset is known once the plan is made.
+    if largest_mb := max((size_mb(data / kind.name) for kind in FORMATS), default=0.0):
+        detail += f", up to {largest_mb / 1e3:.1f} more where a dataset is made anew, as the old one stays until then"
     if there_gb < need_gb:
         return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
     return Diagnosis("disk", "ok", detail)

@@ -167,7 +167,7 @@ def test_clean_deletes_what_was_said_and_nothing_else(clone: Path) -> None:
     assert "add --yes" in asked.stderr
     assert "made again by export_rlds" in asked.stdout
     assert set(data.rglob("*")) == files
-    done = call(clone, "clean", "configs/tiny.yaml", "--only", "rlds", "--yes")
+    done = call(clone, "clean", "--only", "rlds", "--yes", "configs/tiny.yaml")
     assert done.returncode == 0, done.stderr
     gone = files - set(data.rglob("*")) - {data / ".lock"}
     assert gone == {data / "rlds.json", data / "rlds", *(file for file in files if data / "rlds" in file.parents)}

@@ -85,4 +85,4 @@ def test_a_stage_without_its_inputs_says_which(stage: str, tmp_path: Path) -> No
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
     assert re.search(r"error: \S*data/starter", done.stderr)
-    assert "dvc repro" in done.stderr
+    assert "python -m pipeline run" in done.stderr

@@ -185,7 +185,7 @@ def test_the_same_data_give_the_same_figure() -> None:
 
 def test_an_unfinished_run_says_what_to_run(config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(PipelineError, match="dvc repro"):
+    with pytest.raises(PipelineError, match="python -m pipeline run"):
         report.page(config, benchmark.load(REPOSITORY / benchmark.FOLDER))
 
 
