@@ -269,6 +269,49 @@ def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, fr
     assert ("licensed under [CC BY 4.0]" in text) == free
 
 
+def test_demonstrations_of_own_tasks_are_not_attributed_to_libero(data: Path) -> None:
+    own = [row(one["axis"], suite="my_suite") for one in ROWS[:1]]
+    write_rows(data, own, "hdf5")
+    text = written(data, "lerobot")
+    metadata = metadata_of(text)
+    assert metadata["license"] == "other"
+    assert "source_datasets" not in metadata
+    for claim in ("Liu, Zhu", "yifengzhu-hf", "human", "LIBERO demonstration", "LIBERO's wording", "[CC BY 4.0]"):
+        assert claim not in text
+    assert "1 recorded demonstrations of 1 tasks went in" in text
+    assert "**Demonstrations and tasks of my_suite**: of whoever published this dataset" in text
+    # Beside LIBERO's, both are named.
+    write_rows(data, [*own, row("clean", task=STOVE)], "hdf5")
+    text = written(data, "lerobot")
+    metadata = metadata_of(text)
+    assert metadata["license"] == "other"
+    assert metadata["source_datasets"] == ["yifengzhu-hf/LIBERO-datasets"]
+    assert "**Demonstrations of LIBERO's tasks**: [LIBERO]" in text
+    assert "tasks of my_suite" in text
+
+
+def test_only_the_starter_sets_demonstrations_are_called_human(data: Path) -> None:
+    assert "2 human demonstrations of 2 tasks" in written(data, "rlds")
+    write_rows(data, ROWS, "hdf5")
+    text = written(data, "rlds")
+    assert "2 recorded demonstrations of 2 tasks" in text
+    assert "Whether the publisher's files are LIBERO's own was not checked." in text
+    assert metadata_of(text)["license"] == "cc-by-4.0"
+
+
+def test_rewrites_of_another_bank_are_not_licensed(data: Path) -> None:
+    shipped = deal(STOVE)[0]
+    write_rows(data, [row("clean", task=STOVE), row("language", shipped, task=STOVE)])
+    text = written(data, "rlds")
+    assert "that made this dataset are under MIT.\n" in text
+    assert metadata_of(text)["license"] == "cc-by-4.0"
+    own = LanguagePerturbation(component="paraphrase", level=1, text="please turn that stove on for me")
+    write_rows(data, [row("clean", task=STOVE), row("language", own, task=STOVE)])
+    text = written(data, "rlds")
+    assert "others are of\n  whoever published it, and their licence is not known here." in text
+    assert metadata_of(text)["license"] == "other"
+
+
 LEROBOT_COLUMNS = [f"camera.{view}.{name}" for view in ("agent", "wrist") for name in ("depth", "segmentation")]
 NAMES = {
     "rlds": ["image_depth", "wrist_image_depth", "image_segmentation", "wrist_image_segmentation"],
