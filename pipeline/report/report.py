@@ -79,6 +79,7 @@ def page(config: Config, test: TestSet) -> str:
         quality=[_strips(each.name, kept, itemgetter(each.name), each.name) for each in fields(Quality)],
         worst=_worst(kept, twins, load),
         seen=seen.measure(config, test),
+        sample=seen.SAMPLE,
         coverage=_coverage(tried, test),
         rewrites=_rewrites(kept),
         leakage=leakage,

@@ -356,3 +356,13 @@ def test_a_validation_split_is_named(data: Path, kind: str, words: str) -> None:
     split = {one: options.model_copy(update={"validation": 0.2}) for one, options in OPTIONS.formats.items()}
     told = written(data, kind, OPTIONS.model_copy(update=split)).partition("For validation, 20 % of")[2]
     assert words in told.partition("## Episodes")[0]
+
+
+def test_what_was_not_compared_is_counted(data: Path) -> None:
+    leakage = json.loads((data / "leakage.json").read_text())
+    leakage["camera"] |= {"not_compared": 3, "verdict": "unknown"}
+    (data / "leakage.json").write_text(json.dumps(leakage))
+    text = written(data, "rlds")
+    distance = cells(text, "axis", "Distance to the LIBERO-Plus test set")
+    assert cells(text, "camera", "Distance to the LIBERO-Plus test set")[distance.index("not_compared")] == "3"
+    assert "`unknown` means that no row could be compared, `disjoint where compared` that some could not." in text
