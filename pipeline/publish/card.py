@@ -184,20 +184,14 @@ def _metadata(shown: AnyFormat, name: str, *, free: bool, libero: bool) -> Datas
 
 
 def _axes(kept: Iterable[Mapping[str, Any]], shown: AnyFormat) -> dict[str, dict[str, Any]]:
-    """Axis to what it is, and how many episodes show each of its components and levels, combinations included."""
+    """Axis to its kinds of change, and how many episodes show each component and level, combinations included."""
     found: dict[str, dict[str, Any]] = {}
     for row in kept:
         for change in from_json(row["perturbations"]):
-            axis = found.setdefault(
-                change.axis,
-                {
-                    "what": (inspect.getdoc(type(change)) or "").partition("\n")[0],
-                    "changes": _changes(change, shown),
-                    "components": Counter(),
-                    "levels": Counter(),
-                },
-            )
-            axis["components"][change.component] += 1
+            axis = found.setdefault(change.axis, {"kinds": {}, "levels": Counter()})
+            what = (inspect.getdoc(type(change)) or "").partition("\n")[0]
+            kind = f"{what} Changes {_changes(change, shown)}."
+            axis["kinds"].setdefault(kind, Counter())[change.component] += 1
             axis["levels"][change.level] += 1
     return found
 

@@ -366,3 +366,12 @@ def test_what_was_not_compared_is_counted(data: Path) -> None:
     distance = cells(text, "axis", "Distance to the LIBERO-Plus test set")
     assert cells(text, "camera", "Distance to the LIBERO-Plus test set")[distance.index("not_compared")] == "3"
     assert "`unknown` means that no row could be compared, `disjoint where compared` that some could not." in text
+
+
+def test_each_kind_of_an_axis_is_described_with_its_own_components(data: Path) -> None:
+    moved = [PoseAxis(components=(one,)).sample(rng("card", one), BOWL, 0) for one in ("scene", "target")]
+    for order in (moved, moved[::-1]):
+        write_rows(data, [row("clean"), *(row("pose", one, level=str(place)) for place, one in enumerate(order))])
+        pose = written(data, "rlds").partition("### pose\n")[2].partition("##")[0]
+        assert re.search(r"Every object and fixture moved .*\nComponents: scene \(1\)\.\n", pose)
+        assert re.search(r"One object moved .*\nComponents: target \(1\)\.\n", pose)
