@@ -375,3 +375,13 @@ def test_each_kind_of_an_axis_is_described_with_its_own_components(data: Path) -
         pose = written(data, "rlds").partition("### pose\n")[2].partition("##")[0]
         assert re.search(r"Every object and fixture moved .*\nComponents: scene \(1\)\.\n", pose)
         assert re.search(r"One object moved .*\nComponents: target \(1\)\.\n", pose)
+
+
+def test_the_command_that_makes_an_episode_again_has_the_demonstrations(data: Path) -> None:
+    assert "--demos" not in written(data, "rlds")
+    write_rows(data, ROWS, "hdf5")
+    text = written(data, "rlds")
+    assert "--manifest manifest.parquet --demos DIR --out again\n" in text
+    assert "demos expand" not in text
+    write_rows(data, [one | {"demo_origin": "expanded"} for one in ROWS], "hdf5")
+    assert "the very files that `demos expand` wrote" in written(data, "rlds")
