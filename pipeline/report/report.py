@@ -70,6 +70,7 @@ def page(config: Config, test: TestSet) -> str:
     return pages.render(
         "report.html.j2",
         name=config.name,
+        origins=counts.origins(kept, config.demos.source),
         headline=_headline(tried, kept),
         yields=yields.tables(tried),
         axes=axes,

@@ -66,6 +66,18 @@ def _rendered(**values: Any) -> str:
     return " ".join(Page(pages.render("report.html.j2", **{**empty, **texts, **values})).text.split())
 
 
+def test_the_first_line_is_of_this_runs_demonstrations_and_axes() -> None:
+    kept = [{"demo_id": name, "demo_origin": "human"} for name in ("a", "b", "b")]
+    kept.append({"demo_id": "c", "demo_origin": "expanded"})
+    plots = coverage.of("camera", [], benchmark.load(REPOSITORY / benchmark.FOLDER))
+    shown = {axis: (plots, yields.by_level("", [])) for axis in ("camera", "disturbance")}
+    text = _rendered(origins=counts.origins(kept, "hdf5"), coverage=shown)
+    assert "1 expanded demonstration and 2 recorded demonstrations, replayed and perturbed on the axes camera, " in text
+    assert "camera, disturbance; made by" in text
+    assert "human" not in text
+    assert "2 human demonstrations, replayed; made by" in _rendered(origins=counts.origins(kept[:3], "starter"))
+
+
 def test_what_was_not_compared_and_not_measured_is_said() -> None:
     pose: dict[str, Any] = {"smallest": None, "clearance": 1.0, "overlaps": 0, "measure": "m", "coverage": {}}
     pose |= {"rows": 55, "not_compared": 53, "test_tasks": 696, "comparisons": 4, "verdict": "disjoint where compared"}
