@@ -61,7 +61,8 @@ class Format(ABC, Generic[Options]):
     columns: ClassVar[tuple[pa.Field, ...]]
     """Of the manifest: where an episode lies; null when it was dropped."""
     keys: Mapping[str, str]
-    """Each view, ``state``, ``joint_state`` and ``action`` to its name in this format."""
+    """Each view, ``state``, ``joint_state`` and ``action`` to its name in this format; each view's matrices and maps,
+    such as ``image_depth``; and ``provenance`` to where that of an episode lies, with its matrices and instances."""
     clients: tuple[str, ...]
     """The clients of ``finetune.yaml`` that train on this format."""
     gripper: GripperSpec = SCHEMA.action.gripper

@@ -8,11 +8,11 @@ from typing import ClassVar
 
 import pyarrow as pa
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA
 from pipeline.export_config import LeRobotConfig
 from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load, Piece, in_a_row, split
-from pipeline.formats.lerobot_columns import FILE_MB, Convention
+from pipeline.formats.lerobot_columns import FILE_MB, Convention, camera_column
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.identity import Step
 from pipeline.tables import column
@@ -26,9 +26,12 @@ class LeRobot(Format[LeRobotConfig]):
     columns: ClassVar = (
         column("lerobot_episode_index", pa.int64(), "episode_index in the LeRobot dataset, null when dropped"),
     )
-    keys = {view: spec.lerobot_key for view, spec in SCHEMA.views.items()} | {
-        name: getattr(SCHEMA, name).lerobot_key for name in ("state", "joint_state", "action")
-    }
+    keys = (
+        {view: spec.lerobot_key for view, spec in SCHEMA.views.items()}
+        | {name: getattr(SCHEMA, name).lerobot_key for name in MOTION}
+        | {f"{view}_{own}": camera_column(view, own) for view in SCHEMA.views for own in (*MATRICES, *MAPS)}
+        | {"provenance": "meta/provenance.parquet"}
+    )
     clients = ("lerobot_act", "lerobot_smolvla", "lerobot_pi05")
 
     @property

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import pyarrow as pa
 
-from pipeline.episode_schema import SCHEMA
+from pipeline.episode_schema import MAPS, MATRICES, MOTION, SCHEMA
 from pipeline.export_config import RldsConfig
 from pipeline.formats.base import Format, Row
 from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, split
@@ -29,7 +29,11 @@ class Rlds(Format[RldsConfig]):
         column("rlds_shard", pa.string(), "TFRecord file, null when dropped"),
         column("rlds_index", pa.int64(), "place in the shard, null when dropped"),
     )
-    keys = {view: view for view in SCHEMA.views} | {v: v for v in ("state", "joint_state", "action")}
+    keys = (
+        {name: name for name in (*SCHEMA.views, *MOTION)}
+        | {f"{view}_{own}": f"{view}_{own}" for view in SCHEMA.views for own in (*MATRICES, *MAPS)}
+        | {"provenance": "episode_metadata"}
+    )
     clients = ("openvla_oft",)
 
     def pieces(self, episodes: Episodes) -> list[Piece]:

@@ -66,7 +66,8 @@ class AxisDistance:
         rows: planned episodes that the axis perturbs, reserves among them.
         test_tasks: the benchmark's tasks of this axis.
         comparisons: pairs of an episode and a test task that were compared.
-        not_compared: episodes that could be compared with none of the test tasks, such as those in another scene.
+        not_compared: episodes that could be compared with none of the test tasks, such as those in a scene that none
+            has, or all where what the test tasks change cannot be read offline.
         smallest: the least distance of all, or of the overlaps where there are any; None when there was nothing to
             compare with, or nothing similar.
         closest: the episode it belongs to.
@@ -74,7 +75,7 @@ class AxisDistance:
         measure: what the distance is and its unit; of each kind.
         overlaps: episodes that are closer than that.
         verdict: ``overlap``, ``disjoint``, ``disjoint where compared`` when some episodes were not compared, or
-            ``unknown`` when none was, as what the test tasks change cannot be read offline.
+            ``unknown`` when none was.
         coverage: component of the test tasks to how far these are from the wanted episodes, reserves left out.
     """
 

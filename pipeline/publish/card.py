@@ -15,11 +15,13 @@ from huggingface_hub import DatasetCardData
 
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
+from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.base import Format
+from pipeline.libero.tasks import SUITES
 from pipeline.run import manifest
-from pipeline.run.counts import Counts, named, tally, tried
+from pipeline.run.counts import Counts, named, origins, tally, tried
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """What the card is made from, besides the manifest; in the run's folder."""
@@ -57,6 +59,7 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
         PipelineError: when something that it describes cannot be read.
     """
     rows = manifest.read(data / "manifest.parquet")
+    source = manifest.settings(data / "manifest.parquet").source
     reports = {name: read_json(data / name) for name in REPORTS}
     clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)
@@ -67,7 +70,7 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
             for axis in sheets:
                 shutil.copyfile(data / "sheets" / f"{axis}.png", folder / one.name / "pictures" / f"{axis}.png")
             others = [other.title for other in formats if other is not one]
-            text = render(one, others, rows, reports, clients, sheets=sheets, name=name)
+            text = render(one, others, rows, reports, clients, sheets=sheets, name=name, source=source)
             (folder / one.name / "README.md").write_text(text)
             sums = {one.repository_path(path): sha256 for path, sha256 in one.record().files.items()}
             sums["manifest.parquet"] = checksum(data / "manifest.parquet")
@@ -84,6 +87,7 @@ def render(
     *,
     sheets: Sequence[str],
     name: str,
+    source: str,
 ) -> str:
     """The card of one format, with the hub's metadata in front.
 
@@ -92,22 +96,32 @@ def render(
         reports: what the files of ``REPORTS`` hold.
         clients: the section of that name in ``finetune.yaml``: where and how each policy's code is called.
         sheets: the axes that have a picture.
+        source: of the demonstrations, ``starter`` or ``hdf5``.
     """
     leakage, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
     owed = attributions(row["perturbations"] for row in kept)
-    free = all(FREE.match(one.licence) for one in owed)
+    kept_suites = named(kept, "suite")
+    own_suites = [suite for suite in kept_suites if suite not in SUITES]
+    own_rewrites = _own_rewrites(kept)
+    libero = own_suites != kept_suites
+    free = all(FREE.match(one.licence) for one in owed) and not (own_suites or own_rewrites)
     axes = _axes(kept, shown)
     return TEMPLATES.get_template("card.md.j2").render(
         line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
-        metadata=_metadata(shown, name, free).to_yaml(),
+        metadata=_metadata(shown, name, free=free, libero=libero).to_yaml(),
         format=shown.title,
+        kind=shown.name,
         others=" and ".join(others),
         key=shown.keys,
         loading=shown.loading(name, REPOSITORY, kept),
         name=name,
         kept=kept,
-        origins=Counter({row["demo_id"]: row["demo_origin"] for row in kept}.values()),
+        origins=origins(kept, source),
+        source=source,
+        libero=libero,
+        own_suites=own_suites,
+        own_rewrites=own_rewrites,
         steps=sum(row["steps"] for row in kept),
         rows=rows,
         suites=named(rows, "suite"),
@@ -120,6 +134,9 @@ def render(
         leakage={axis: finding for axis, finding in leakage.items() if axis in axes},
         schema=SCHEMA,
         gripper=shown.gripper,
+        extras=shown.extras,
+        language=shown.language,
+        held_out=shown.options.validation,
         statistics=statistics,
         validation=validation,
         failed=[check for check, found in validation.items() if found["findings"]],
@@ -144,33 +161,37 @@ def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
     return dict(sorted(shown.items(), key=lambda one: (one[0].kind, *one[0])))
 
 
-def _metadata(shown: AnyFormat, name: str, free: bool) -> DatasetCardData:
+def _own_rewrites(kept: Iterable[Mapping[str, Any]]) -> bool:
+    """Whether an instruction is a rewrite that the shipped bank does not have."""
+    return any(
+        isinstance(change, LanguagePerturbation)
+        and change.text not in chain(*load_bank().get(row["suite"], {}).get(row["task"], {}).values())
+        for row in kept
+        for change in from_json(row["perturbations"])
+    )
+
+
+def _metadata(shown: AnyFormat, name: str, *, free: bool, libero: bool) -> DatasetCardData:
     return DatasetCardData(
         language="en",
         license="cc-by-4.0" if free else "other",
         pretty_name=name,
         task_categories=["robotics"],
-        source_datasets=["yifengzhu-hf/LIBERO-datasets"],
+        source_datasets=["yifengzhu-hf/LIBERO-datasets"] if libero else None,
         tags=[shown.title, "LIBERO", "LIBERO-Plus", "panda", "simulation"],
         configs=[*shown.viewer(), {"config_name": "manifest", "data_files": "manifest.parquet"}],
     )
 
 
 def _axes(kept: Iterable[Mapping[str, Any]], shown: AnyFormat) -> dict[str, dict[str, Any]]:
-    """Axis to what it is, and how many episodes show each of its components and levels, combinations included."""
+    """Axis to its kinds of change, and how many episodes show each component and level, combinations included."""
     found: dict[str, dict[str, Any]] = {}
     for row in kept:
         for change in from_json(row["perturbations"]):
-            axis = found.setdefault(
-                change.axis,
-                {
-                    "what": (inspect.getdoc(type(change)) or "").partition("\n")[0],
-                    "changes": _changes(change, shown),
-                    "components": Counter(),
-                    "levels": Counter(),
-                },
-            )
-            axis["components"][change.component] += 1
+            axis = found.setdefault(change.axis, {"kinds": {}, "levels": Counter()})
+            what = (inspect.getdoc(type(change)) or "").partition("\n")[0]
+            kind = f"{what} Changes {_changes(change, shown)}."
+            axis["kinds"].setdefault(kind, Counter())[change.component] += 1
             axis["levels"][change.level] += 1
     return found
 

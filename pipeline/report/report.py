@@ -70,6 +70,7 @@ def page(config: Config, test: TestSet) -> str:
     return pages.render(
         "report.html.j2",
         name=config.name,
+        origins=counts.origins(kept, config.demos.source),
         headline=_headline(tried, kept),
         yields=yields.tables(tried),
         axes=axes,
@@ -79,6 +80,7 @@ def page(config: Config, test: TestSet) -> str:
         quality=[_strips(each.name, kept, itemgetter(each.name), each.name) for each in fields(Quality)],
         worst=_worst(kept, twins, load),
         seen=seen.measure(config, test),
+        sample=seen.SAMPLE,
         coverage=_coverage(tried, test),
         rewrites=_rewrites(kept),
         leakage=leakage,

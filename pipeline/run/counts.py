@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from pipeline.libero.demonstrations import HUMAN
 from pipeline.planning.plan import NOT_NEEDED
 from pipeline.run.outcome import MADE
 
@@ -55,6 +56,18 @@ def twins(rows: Rows) -> dict[str, Mapping[str, Any]]:
 def named(rows: Rows, column: str) -> list[str]:
     """The values of a column, each once, in the order in which they come."""
     return list(dict.fromkeys(row[column] for row in rows))
+
+
+def origins(rows: Rows, source: str) -> Counter[str]:
+    """Who made the demonstrations of some rows, to how many: ``human``, ``recorded`` or ``expanded``.
+
+    Args:
+        source: of the run's demonstrations. Who recorded an HDF5 file, a person or a policy, is not known.
+    """
+    made = Counter({row["demo_id"]: row["demo_origin"] for row in rows}.values())
+    if source == "hdf5" and HUMAN in made:
+        made["recorded"] = made.pop(HUMAN)
+    return made
 
 
 def tally(rows: Rows, column: str) -> dict[str, Counter[str]]:

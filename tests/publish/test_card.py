@@ -5,28 +5,31 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 import pytest
 import yaml
-from conftest import MILK, STOVE
+from conftest import BOWL, MILK, STOVE
 from huggingface_hub import DatasetCard
 
 from pipeline.axes import to_json
 from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
 from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraAxis
+from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.axes.layout import LayoutAxis
+from pipeline.axes.pose import PoseAxis
+from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.registry import FORMATS, columns, formats_of
 from pipeline.publish import card
 from pipeline.run import manifest
 from pipeline.seeding import rng
-from pipeline.tables import write_table
-from pipeline.types import Task
+from pipeline.types import Extra, Task
 
 NAME = "libero_tiny"
 CAMERA = CameraAxis(levels=(4,)).sample(rng("card"), MILK, 0)
@@ -71,6 +74,7 @@ ROWS = [
 ]
 COVERAGE = {"test_tasks": 313, "compared": 313, "smallest": 5.379, "median": 6.12, "p90": 7.34, "largest": 8.56}
 FINDING = {"rows": 3, "test_tasks": 1599, "comparisons": 4797, "smallest": 5.379, "closest": "e", "clearance": 5.0}
+FINDING |= {"not_compared": 0}
 DATA_SHA256 = hashlib.sha256(b"data").hexdigest()
 VALIDATION: dict[str, dict[str, Any]] = {"gripper": {"checked": 7, "findings": []}}
 
@@ -108,17 +112,21 @@ def data(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def write_rows(data: Path, rows: list[dict[str, Any]]) -> None:
-    write_table(pa.Table.from_pylist(rows, schema=manifest.schema(columns())), data / "manifest.parquet")
+def write_rows(data: Path, rows: list[dict[str, Any]], source: Literal["starter", "hdf5"] = "starter") -> None:
+    settings = manifest.Settings(source=source, replay=ReplayConfig(), render=RenderConfig())
+    table = pa.Table.from_pylist(rows, schema=manifest.schema(columns()))
+    manifest.write(table, data / "manifest.parquet", settings)
 
 
-def write(data: Path) -> None:
-    options = ExportConfig(
-        rlds=RldsConfig(name=NAME, shards=1),
-        lerobot=LeRobotConfig(name=NAME, shards=1),
-        lerobot_v21=LeRobotV21Config(name=NAME, convention="ipec"),
-    )
-    card.write(data, formats_of(data, options), NAME)
+OPTIONS = ExportConfig(
+    rlds=RldsConfig(name=NAME, shards=1),
+    lerobot=LeRobotConfig(name=NAME, shards=1),
+    lerobot_v21=LeRobotV21Config(name=NAME, convention="ipec"),
+)
+
+
+def write(data: Path, options: ExportConfig = OPTIONS, extras: Sequence[Extra] = ()) -> None:
+    card.write(data, formats_of(data, options, extras), NAME)
 
 
 def test_other_formats_are_named_where_there_are_any(data: Path) -> None:
@@ -128,8 +136,8 @@ def test_other_formats_are_named_where_there_are_any(data: Path) -> None:
     assert "This repository holds the RLDS form. `manifest.parquet` has" in alone
 
 
-def written(data: Path, kind: str) -> str:
-    write(data)
+def written(data: Path, kind: str, options: ExportConfig = OPTIONS, extras: Sequence[Extra] = ()) -> str:
+    write(data, options, extras)
     return (data / "card" / kind / "README.md").read_text()
 
 
@@ -259,3 +267,121 @@ def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, fr
     text = written(data, "rlds")
     assert metadata_of(text)["license"] == ("cc-by-4.0" if free else "other")
     assert ("licensed under [CC BY 4.0]" in text) == free
+
+
+def test_demonstrations_of_own_tasks_are_not_attributed_to_libero(data: Path) -> None:
+    own = [row(one["axis"], suite="my_suite") for one in ROWS[:1]]
+    write_rows(data, own, "hdf5")
+    text = written(data, "lerobot")
+    metadata = metadata_of(text)
+    assert metadata["license"] == "other"
+    assert "source_datasets" not in metadata
+    for claim in ("Liu, Zhu", "yifengzhu-hf", "human", "LIBERO demonstration", "LIBERO's wording", "[CC BY 4.0]"):
+        assert claim not in text
+    assert "1 recorded demonstrations of 1 tasks went in" in text
+    assert "**Demonstrations and tasks of my_suite**: of whoever published this dataset" in text
+    # Beside LIBERO's, both are named.
+    write_rows(data, [*own, row("clean", task=STOVE)], "hdf5")
+    text = written(data, "lerobot")
+    metadata = metadata_of(text)
+    assert metadata["license"] == "other"
+    assert metadata["source_datasets"] == ["yifengzhu-hf/LIBERO-datasets"]
+    assert "**Demonstrations of LIBERO's tasks**: [LIBERO]" in text
+    assert "tasks of my_suite" in text
+
+
+def test_only_the_starter_sets_demonstrations_are_called_human(data: Path) -> None:
+    assert "2 human demonstrations of 2 tasks" in written(data, "rlds")
+    write_rows(data, ROWS, "hdf5")
+    text = written(data, "rlds")
+    assert "2 recorded demonstrations of 2 tasks" in text
+    assert "Whether the publisher's files are LIBERO's own was not checked." in text
+    assert metadata_of(text)["license"] == "cc-by-4.0"
+
+
+def test_rewrites_of_another_bank_are_not_licensed(data: Path) -> None:
+    shipped = deal(STOVE)[0]
+    write_rows(data, [row("clean", task=STOVE), row("language", shipped, task=STOVE)])
+    text = written(data, "rlds")
+    assert "that made this dataset are under MIT.\n" in text
+    assert metadata_of(text)["license"] == "cc-by-4.0"
+    own = LanguagePerturbation(component="paraphrase", level=1, text="please turn that stove on for me")
+    write_rows(data, [row("clean", task=STOVE), row("language", own, task=STOVE)])
+    text = written(data, "rlds")
+    assert "others are of\n  whoever published it, and their licence is not known here." in text
+    assert metadata_of(text)["license"] == "other"
+
+
+LEROBOT_COLUMNS = [f"camera.{view}.{name}" for view in ("agent", "wrist") for name in ("depth", "segmentation")]
+NAMES = {
+    "rlds": ["image_depth", "wrist_image_depth", "image_segmentation", "wrist_image_segmentation"],
+    "lerobot": LEROBOT_COLUMNS,
+    "lerobot_v21": LEROBOT_COLUMNS,
+}
+
+
+@pytest.mark.parametrize("kind", NAMES)
+def test_what_is_beside_the_frames_is_described_where_it_is_there(data: Path, kind: str) -> None:
+    plain = written(data, kind)
+    for matrix in ("intrinsics", "extrinsics"):
+        views = ("image", "wrist_image") if kind == "rlds" else ("camera.agent", "camera.wrist")
+        assert all(f"`{view}{'_' if kind == 'rlds' else '.'}{matrix}`" in plain for view in views)
+    assert "fx is negative" in plain
+    assert ("`episode_metadata`" if kind == "rlds" else "`meta/provenance.parquet`:") in plain
+    full = written(data, kind, extras=("depth", "segmentation", "object_poses"))
+    for name in (*NAMES[kind], "object_poses", "instances"):
+        assert f"`{name}`" in full
+        assert f"`{name}`" not in plain
+    assert "uint16 PNG as base64 text" in full or kind == "rlds"
+    assert "65535 is 6.5535 m or more;\n  a unit is 0.0001 m." in full
+    assert "`instances`" in written(data, kind, extras=("segmentation",))
+    assert "`instances`" not in written(data, kind, extras=("depth",))
+
+
+def test_a_language_column_and_who_can_open_it_are_named(data: Path) -> None:
+    # As it is written by lerobot 0.6, where the field is not refused.
+    lerobot = LeRobotConfig(name=NAME).model_copy(update={"language": True})
+    text = written(data, "lerobot", ExportConfig(rlds=None).model_copy(update={"lerobot": lerobot}))
+    assert "`language_persistent`" in text
+    assert "before 0.6 cannot open" in text
+    assert "0.6" not in written(data, "lerobot")
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [("rlds", "the split `val` of each set"), ("lerobot", "`meta/info.json`"), ("lerobot_v21", "end in `_val`")],
+)
+def test_a_validation_split_is_named(data: Path, kind: str, words: str) -> None:
+    assert "For validation" not in written(data, kind)
+    split = {one: options.model_copy(update={"validation": 0.2}) for one, options in OPTIONS.formats.items()}
+    told = written(data, kind, OPTIONS.model_copy(update=split)).partition("For validation, 20 % of")[2]
+    assert words in told.partition("## Episodes")[0]
+
+
+def test_what_was_not_compared_is_counted(data: Path) -> None:
+    leakage = json.loads((data / "leakage.json").read_text())
+    leakage["camera"] |= {"not_compared": 3, "verdict": "unknown"}
+    (data / "leakage.json").write_text(json.dumps(leakage))
+    text = written(data, "rlds")
+    distance = cells(text, "axis", "Distance to the LIBERO-Plus test set")
+    assert cells(text, "camera", "Distance to the LIBERO-Plus test set")[distance.index("not_compared")] == "3"
+    assert "`unknown` means that no row could be compared, `disjoint where compared` that some could not." in text
+
+
+def test_each_kind_of_an_axis_is_described_with_its_own_components(data: Path) -> None:
+    moved = [PoseAxis(components=(one,)).sample(rng("card", one), BOWL, 0) for one in ("scene", "target")]
+    for order in (moved, moved[::-1]):
+        write_rows(data, [row("clean"), *(row("pose", one, level=str(place)) for place, one in enumerate(order))])
+        pose = written(data, "rlds").partition("### pose\n")[2].partition("##")[0]
+        assert re.search(r"Every object and fixture moved .*\nComponents: scene \(1\)\.\n", pose)
+        assert re.search(r"One object moved .*\nComponents: target \(1\)\.\n", pose)
+
+
+def test_the_command_that_makes_an_episode_again_has_the_demonstrations(data: Path) -> None:
+    assert "--demos" not in written(data, "rlds")
+    write_rows(data, ROWS, "hdf5")
+    text = written(data, "rlds")
+    assert "--manifest manifest.parquet --demos DIR --out again\n" in text
+    assert "demos expand" not in text
+    write_rows(data, [one | {"demo_origin": "expanded"} for one in ROWS], "hdf5")
+    assert "the very files that `demos expand` wrote" in written(data, "rlds")

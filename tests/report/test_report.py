@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -22,7 +23,7 @@ from pipeline.errors import PipelineError
 from pipeline.images.jpeg import encode
 from pipeline.images.mp4 import VIDEO_BYTES
 from pipeline.libero.tasks import find_task
-from pipeline.report import coverage, figures, pages, report, yields
+from pipeline.report import coverage, figures, pages, report, seen, yields
 from pipeline.report.coverage import Draw
 from pipeline.run import counts, manifest
 from pipeline.run.episode_loader import EpisodeLoader
@@ -54,6 +55,35 @@ def page(html: str) -> Page:
 def test_needs_nothing_beside_itself(html: str) -> None:
     needs_nothing_beside_itself(html)
     assert len(html) < LIMIT_BYTES
+
+
+def _rendered(**values: Any) -> str:
+    """The text of a page of a run without episodes, but for what ``values`` have."""
+    names = ("yields", "axes", "overall", "lengths", "quality", "worst", "seen", "rewrites", "videos")
+    tables = ("headline", "by_axis", "coverage", "leakage", "sheets", "previews", "versions", "origins")
+    empty: dict[str, Any] = {**dict.fromkeys(names, ()), **{name: {} for name in tables}}
+    texts = {"name": "tiny", "example": "", "settings": "", "sample": seen.SAMPLE}
+    return " ".join(Page(pages.render("report.html.j2", **{**empty, **texts, **values})).text.split())
+
+
+def test_the_first_line_is_of_this_runs_demonstrations_and_axes() -> None:
+    kept = [{"demo_id": name, "demo_origin": "human"} for name in ("a", "b", "b")]
+    kept.append({"demo_id": "c", "demo_origin": "expanded"})
+    plots = coverage.of("camera", [], benchmark.load(REPOSITORY / benchmark.FOLDER))
+    shown = {axis: (plots, yields.by_level("", [])) for axis in ("camera", "disturbance")}
+    text = _rendered(origins=counts.origins(kept, "hdf5"), coverage=shown)
+    assert "1 expanded demonstration and 2 recorded demonstrations, replayed and perturbed on the axes camera, " in text
+    assert "camera, disturbance; made by" in text
+    assert "human" not in text
+    assert "2 human demonstrations, replayed; made by" in _rendered(origins=counts.origins(kept[:3], "starter"))
+
+
+def test_what_was_not_compared_and_not_measured_is_said() -> None:
+    pose: dict[str, Any] = {"smallest": None, "clearance": 1.0, "overlaps": 0, "measure": "m", "coverage": {}}
+    pose |= {"rows": 55, "not_compared": 53, "test_tasks": 696, "comparisons": 4, "verdict": "disjoint where compared"}
+    text = _rendered(leakage={"pose": pose})
+    assert "draws not compared test tasks comparisons pose disjoint where compared - 1 0 55 53 696 4" in text
+    assert "At most 200 episodes of each axis are measured" in text
 
 
 def test_links_lead_to_sections_and_to_files_of_the_run(page: Page, finished: Path) -> None:
