@@ -279,12 +279,15 @@ def test_openvla_oft_continues_under_the_statistics_of_a_checkpoint(trained: Pat
     file = tmp_path / "dataset_statistics.json"
     former = {"action": {"q01": [0.5]}, "proprio": {"q01": [0.25]}, "num_trajectories": 432}
     file.write_text(json.dumps({f"{suite}_no_noops": former for suite in SUITES}))
-    seen = run(checkout, script, "--statistics", str(file), "--max_steps", "3")
+    words = ["--statistics", str(file), "--resume", "True", "--resume_step", "700", "--max_steps", "1200"]
+    seen = run(checkout, script, *words)
     assert seen["statistics"] == former | {"num_trajectories": 1}
+    rates = [seen["rates"][str(step)] for step in (700, 799, 800, 1000, 1200)]
+    assert np.allclose(rates, [5e-6, 5e-4, 5e-4, 2.5e-4, 0])
     assert "--statistics" not in seen["arguments"]
     file.write_text(json.dumps({"bridge": former}))
     done = subprocess.run(
-        [sys.executable, str(script), "--statistics", str(file)],
+        [sys.executable, str(script), *words],
         cwd=checkout,
         env={**os.environ, "PYTHONPATH": str(checkout), "HOME": str(checkout / "home")},
         capture_output=True,
@@ -322,6 +325,26 @@ def test_the_rate_follows_steps_warm_up_and_resumption(
         optimizer.step()
         scheduler.step()
     assert {step: rates[step] for step in shares} == pytest.approx({k: 5e-4 * v for k, v in shares.items()}, abs=1e-12)
+
+
+def test_a_checkpoint_of_another_training_begins_a_schedule_of_its_own() -> None:
+    words = ["--resume", "True", "--resume_step", "150_000", "--max_steps", "170_000"]
+    schedule = read_schedule(words, steps=100_000, warmup_steps=1000, anew=True)
+    shares = {step: schedule.share(step) for step in (0, 199, 200, 10_100, 20_000)}
+    assert shares == pytest.approx({0: 1 / 200, 199: 1, 200: 1, 10_100: 0.5, 20_000: 0})
+
+
+@pytest.mark.parametrize(
+    ("words", "anew", "said"),
+    [
+        (["--resume", "True", "--resume_step", "150000"], False, "--max_steps 250000 for 100000 more"),
+        (["--resume", "True", "--resume_step", "150000"], True, "150000 is not below --max_steps 100000"),
+        (["--resume_step", "150000", "--max_steps", "170000"], True, "--statistics without --resume"),
+    ],
+)
+def test_a_resumption_that_would_train_something_else_is_refused(words: list[str], anew: bool, said: str) -> None:
+    with pytest.raises(SystemExit, match=said):
+        read_schedule(words, steps=100_000, warmup_steps=1000, anew=anew)
 
 
 def test_openpi_finds_set_and_statistics_by_the_command_of_the_recipe(tmp_path: Path) -> None:

@@ -8,9 +8,14 @@ OFT always logs to Weights & Biases; offline it needs no account. With one, give
 NAME`` instead. Further arguments go to OFT's ``vla-scripts/finetune.py`` and win over these, such as
 ``--dataset_name libero_perturbed_spatial`` for one suite, or ``--max_steps 20000``.
 
-To continue from a checkpoint that was trained on LIBERO, add ``--statistics CHECKPOINT/dataset_statistics.json``. Its
-action head gives actions in units of its own statistics; with others, the same outputs would be other movements. To
-begin from weights that were not trained on LIBERO, leave it out: then the statistics are those of these datasets.
+To continue for N steps from a checkpoint that was trained on LIBERO, saved at STEP in the folder CHECKPOINT, add
+
+    --vla_path CHECKPOINT --statistics CHECKPOINT/dataset_statistics.json --resume True --resume_step STEP
+    --max_steps STEP+N
+
+Its action head, which OFT loads only with ``--resume``, gives actions in units of its own statistics; with others, the
+same outputs would be other movements. Warm-up and cosine go from STEP to the last step. Without ``--statistics``, the
+statistics are those of these datasets, and a resumed run goes on within its own cosine.
 
 What OFT has no flag for is done here: the datasets and their mixture are registered, AdamW gets the settings' weight
 decay (OFT leaves PyTorch's 0.01), a cosine with warm-up takes the place of OFT's step (whose own warm-up would undo
@@ -108,7 +113,7 @@ class Schedule:
     """The learning rate: a linear warm-up, then a cosine that ends at 0 with the last step.
 
     Attributes:
-        steps: OFT's ``--max_steps``, counted from the first run on where training is resumed.
+        steps: from the first run on where training is resumed.
         warmup_steps: how many of them rise to the full rate.
         first: the step that this run begins with.
     """
@@ -126,13 +131,17 @@ class Schedule:
         return (1 + math.cos(math.pi * min(done, 1.0))) / 2
 
 
-def read_schedule(words: Sequence[str], steps: int, warmup_steps: int) -> Schedule:
+def read_schedule(words: Sequence[str], steps: int, warmup_steps: int, *, anew: bool = False) -> Schedule:
     """The recipe's schedule, by the steps, the warm-up and the resumed step among OFT's arguments.
 
     Args:
         words: arguments of OFT's script.
         steps: the recipe's, for want of ``--max_steps``.
-        warmup_steps: the recipe's; without ``--lr_warmup_steps`` the same share of ``--max_steps``.
+        warmup_steps: the recipe's; without ``--lr_warmup_steps`` the same share of the schedule's steps.
+        anew: whether the resumed checkpoint is of another training, so that the schedule begins with it.
+
+    Raises:
+        SystemExit: with words, when nothing is resumed although ``anew``, or OFT would never stop.
     """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--max_steps", type=int, default=steps)
@@ -141,8 +150,20 @@ def read_schedule(words: Sequence[str], steps: int, warmup_steps: int) -> Schedu
     parser.add_argument("--resume", type=yaml.safe_load, default=False)
     parser.add_argument("--resume_step", type=int, default=0)
     given, _ = parser.parse_known_args(words)
-    warmup = given.max_steps * warmup_steps // steps if given.lr_warmup_steps is None else given.lr_warmup_steps
-    return Schedule(given.max_steps, warmup, given.resume_step if given.resume else 0)
+    first = given.resume_step if given.resume else 0
+    if anew and not first:
+        sys.exit(
+            "error: --statistics without --resume: OFT would begin with a new action head\n"
+            "  try: --vla_path CHECKPOINT --resume True --resume_step STEP --max_steps STEP+N"
+        )
+    if first >= given.max_steps:
+        sys.exit(
+            f"error: --resume_step {first} is not below --max_steps {given.max_steps}, at which OFT stops\n"
+            f"  try: --max_steps {first + steps} for {steps} more"
+        )
+    steps_here = given.max_steps - first if anew else given.max_steps
+    warmup = steps_here * warmup_steps // steps if given.lr_warmup_steps is None else given.lr_warmup_steps
+    return Schedule(steps_here, warmup, 0 if anew else first)
 
 
 def set_optimiser(weight_decay: float, schedule: Schedule) -> None:
@@ -193,6 +214,9 @@ def prepare() -> None:
     parser.add_argument("--statistics", type=Path)
     own, given = parser.parse_known_args()
     suites = dataset["suites"]["value"]
+    schedule = read_schedule(
+        given, training["steps"]["value"], training["warmup_steps"]["value"], anew=own.statistics is not None
+    )
     # OFT takes its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" among the arguments.
     # Of two values the last counts; a warm-up of OFT's own would undo the cosine, so there is none.
     sys.argv = [SCRIPT, *arguments(recipe), *given, "--lr_warmup_steps", "0"]
@@ -201,10 +225,7 @@ def prepare() -> None:
     keep_statistics_elsewhere(
         dataset["sha256"]["value"], statistics_of(own.statistics, suites) if own.statistics else {}
     )
-    set_optimiser(
-        training["weight_decay"]["value"],
-        read_schedule(given, training["steps"]["value"], training["warmup_steps"]["value"]),
-    )
+    set_optimiser(training["weight_decay"]["value"], schedule)
 
 
 def main() -> None:
