@@ -375,7 +375,11 @@ def test_starvla_finds_the_sets_of_every_suite(tmp_path: Path) -> None:
     (found,) = runpy.run_path(str(tmp_path / "finetune" / "starvla_data_config.py"))["DATASET_NAMED_MIXTURES"].items()
     assert found == ("synthetic", [(SET, 1.0, "libero_franka")])
     assert (tmp_path / "lerobot_v21" / SET / "meta" / "modality.json").is_file()
-    assert "--datasets.vla_data.data_mix synthetic" in recipe["clients"]["starvla"]["command"]
+    command = recipe["clients"]["starvla"]["command"]
+    assert "--datasets.vla_data.data_mix synthetic" in command
+    # What its script for LIBERO changes of the configuration, by which the language model would be frozen (0ed0aad).
+    assert "--framework.name QwenPI" in command
+    assert "--trainer.freeze_modules --trainer.max_train_steps 80000 --trainer.save_interval 10000" in command
     assert "openpi" not in recipe["clients"]
 
 
