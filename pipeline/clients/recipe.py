@@ -14,12 +14,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
-from pipeline.files import checksum, replaced
+from pipeline.files import checksum, read_json, replaced
 from pipeline.formats import exact_statistics
-from pipeline.formats.rlds_layout import dataset_of
+from pipeline.formats.rlds_layout import dataset_of, split_of
 
 TEMPLATES = Path(__file__).parent / "templates"
 OFT_SCRIPT = "run_openvla_oft.py"
+LEROBOT_TRAIN = "lerobot_train.json"
+"""Written where a validation split is held out: the other episodes, as lerobot-train reads them from a file.
+
+On a command line, 25,000 of them would be too long for Linux.
+"""
 
 OPENPI = "pi05_libero"
 """openpi's configuration that is trained and served."""
@@ -52,6 +57,7 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
         "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
         "episodes_by_suite_and_axis": sourced({suite: dict(axes) for suite, axes in counts.items()}, MANIFEST),
     }
+    oft_validates = False
     if export.rlds is not None:
         suites = {row["suite"]: dataset_of(row) for row in kept}
         dataset["suites"] = sourced(suites, MANIFEST + ": the RLDS dataset that holds each suite")
@@ -59,15 +65,19 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
             {export.rlds.name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
             "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
         )
+        validating = {dataset_of(row) for row in kept if split_of(Path(row["rlds_shard"])) == "val"}
+        # It asks every set for its split.
+        oft_validates = bool(validating) and validating == {*suites.values()}
     if export.lerobot is not None:
         dataset["lerobot"] = sourced(export.lerobot.name, "the run's configuration, export.lerobot.name")
-    return {"name": (export.rlds or export).name, "dataset": dataset, **_training_and_clients(export)}
+    return {"name": (export.rlds or export).name, "dataset": dataset, **_training_and_clients(export, oft_validates)}
 
 
-def _training_and_clients(export: ExportConfig) -> dict[str, Any]:
+def _training_and_clients(export: ExportConfig, oft_validates: bool) -> dict[str, Any]:
     cameras = {view.lerobot_key: f"observation.images.camera{k}" for k, view in enumerate(SCHEMA.views.values(), 1)}
     known = {"images": len(SCHEMA.views), "renamed": json.dumps(cameras)}
     known |= {"openpi": OPENPI, "openpi_assets": OPENPI_ASSETS}
+    known |= {"lerobot_train": LEROBOT_TRAIN, "oft_validates": oft_validates}
     sections: dict[str, Any] = yaml.safe_load(_filled("recipe.yaml.j2", export=export, **known))
     return sections
 
@@ -84,10 +94,10 @@ def _filled(template: str, **values: object) -> str:
 
 
 def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
-    """Write ``finetune.yaml``, the clients' scripts and openpi's statistics, replacing what is in ``finetune``.
+    """Write ``finetune.yaml``, the clients' scripts and what else they read, replacing what is in ``finetune``.
 
     Args:
-        data: the run's folder; the scripts look for ``rlds`` beside theirs.
+        data: the run's folder with its datasets; the scripts look for ``rlds`` beside theirs.
     """
     wanted = export.lerobot_v21
     with replaced(data / "finetune") as unfinished:
@@ -96,6 +106,10 @@ def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / "finetune.yaml").write_text(text)
         shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
+        if export.lerobot is not None and export.lerobot.validation:
+            info = read_json(data / "lerobot" / export.lerobot.name / "meta" / "info.json")
+            listed = [*range(int(info["splits"]["train"].partition(":")[2]))]
+            (unfinished / LEROBOT_TRAIN).write_text(json.dumps({"dataset": {"episodes": listed}}) + "\n")
         if wanted is not None and wanted.convention == "openpi":
             table = pq.read_table(data / "lerobot_v21" / wanted.name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)

@@ -80,6 +80,17 @@ def test_recipe_counts_what_was_kept(tmp_path: Path) -> None:
     assert all(field["source"] for field in (*recipe["dataset"].values(), *recipe["training"].values()))
 
 
+@pytest.mark.parametrize(("held_out", "asked"), [((), False), (("libero_10",), False), (tuple(SUITES), True)])
+def test_openvla_oft_measures_what_every_set_holds_out(held_out: tuple[str, ...], asked: bool, tmp_path: Path) -> None:
+    """It fails where a set has no split ``val``, and never trains on one."""
+    kept = [row(suite, "camera") for suite in SUITES]
+    for suite in held_out:
+        one = row(suite, "camera")
+        kept.append(one | {"rlds_shard": one["rlds_shard"].replace("-train.", "-val.")})
+    command = tiny_recipe(tmp_path, rows=kept)["clients"]["openvla_oft"]["command"]
+    assert command.endswith(" --use_val_set True") == asked
+
+
 @pytest.mark.parametrize("convention", ["ipec", "openpi"])
 def test_every_client_is_named_by_the_format_that_it_reads(convention: str, tmp_path: Path) -> None:
     export = export_config(lerobot_v21={"name": NAME, "convention": convention})

@@ -3,19 +3,24 @@
 import base64
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 from typing import Literal
 
+import lerobot.policies.factory  # noqa: F401 - by which policies have names
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import tensorflow_datasets as tfds
 import yaml
 from conftest import REPOSITORY, link_testset, tiny_config
+from lerobot.configs import parser
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets, split_dataset
+from lerobot.datasets.factory import make_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_lerobot
 
@@ -123,6 +128,29 @@ def test_lerobot_has_the_splits_as_ranges(episodes: Episodes, held_out: Path) ->
     assert json.loads((held_out / "meta" / "info.json").read_text())["splits"] == {"train": "0:4", "val": "4:6"}
     splits = episodes.by_split(0.34)
     assert episode_ids(LeRobotDataset(NAME, root=held_out)) == splits["train"] + splits["val"]
+
+
+@pytest.mark.slow
+def test_lerobot_trains_without_what_is_held_out(
+    episodes: Episodes, held_out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the recipe's command for ACT, read by lerobot's own parser and opened by its own factory."""
+    data = held_out.parents[1]
+    (data / "manifest.parquet").touch()
+    options = ExportConfig(rlds=None, lerobot=LeRobotConfig(name=NAME, shards=3, validation=0.34))
+    made = recipe.build(data / "manifest.parquet", [], options)
+    recipe.write(made, data, options)
+    commands = {name: client["command"].replace("$DATA", str(data)) for name, client in made["clients"].items()}
+    assert len({shlex.split(command)[1] for command in commands.values()}) == 1
+    monkeypatch.setattr(sys, "argv", shlex.split(commands["lerobot_act"]))
+    config = as_lerobot_train_reads()
+    assert (config.policy.type, config.policy.push_to_hub) == ("act", False)
+    assert episode_ids(make_dataset(config)) == episodes.by_split(0.34)["train"]
+
+
+@parser.wrap()
+def as_lerobot_train_reads(config: TrainPipelineConfig) -> TrainPipelineConfig:
+    return config
 
 
 @pytest.mark.parametrize(("convention", "name"), [("openpi", NAME), ("ipec", SET)])
