@@ -36,7 +36,7 @@ from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.images.jpeg import encode, to_policy  # noqa: E402
 from pipeline.libero.tasks import find_task, select_tasks  # noqa: E402
 from pipeline.physics.environment import DUMMY_ACTION  # noqa: E402
-from pipeline.planning import plan  # noqa: E402
+from pipeline.planning import plan, selection  # noqa: E402
 from pipeline.planning.streams import streams_of  # noqa: E402
 from pipeline.run.outcome import rejections  # noqa: E402
 from pipeline.run.render_stage import render_plan  # noqa: E402
@@ -62,7 +62,7 @@ def main() -> None:
         render_plan(rows, config, trajectories, frames, loop)
         rendered = time.process_time()
         store = FrameStore(frames, config.render)
-        outcome = plan.select(rows, verdicts, rejections(rows, shown_of(store.rows())))
+        outcome = selection.select(rows, verdicts, rejections(rows, shown_of(store.rows())))
         kept = [row for row in rows if outcome[row.episode_id].kept]
         naive_s, same, count = 0.0, 0, 0
         for row in kept:

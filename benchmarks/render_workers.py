@@ -25,7 +25,8 @@ from episode_slice import sliced
 
 from pipeline import gl
 from pipeline.compute.pool import Workers, loop, runner
-from pipeline.config import ComputeConfig, load
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import load
 from pipeline.planning import plan
 from pipeline.rendering.renderer import Renderer
 from pipeline.run.render_stage import render_plan

@@ -25,7 +25,8 @@ from rich.table import Table
 
 from pipeline.axes import from_json
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, ReplayConfig
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.evaluation.statistics import wilson
 from pipeline.libero.tasks import SUITES, find_task
 from pipeline.physics.quality import smoothness

@@ -22,7 +22,8 @@ import mujoco
 import numpy as np
 
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig, DemosConfig
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import DemosConfig
 from pipeline.evaluation.tasks import libero_states
 from pipeline.libero.starts import HOME_RAD
 from pipeline.physics.quality import smoothness

@@ -28,7 +28,8 @@ from pipeline import seeding
 from pipeline.axes import Axes
 from pipeline.axes.noise import NoiseAxis
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, RenderConfig, ReplayConfig
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.lerobot_video import Video
 from pipeline.images.jpeg import decode, encode, to_policy

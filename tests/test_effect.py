@@ -19,7 +19,8 @@ from episode_results import result
 from scipy.stats import permutation_test
 
 from pipeline.__main__ import main
-from pipeline.config import ComputeConfig, load
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import load
 from pipeline.errors import PipelineError
 from pipeline.evaluation import environment
 from pipeline.evaluation.environment import EpisodeSettings

@@ -25,6 +25,7 @@ FLOORS = (
     "images",
     "rewriting",
     "config",
+    "compute_config",
     "axes",
     "scenes",
     "testset",

@@ -21,7 +21,7 @@ from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.images.jpeg import decode, resized
 from pipeline.libero.demonstrations import DemoEntry
-from pipeline.planning import leakage, plan
+from pipeline.planning import leakage, plan, selection
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.outcome import rejections
 from pipeline.run.render_stage import render_plan
@@ -79,7 +79,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
         while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = known
             Replays(run.demos, run.replay, trajectories.root, workers, run.filter).of(rows, rejected)
-            outcome = plan.select(chosen, verdicts_of(trajectories.rows(), run.filter), rejected)
+            outcome = selection.select(chosen, verdicts_of(trajectories.rows(), run.filter), rejected)
             kept = [row for row in chosen if outcome[row.episode_id].kept]
             if len(kept) < experiment.episodes:
                 counts = Counter(row.axis for row in chosen if row.wanted) - Counter(row.axis for row in kept)

@@ -14,7 +14,7 @@ from experiment import Experiment
 
 from pipeline import gl
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig
+from pipeline.compute_config import ComputeConfig
 from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Server, Wanted
 from pipeline.evaluation.selection import INITIAL_STATES, Selection, select

@@ -62,7 +62,8 @@ def expand(arguments: argparse.Namespace) -> int:
     them.
     """
     from pipeline.compute.pool import runner
-    from pipeline.config import ComputeConfig, DemosConfig
+    from pipeline.compute_config import ComputeConfig
+    from pipeline.config import DemosConfig
     from pipeline.run.expand import candidates, expand, resets
     from pipeline.testset import benchmark
 
@@ -89,7 +90,7 @@ def check(arguments: argparse.Namespace) -> int:
     JSON. Ends with 1 where there is a fault.
     """
     from pipeline.compute.pool import runner
-    from pipeline.config import ComputeConfig
+    from pipeline.compute_config import ComputeConfig
     from pipeline.validation.demonstrations import check
 
     with runner(ComputeConfig(), arguments.folder) as run:

@@ -89,7 +89,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
 
     from pipeline import gl
     from pipeline.compute.pool import runner
-    from pipeline.config import ComputeConfig
+    from pipeline.compute_config import ComputeConfig
     from pipeline.evaluation.environment import EpisodeSettings
     from pipeline.evaluation.evaluate import evaluate
     from pipeline.evaluation.rollout import Evaluation, PolicyConfig

@@ -16,7 +16,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from pipeline.compute.cluster import Workplace, in_place, workplace_of
 from pipeline.compute.progress import progress_of
 from pipeline.compute.workers import ended, local_cluster, slurm_cluster
-from pipeline.config import ComputeConfig
+from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
 

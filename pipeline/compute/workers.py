@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import ComputeConfig, SlurmConfig
+from pipeline.compute_config import ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
 from pipeline.machine_code import SETTINGS, in_shell

@@ -15,7 +15,8 @@ from pipeline.axes.base import Frozen
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation import libero_plus, own_draws
-from pipeline.evaluation.policies import VIEWS, Wanted, checked_actions
+from pipeline.evaluation.actions import checked_actions
+from pipeline.evaluation.policies import VIEWS, Wanted
 from pipeline.evaluation.results import REFUSED
 from pipeline.evaluation.simulator import Picture, Simulator
 from pipeline.evaluation.tasks import EvaluationTask, Prompt, find_replacement, libero_states

@@ -16,8 +16,9 @@ from pipeline import gl
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
+from pipeline.evaluation.actions import PolicyError
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.policies import Policy, PolicyError
+from pipeline.evaluation.policies import Policy
 from pipeline.evaluation.results import one_setting
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_policy
 from pipeline.evaluation.selection import Selection, select

@@ -20,9 +20,10 @@ from vla_eval.specs import (
 
 from pipeline import gl
 from pipeline.errors import PipelineError
+from pipeline.evaluation.actions import checked_actions, refuse_other_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import check_settings
-from pipeline.evaluation.policies import NextLook, Wanted, checked_actions, refuse_other_actions
+from pipeline.evaluation.policies import NextLook, Wanted
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select

@@ -190,8 +190,7 @@ def refuse_shared_names(policies: Iterable[tuple[str, str, Path]]) -> None:
         ((repr(name), {"identity": identity}, where) for name, identity, where in policies),
         "two policies have the name ",
         expected="one policy under one name",
-        remedy="evaluate one of them under another --label into another folder, or leave out the folder of the one "
-        "that is no longer wanted",
+        remedy="evaluate one of them under another --label into another folder, or leave out the other's folder",
     )
 
 
@@ -205,12 +204,8 @@ def _agree(found: Iterable[tuple[str, Mapping[str, object], Path]], what: str, e
     known: dict[str, tuple[Mapping[str, object], Path]] = {}
     for name, facts, file in found:
         earlier, where = known.setdefault(name, (facts, file))
-        differing = [
-            f"{fact} {earlier.get(fact)} and {facts.get(fact)}"
-            for fact in {**earlier, **facts}
-            if earlier.get(fact) != facts.get(fact)
-        ]
-        if differing:
+        both = [(fact, earlier.get(fact), facts.get(fact)) for fact in {**earlier, **facts}]
+        if differing := [f"{fact} {one} and {other}" for fact, one, other in both if one != other]:
             raise PipelineError(
                 f"{what}{name}: {', '.join(differing)}", where=f"{where} and {file}", expected=expected, remedy=remedy
             )

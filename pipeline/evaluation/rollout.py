@@ -17,8 +17,9 @@ from pipeline.axes import to_json
 from pipeline.axes.base import Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, own_draws
+from pipeline.evaluation.actions import checked_actions
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
-from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, checked_actions, content_of
+from pipeline.evaluation.policies import Checkpoint, Policy, Server, Wanted, content_of
 from pipeline.evaluation.reference_policies import Replay, TrackedReplay
 from pipeline.evaluation.results import PER_TASK, EpisodeFiles, EpisodeResult, refuse_shared_names
 from pipeline.evaluation.tasks import EvaluationTask

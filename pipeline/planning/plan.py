@@ -1,7 +1,7 @@
 """The plan: a table with one row per wanted episode. All randomness is drawn here, keyed, never by position."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from itertools import count, islice
@@ -18,15 +18,9 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
 from pipeline.tables import read_table, write_table
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Task, Verdict
+from pipeline.types import Task
 
 _ATTEMPTS = 100
-
-NOT_NEEDED = "reserve_not_needed"
-"""The reason of a reserve for whose quota others were kept."""
-
-NOT_REPLAYED = "not_replayed"
-"""The reason of what is needed, as far as is known, and has no trajectory yet."""
 
 RESET = "reset"
 """What stands for the axis where nothing is perturbed and the start is a reset of LIBERO's environment."""
@@ -278,51 +272,3 @@ def read(path: Path) -> list[Row]:
     names = [column.name for column in fields(Row)]
     columns = read_table(path, names, MAKE_AGAIN).select(names).to_pydict()
     return [Row(*row) for row in zip(*columns.values(), strict=True)]
-
-
-def pending(
-    rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
-) -> list[str]:
-    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given.
-
-    Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
-    """
-    found = _verdicts(rows, verdicts, rejected)
-    return list(dict.fromkeys(row.trajectory_id for row, verdict in found if verdict is None))
-
-
-def select(
-    rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
-) -> dict[str, Verdict]:
-    """What became of every row: kept, dropped with a reason, or a reserve that was not needed.
-
-    Args:
-        verdicts: trajectory id to its verdict.
-        rejected: episode id to the reason why its frames were rejected.
-    """
-    unknown = Verdict(False, NOT_REPLAYED)
-    return {row.episode_id: verdict or unknown for row, verdict in _verdicts(rows, verdicts, rejected)}
-
-
-def _verdicts(
-    rows: Iterable[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None
-) -> Iterator[tuple[Row, Verdict | None]]:
-    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
-
-    The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
-    """
-    quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
-    for row in rows:
-        quotas[row.axis, row.suite, row.task].append(row)
-    for quota in quotas.values():
-        group = sorted(quota, key=lambda row: row.rank)
-        need = sum(row.wanted for row in group)
-        for row in group:
-            verdict = verdicts.get(row.trajectory_id)
-            if not need:
-                verdict = Verdict(False, NOT_NEEDED)
-            elif rejected and verdict and verdict.kept and row.episode_id in rejected:
-                verdict = Verdict(False, rejected[row.episode_id])
-            # Until it is known, it is hoped for.
-            need -= verdict is None or verdict.kept
-            yield row, verdict

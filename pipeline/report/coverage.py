@@ -10,7 +10,8 @@ from pipeline.axes import AXES
 from pipeline.axes.background import BackgroundPerturbation
 from pipeline.axes.base import Perturbation
 from pipeline.axes.camera import CameraPerturbation
-from pipeline.axes.language import CLASSES, distance
+from pipeline.axes.language import distance
+from pipeline.axes.language_lint import CLASSES
 from pipeline.axes.light import LightPerturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.axes.pose import PosePerturbation, ScenePerturbation, displacements

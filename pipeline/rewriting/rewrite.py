@@ -16,7 +16,8 @@ import yaml
 from jinja2 import StrictUndefined, Template
 from pydantic import TypeAdapter
 
-from pipeline.axes.language import CLASSES, LENGTH, REMEDY, Bank, Component, lint, load_bank, normalise, read_bank
+from pipeline.axes.language import Bank, load_bank, read_bank
+from pipeline.axes.language_lint import CLASSES, LENGTH, REMEDY, Component, lint, normalise
 from pipeline.errors import PipelineError
 from pipeline.files import replaced
 from pipeline.libero.bddl import Fact, read

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from pipeline.libero.demonstrations import HUMAN
-from pipeline.planning.plan import NOT_NEEDED
+from pipeline.planning.selection import NOT_NEEDED
 from pipeline.run.outcome import MADE
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import smoothness
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.run.replay_stage import Replays
 from pipeline.scenes.compiled import CompiledScene, physics_to_read, proprioception
 from pipeline.stores.trajectory_store import TrajectoryStore
@@ -89,12 +89,12 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     faults: dict[str, str] = {}
     while True:
         verdicts = Replays(demos, REPLAY, store.root, workers).of(rows, faults)
-        outcome = plan.select(rows, verdicts, faults)
+        outcome = selection.select(rows, verdicts, faults)
         kept = [row for row in rows if row.role == "perturbed" and outcome[row.episode_id].kept]
         if not (found := _faults(kept, rows, store)):
             break
         faults |= found
-    unwanted = {"kept", plan.NOT_NEEDED}
+    unwanted = {"kept", selection.NOT_NEEDED}
     reasons = [outcome[row.episode_id].reason for row in rows if row.role == "perturbed"]
     result = Expansion(dropped=Counter(reason for reason in reasons if reason not in unwanted))
     by_task: dict[str, list[plan.Row]] = defaultdict(list)

@@ -17,7 +17,7 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import Where
 from pipeline.identity import DISTRIBUTION, VERSIONS, versions
 from pipeline.planning import plan
-from pipeline.planning.plan import NOT_NEEDED
+from pipeline.planning.selection import NOT_NEEDED
 from pipeline.run.outcome import Outcome, rendered
 from pipeline.tables import column, columns_of, read_table, write_table
 from pipeline.types import Quality

@@ -10,7 +10,7 @@ from typing import Any
 from pipeline.config import Config, FilterConfig
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import ExportConfig
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
 from pipeline.seeding import digest
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
@@ -84,7 +84,7 @@ def replayed(
     """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
-    needed = plan.pending(rows, verdicts_of(trajectories, limits), rejected)
+    needed = selection.pending(rows, verdicts_of(trajectories, limits), rejected)
     # What takes the place of rejected frames, only the stage render replays.
     _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
@@ -116,7 +116,7 @@ def read(config: Config) -> Outcome:
     frames = shown_of(store.rows())
     rejected = rejections(rows, frames)
     trajectories = replayed(rows, config.data / "trajectories", rejected, config.filter)
-    judged = plan.select(rows, verdicts_of(trajectories, config.filter), rejected)
+    judged = selection.select(rows, verdicts_of(trajectories, config.filter), rejected)
     if where := config.export.where:
         for row in rows:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
@@ -129,7 +129,7 @@ def read(config: Config) -> Outcome:
 
 
 def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
-    """The failures that are asked for, by the verdicts of ``plan.select``."""
+    """The failures that are asked for, by the verdicts of ``selection.select``."""
     found = [row for row in rows if export.failures and judged[row.episode_id].reason in MISSED]
     where = export.where
     return [row for row in found if where is None or where.takes(row.axis, row.component, row.level, row.suite)]

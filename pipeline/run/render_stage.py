@@ -11,7 +11,8 @@ from pipeline import gl
 from pipeline.compute.pool import Expendable, Workers
 from pipeline.config import Config
 from pipeline.errors import PipelineError
-from pipeline.planning.plan import Row, select
+from pipeline.planning.plan import Row
+from pipeline.planning.selection import select
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.run.outcome import MISSED, rejections
 from pipeline.stores.frame_store import FrameStore, file_name, shown_of

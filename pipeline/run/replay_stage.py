@@ -7,7 +7,8 @@ from pathlib import Path
 from pipeline.compute.pool import Expendable, Workers
 from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.planning.plan import Row, pending
+from pipeline.planning.plan import Row
+from pipeline.planning.selection import pending
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
 

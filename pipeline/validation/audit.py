@@ -19,7 +19,8 @@ import tensorflow_datasets as tfds
 from pipeline.axes import AXES, from_json, to_json
 from pipeline.axes.base import Perturbation
 from pipeline.axes.camera_pose import AGENT_VIEWS, moved_to
-from pipeline.axes.language import LanguagePerturbation, load_bank, normalise
+from pipeline.axes.language import LanguagePerturbation, load_bank
+from pipeline.axes.language_lint import normalise
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.formats.lerobot_columns import EPISODE_ID, camera_column

@@ -1,10 +1,7 @@
 """What must hold of an episode wherever it lies: small functions, each with a name, that yield what is off."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 import cv2
@@ -15,10 +12,10 @@ from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
 from pipeline.formats.read_back import Copy, Fault, sampled
-from pipeline.images.jpeg import decode
 from pipeline.libero.tasks import find_task
 from pipeline.run.manifest import OWN_VERSION
-from pipeline.types import Episode, Frame, Trajectory
+from pipeline.types import Frame
+from pipeline.validation.case import Case
 
 VIDEO_PSNR_DB = 32.0
 """Least PSNR, in grey, of a video's frame to the stored JPEG; panning over 30 procedural data maps it is 38.0 or more.
@@ -44,44 +41,6 @@ way round, 49 episodes moved 0.05 m and more with it."""
 
 DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|demo)", re.IGNORECASE)
 """What an instruction has only when it was made from a file's name."""
-
-
-@dataclass(frozen=True)
-class Case:
-    """One episode and everything known of it.
-
-    Attributes:
-        made: as the episode store has it.
-        trajectory: the replay that it was rendered from.
-        copies: as each dataset has it, as far as it could be read.
-        bank: the run's own bank of rewrites.
-    """
-
-    row: Mapping[str, Any]
-    made: Episode
-    trajectory: Trajectory
-    copies: Sequence[Copy]
-    bank: Path | None
-
-    @cached_property
-    def shown(self) -> dict[int, dict[str, Frame]]:
-        """Sampled step to what the store has in every view there."""
-        return {
-            step: {view: decode(frames[step]) for view, frames in self.made.frames.items()}
-            for step in sampled(len(self.made))
-        }
-
-    @property
-    def whole(self) -> list[Copy]:
-        """The copies of the right shapes: what else is wrong with the others follows from that."""
-        return [
-            copy
-            for copy in self.copies
-            if all(getattr(copy.episode, name).shape == getattr(self.made, name).shape for name in MOTION)
-        ]
-
-    def finding(self, dataset: str, what: str, expected: object) -> Fault:
-        return Fault(dataset, self.made.episode_id, what, str(expected))
 
 
 def _grey_psnr_db(one: Frame, other: Frame) -> float:

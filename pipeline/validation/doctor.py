@@ -20,7 +20,8 @@ from rich.text import Text
 
 from pipeline import gl
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
-from pipeline.config import ComputeConfig, Config, DemosConfig
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import Config, DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.registry import FORMATS
 from pipeline.identity import DISTRIBUTION

@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.axes import AXES, Perturbation, PhysicsPerturbation, RenderPerturbation, axes_of
-from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import Config, DemosConfig, PlanConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN

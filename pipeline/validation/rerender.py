@@ -18,7 +18,7 @@ from pipeline.formats.read_back import Fault
 from pipeline.images.jpeg import decode, encode
 from pipeline.rendering.renderer import LastScene
 from pipeline.types import Frame
-from pipeline.validation.checks import Case
+from pipeline.validation.case import Case
 
 PSNR_DB = 25.0
 """Least PSNR of a frame to a fresh rendering: far below what JPEG costs, far above what another frame reaches."""

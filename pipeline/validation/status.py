@@ -10,7 +10,7 @@ from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
 from pipeline.run import cleaning, export, finished, inputs, machine, outcome
 from pipeline.run.outcome import outdated
@@ -39,14 +39,14 @@ def told(config: Config) -> Iterator[str | Table]:
     verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), config.filter)
     frames = shown_of(FrameStore(config.data / "frames", config.render).rows())
     rejected = outcome.rejections(rows, frames)
-    judged = plan.select(rows, verdicts, rejected)
+    judged = selection.select(rows, verdicts, rejected)
     yield _counts(config, rows, judged, frames)
     steps = dict(_steps(config, rows, verdicts, frames, rejected))
     yield "would run:" if steps else "nothing would run: all of this configuration is made"
     yield from (f"  {step}: {why}" for step, why in steps.items())
     yield _disk(config)
     # What is not replayed yet is hoped for.
-    hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == plan.NOT_REPLAYED}
+    hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
     needed = [row for row in rows if row.episode_id in hopes]
     yield from _time_left(config, needed, verdicts, frames, steps) if steps else ()
 
@@ -85,9 +85,9 @@ def _steps(
     if of_plan:
         yield "plan", f"another configuration: {', '.join(of_plan)}"
     made_anew = outdated(rows, config)
-    if needed := plan.pending(rows, verdicts, rejected):
+    if needed := selection.pending(rows, verdicts, rejected):
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
-    judged = plan.select(rows, verdicts, rejected)
+    judged = selection.select(rows, verdicts, rejected)
     shown = [row for row in rows if judged[row.episode_id].kept]
     shown += [row for row in outcome.missed(rows, judged, config.export) if row.episode_id not in rejected]
     if missing := [row for row in shown if not outcome.rendered(row, frames)]:

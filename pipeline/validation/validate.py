@@ -23,7 +23,7 @@ from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.rendering.renderer import scene_of_process
 from pipeline.run import manifest, outcome
 from pipeline.run.counts import by_axis_and_suite
@@ -31,7 +31,8 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import wordings
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Extra
-from pipeline.validation.checks import CHECKS, Case
+from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import rendered, witnesses
 
 SLICE = 4
@@ -137,7 +138,7 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
     for (axis, suite, task), members in quotas.items():
         wanted = sum(row["wanted"] for row in members)
         kept = sum(row["reason"] in outcome.MADE for row in members)
-        left = any(row["reason"] in (plan.NOT_NEEDED, plan.NOT_REPLAYED) for row in members)
+        left = any(row["reason"] in (selection.NOT_NEEDED, selection.NOT_REPLAYED) for row in members)
         if kept > wanted or (kept < wanted and left):
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
     if read_json(data / "counts.json") != by_axis_and_suite(rows):

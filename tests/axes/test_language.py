@@ -13,18 +13,8 @@ from pydantic import ValidationError
 
 from pipeline import seeding
 from pipeline.axes.base import Level
-from pipeline.axes.language import (
-    CLASSES,
-    NAMED,
-    LanguageAxis,
-    LanguagePerturbation,
-    deal,
-    distance,
-    level_of,
-    lint,
-    load_bank,
-    normalise,
-)
+from pipeline.axes.language import LanguageAxis, LanguagePerturbation, deal, distance, level_of, load_bank
+from pipeline.axes.language_lint import CLASSES, NAMED, lint, normalise
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task, tasks
 from pipeline.testset import benchmark

@@ -5,8 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
-from pipeline.axes.language import NAMED, lint, load_bank
+from pipeline.axes.language import load_bank
 from pipeline.axes.language_goal import changed_goal, demands
+from pipeline.axes.language_lint import NAMED, lint
 from pipeline.libero.task_goal import Aim, StateChange, read_goal
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Task

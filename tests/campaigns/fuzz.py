@@ -40,7 +40,7 @@ from pipeline.axes.language import BANK_FILE, load_bank
 from pipeline.catalogue.texture_sources import from_file
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig, load
 from pipeline.errors import PipelineError
-from pipeline.evaluation.policies import checked_actions
+from pipeline.evaluation.actions import checked_actions
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.tasks import libero_task
 from pipeline.files import read_json

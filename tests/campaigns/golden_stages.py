@@ -25,6 +25,7 @@ from pipeline.seeding import digest
 from pipeline.types import Scene, Trajectory, Verdict
 from pipeline.validation import checks as of_episodes
 from pipeline.validation import rerender
+from pipeline.validation.case import Case
 
 TEMPLATES = ("report.html.j2", "macros.html.j2", "style.css")
 
@@ -107,7 +108,7 @@ def checks() -> dict[str, Any]:
         said=[[{"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1"}]] * steps,
     )
     blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in shown.items()})
-    case = of_episodes.Case(row, made, trajectory, [whole, wrong, blank], None)
+    case = Case(row, made, trajectory, [whole, wrong, blank], None)
     found = {name: len(list(check(case))) for name, check in of_episodes.CHECKS.items()}
     limits = {name: value for name, value in vars(of_episodes).items() if isinstance(value, float)}
     return {"found": found, "limits": limits | {"fresh PSNR dB": rerender.PSNR_DB}}

@@ -21,7 +21,8 @@ from pipeline import gl
 from pipeline.axes import Axes
 from pipeline.compute.cluster import Workplace, setup
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig, DemosConfig, PlanConfig, RenderConfig, ReplayConfig
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.identity import made_with
 from pipeline.machine_code import SETTINGS

@@ -18,7 +18,7 @@ from distributed import Nanny
 
 from pipeline import gl
 from pipeline.compute.pool import TRIES, Expendable, loop, runner
-from pipeline.config import ComputeConfig
+from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 
 

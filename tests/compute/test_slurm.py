@@ -15,7 +15,7 @@ from conftest import REPOSITORY
 from pydantic import ValidationError
 
 from pipeline.compute.pool import runner
-from pipeline.config import ComputeConfig, SlurmConfig
+from pipeline.compute_config import ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
 from pipeline.machine_code import machine_code
 

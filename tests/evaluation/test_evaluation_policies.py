@@ -19,9 +19,10 @@ from vla_eval.model_servers.xvla import _PROFILE_OBS_PARAMS as XVLA
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
+from pipeline.evaluation.actions import PolicyError, checked_actions
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment, evaluate
-from pipeline.evaluation.policies import PolicyError, Server, checked_actions
+from pipeline.evaluation.policies import Server
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection

@@ -24,7 +24,8 @@ from pipeline.formats import lerobot_read
 from pipeline.formats.lerobot import LeRobot
 from pipeline.run.export import export
 from pipeline.types import Episode, Subtask
-from pipeline.validation.checks import CHECKS, Case
+from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS
 
 LEROBOT = Version(version("lerobot"))
 

@@ -52,7 +52,8 @@ from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
 from pipeline.formats.tfrecord import columns
 from pipeline.types import Episode, Scene, Trajectory, Verdict
-from pipeline.validation.checks import CHECKS, Case
+from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS
 
 MIN_PSNR_DB = 36.0
 

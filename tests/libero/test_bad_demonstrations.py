@@ -18,7 +18,7 @@ from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.libero import hdf5
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment, UnusableSceneError
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
@@ -133,7 +133,7 @@ def test_each_bad_demonstration_is_a_verdict(
             assert detail in json.loads(stored.resolved)["fault"]
             assert re.search(rf"{row.demo_id}\b.*{detail}", log), row.demo_id
     assert Replays(demos, REPLAY, folder, nothing_left).of(rows) == verdicts
-    assert all(not verdict.kept for verdict in plan.select(rows, verdicts).values())
+    assert all(not verdict.kept for verdict in selection.select(rows, verdicts).values())
 
 
 @pytest.mark.slow

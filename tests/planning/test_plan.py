@@ -23,7 +23,7 @@ from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.libero.tasks import find_task, tasks
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.seeding import rng
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -122,12 +122,12 @@ def test_replacements_in_plan_order_until_full_or_exhausted(succeeds: list[bool]
     }
     known: dict[str, Verdict] = {}
     rounds = 0
-    while needed := plan.pending(rows, known):
+    while needed := selection.pending(rows, known):
         assert not set(needed) & known.keys()
         known |= {trajectory_id: truth[trajectory_id] for trajectory_id in needed}
         rounds += 1
         assert rounds < 10
-    outcome = plan.select(rows, known)
+    outcome = selection.select(rows, known)
     assert outcome.keys() == {row.episode_id for row in rows}
     for axis in ("camera", "noise", "language"):
         for task in TASKS:
@@ -149,8 +149,8 @@ def test_rejected_frames_are_replaced_from_the_reserve() -> None:
     verdicts = {row.trajectory_id: Verdict(True, "kept") for row in rows}
     group = sorted((r for r in rows if (r.axis, r.task) == ("camera", TASKS[0].name)), key=lambda row: row.rank)
     first, reserve = group[0], next(row for row in group if not row.wanted)
-    assert plan.select(rows, verdicts)[reserve.episode_id].reason == "reserve_not_needed"
-    outcome = plan.select(rows, verdicts, {first.episode_id: "too_dark"})
+    assert selection.select(rows, verdicts)[reserve.episode_id].reason == "reserve_not_needed"
+    outcome = selection.select(rows, verdicts, {first.episode_id: "too_dark"})
     assert outcome[first.episode_id] == Verdict(False, "too_dark")
     assert outcome[reserve.episode_id].kept
 
@@ -265,7 +265,7 @@ def test_a_combination_fills_a_quota_of_its_own() -> None:
     together = config(axes=Axes.model_validate(axes), episodes={"camera": 3, "noise+camera": 3, "noise": 3}, reserve=0)
     rows = plan.make(entries(), together, REPLAY, NO_TESTS)
     assert Counter(row.axis for row in rows) == {"clean": 12, "camera": 3, "camera+noise": 3, "noise": 3}
-    kept = plan.select(rows, {row.trajectory_id: Verdict(True, "kept") for row in rows})
+    kept = selection.select(rows, {row.trajectory_id: Verdict(True, "kept") for row in rows})
     assert all(verdict.kept for verdict in kept.values())
     assert plan.shortage(rows, together) == {}
     alone = plan.make(

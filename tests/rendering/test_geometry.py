@@ -26,7 +26,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.registry import formats_of
 from pipeline.libero import bddl
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.planning.streams import Stream
 from pipeline.rendering.geometry import COMMON
 from pipeline.rendering.render import render
@@ -38,7 +38,8 @@ from pipeline.run.replay_stage import Replays
 from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Rendered, RenderedExtra, Task, Trajectory
-from pipeline.validation.checks import CHECKS, Case
+from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS
 
 EXTRAS: tuple[RenderedExtra, ...] = ("depth", "object_poses", "segmentation")
 MOVED = CameraPerturbation(component="spherical", level=3, azimuth_deg=30.0, elevation_deg=8.0)
@@ -170,7 +171,7 @@ def run(short_demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     plan.write(rows, data / "plan.parquet")
     judged = Replays(config.demos, config.replay, data / "trajectories", loop).of(rows)
     render_plan(rows, config, data / "trajectories", data / "frames", loop)
-    outcome = plan.select(rows, judged)
+    outcome = selection.select(rows, judged)
     kept = [row for row in rows if outcome[row.episode_id].kept]
     load = EpisodeLoader(data, config.render)
     known = {

@@ -12,7 +12,8 @@ import yaml
 from conftest import served
 
 from pipeline import __main__ as command_line
-from pipeline.axes.language import CLASSES, Component, lint, load_bank, normalise
+from pipeline.axes.language import load_bank
+from pipeline.axes.language_lint import CLASSES, Component, lint, normalise
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
 from pipeline.rewriting import language_model, rewrite

@@ -16,7 +16,8 @@ from machine_paths import told
 
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop, runner
-from pipeline.config import ComputeConfig, DemosConfig, ReplayConfig
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.assets import libero_assets

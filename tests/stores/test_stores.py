@@ -26,7 +26,7 @@ from pipeline.compute.pool import loop
 from pipeline.config import Config, FilterConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.planning import plan
+from pipeline.planning import plan, selection
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.rendering.render import render
 from pipeline.rendering.renderer import LastScene
@@ -511,7 +511,7 @@ def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_agai
     judged = Replays(config.demos, config.replay, tmp_path, given_up).of(rows)
     assert judged == {rows[0].trajectory_id: Verdict(False, "worker_lost")}
     assert Replays(config.demos, config.replay, tmp_path, nothing_to_do).of(rows) == judged
-    assert {verdict.reason for verdict in plan.select(rows, judged).values()} == {"worker_lost"}
+    assert {verdict.reason for verdict in selection.select(rows, judged).values()} == {"worker_lost"}
     assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
     assert outcome.replayed(rows, tmp_path)
 
@@ -558,11 +558,11 @@ def test_a_reserve_is_replayed_once_frames_before_it_are_refused(rows: list[plan
         for rank, name in enumerate("abc")
     )
     both, kept = [first, second, third], Verdict(True, "kept")
-    assert plan.pending(both, {}) == ["a"]
-    assert plan.pending(both, {"a": kept}) == []
-    assert plan.pending(both, {"a": kept}, {"a": "worker_lost"}) == ["b"]
-    assert plan.pending(both, {"a": kept, "b": kept}, {"a": "worker_lost", "b": "too_dark"}) == ["c"]
-    judged = plan.select(both, {"a": kept, "b": kept}, {"a": "worker_lost"})
+    assert selection.pending(both, {}) == ["a"]
+    assert selection.pending(both, {"a": kept}) == []
+    assert selection.pending(both, {"a": kept}, {"a": "worker_lost"}) == ["b"]
+    assert selection.pending(both, {"a": kept, "b": kept}, {"a": "worker_lost", "b": "too_dark"}) == ["c"]
+    judged = selection.select(both, {"a": kept, "b": kept}, {"a": "worker_lost"})
     assert [verdict.reason for verdict in judged.values()] == ["worker_lost", "kept", "reserve_not_needed"]
 
 

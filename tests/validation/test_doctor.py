@@ -14,7 +14,8 @@ from conftest import BOWL, MILK, REPOSITORY, STOVE, link_testset, tiny_config
 from pipeline import __main__ as command_line
 from pipeline import gl
 from pipeline.catalogue import downloads
-from pipeline.config import ComputeConfig, Config, DemosConfig, PlanConfig, load
+from pipeline.compute_config import ComputeConfig
+from pipeline.config import Config, DemosConfig, PlanConfig, load
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig
 from pipeline.identity import made_with

@@ -34,7 +34,8 @@ from pipeline.run import manifest, outcome
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import episodes_of, export
 from pipeline.types import Episode, Task, Trajectory
-from pipeline.validation.checks import CHECKS, Case
+from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import witnesses
 from pipeline.validation.validate import EpisodesJob, validate
 from pipeline.validation.verify import verify

@@ -1,0 +1,70 @@
+"""Whether a sentence can take the place of an instruction, by its form and, as far as it can be checked, its goal."""
+
+import re
+from typing import Literal, get_args
+
+from pipeline.axes.language_goal import changed_goal
+from pipeline.types import Task
+
+Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
+CLASSES: tuple[Component, ...] = get_args(Component)
+NAMED: tuple[Component, ...] = ("distraction", "paraphrase")
+"""The classes that call all things and places of the goal by their names; the others may describe them by what one
+knows of them, or by exclusion (``the only dairy product``), which holds for the task's own objects and no more."""
+
+MIN_WORDS = 3
+MAX_WORDS_AND_MARKS, MAX_CHARACTERS = 38, 172
+"""SmolVLA and pi0 keep the first 48 tokens of an instruction and cut the rest without a warning.
+
+Two of the 48 are not free: pi0's tokenizer puts a token at the beginning, and both policies a line break at the end.
+Their tokenizers could not be had, so three public ones were measured on the bank: GPT-2's, Mistral's and its successor.
+By none has a rewrite more than 8 tokens beyond its words and marks, hence 46 - 8; the longest has 43 of the 46. The
+bound on characters is for sentences with more rare words than the bank's.
+"""
+LENGTH = (
+    f"at least {MIN_WORDS} words, at most {MAX_WORDS_AND_MARKS} words and punctuation marks together, "
+    f"and at most {MAX_CHARACTERS} characters"
+)
+REMEDY = "correct or delete the sentence; or, where it is right, add its words to axes/language_words.yaml"
+
+_PREAMBLE = re.compile(
+    r"^(sure|certainly|of course)\b\W*here\b"
+    r"|\b(here (are|is)|below (are|is)|as an ai)\b"
+    r"|\b(variation|variant|rewrite|rephrasing|paraphrase)s? (of|for)\b",
+    re.IGNORECASE,
+)
+_DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|benchmark|hdf)\b", re.IGNORECASE)
+_MARK = re.compile(r"[^a-z ]")
+_WELL_FORMED = re.compile(r"[a-z]+(?:[,.?!;:]? [a-z]+|['-][a-z]+)*")
+
+
+def normalise(text: str) -> str:
+    """``text`` without case, punctuation and repeated white space: what two wordings are compared by."""
+    return " ".join(re.sub(r"[^a-z0-9]+", " ", text.lower().replace("'", "")).split())
+
+
+def lint(text: str, task: Task, component: Component) -> str | None:
+    """The reason why ``text`` cannot replace the task's instruction; None when it can.
+
+    Raises:
+        PipelineError: when the task's BDDL file cannot be read.
+    """
+    words = len(text.split())
+    words_and_marks = words + len(_MARK.findall(text))
+    if words == 0:
+        return "empty"
+    if _PREAMBLE.search(text):
+        return "preamble of a language model"
+    if _DEBRIS.search(text):
+        return "file-name debris"
+    if not _WELL_FORMED.fullmatch(text):
+        return "characters, spacing or punctuation other than of a lower-case sentence without its final full stop"
+    if words < MIN_WORDS:
+        return f"{words} words, wanted {LENGTH}"
+    if words_and_marks > MAX_WORDS_AND_MARKS:
+        return f"{words_and_marks} words and marks, wanted {LENGTH}"
+    if len(text) > MAX_CHARACTERS:
+        return f"{len(text)} characters, wanted {LENGTH}"
+    if normalise(text) == normalise(task.instruction):
+        return "equal to the original"
+    return changed_goal(text, task, hints=component not in NAMED)

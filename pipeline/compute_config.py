@@ -1,0 +1,48 @@
+"""The section ``compute`` of a configuration."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from pipeline.axes.base import Frozen
+from pipeline.export_config import Count
+
+
+class SlurmConfig(Frozen):
+    """What each worker asks SLURM for; what is left out, SLURM decides.
+
+    Attributes:
+        partition, account: of the site.
+        walltime: after which SLURM ends a worker, such as ``"12:00:00"``; its work is done again by another.
+        memory_gb: of a worker.
+        options: further ones of ``sbatch``, such as ``--gres=gpu:1``.
+    """
+
+    partition: str | None = None
+    account: str | None = None
+    walltime: str | None = None
+    memory_gb: float = Field(default=4.0, gt=0.0, le=1000.0)
+    options: tuple[str, ...] = ()
+
+
+class ComputeConfig(Frozen):
+    """Where the work runs; it never changes the result.
+
+    Attributes:
+        cluster: ``local`` starts worker processes here, ``loop`` runs everything in this process, ``slurm`` has SLURM
+            start them, anything with ``://`` is the address of a Dask scheduler.
+        workers: processes of a local cluster, one for each core when left out; or jobs of SLURM.
+        slurm: what a job asks for.
+    """
+
+    cluster: str = Field(default="local", pattern=r"^(local|loop|slurm|\w+://.+)$")
+    workers: Count | None = None
+    slurm: SlurmConfig | None = None
+
+    @model_validator(mode="after")
+    def _slurm_with_slurm(self) -> ComputeConfig:
+        if self.cluster == "slurm" and self.workers is None:
+            raise ValueError("cluster: slurm needs a number of workers")
+        if self.cluster != "slurm" and self.slurm is not None:
+            raise ValueError("slurm goes with cluster: slurm, and only with it")
+        return self

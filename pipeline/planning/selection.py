@@ -1,0 +1,61 @@
+"""What became of each planned episode, and what has to be replayed next to know it."""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from pipeline.planning.plan import Row
+from pipeline.types import Verdict
+
+NOT_NEEDED = "reserve_not_needed"
+"""The reason of a reserve for whose quota others were kept."""
+
+NOT_REPLAYED = "not_replayed"
+"""The reason of what is needed, as far as is known, and has no trajectory yet."""
+
+
+def pending(
+    rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
+) -> list[str]:
+    """The trajectories that have to be replayed next, in plan order, given what ``select`` is given.
+
+    Reserves come in only where a candidate before them failed, so this is asked again until it is empty.
+    """
+    found = _verdicts(rows, verdicts, rejected)
+    return list(dict.fromkeys(row.trajectory_id for row, verdict in found if verdict is None))
+
+
+def select(
+    rows: Sequence[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None = None
+) -> dict[str, Verdict]:
+    """What became of every row: kept, dropped with a reason, or a reserve that was not needed.
+
+    Args:
+        verdicts: trajectory id to its verdict.
+        rejected: episode id to the reason why its frames were rejected.
+    """
+    unknown = Verdict(False, NOT_REPLAYED)
+    return {row.episode_id: verdict or unknown for row, verdict in _verdicts(rows, verdicts, rejected)}
+
+
+def _verdicts(
+    rows: Iterable[Row], verdicts: Mapping[str, Verdict], rejected: Mapping[str, str] | None
+) -> Iterator[tuple[Row, Verdict | None]]:
+    """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
+
+    The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
+    """
+    quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
+    for row in rows:
+        quotas[row.axis, row.suite, row.task].append(row)
+    for quota in quotas.values():
+        group = sorted(quota, key=lambda row: row.rank)
+        need = sum(row.wanted for row in group)
+        for row in group:
+            verdict = verdicts.get(row.trajectory_id)
+            if not need:
+                verdict = Verdict(False, NOT_NEEDED)
+            elif rejected and verdict and verdict.kept and row.episode_id in rejected:
+                verdict = Verdict(False, rejected[row.episode_id])
+            # Until it is known, it is hoped for.
+            need -= verdict is None or verdict.kept
+            yield row, verdict
