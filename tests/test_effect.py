@@ -272,6 +272,7 @@ def test_from_demonstrations_to_the_results(
         (49, "turn on the stove", None, 50),
         (49, "", None, 50),
     ]
+    assert found.black == [{"task": STOVE.name, "state": 0, "success": False}]
     assert found.made["episodes_by_axis"] == {"clean": 1}
 
 
@@ -290,7 +291,8 @@ def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
         "arms": {"clean": [], "ours": ["robot"]},
         "run": {"demos": {"tasks": ["libero_goal/stove", "libero_goal/put_the_bowl_on_the_plate"]}},
     }
-    return results.PolicyResults(arm, seed, settings, {}, rows, reading)
+    black = [{"task": "stove", "state": number, "success": number < solved // 4} for number in range(10)]
+    return results.PolicyResults(arm, seed, settings, {}, rows, reading, black)
 
 
 def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -317,6 +319,7 @@ def test_the_table_pairs_episodes_seed_by_seed() -> None:
     text = comparison.markdown(found)
     assert "| robot | 10 | 30 % (40, 20) | 90 % (90, 90) |" in text
     assert "| camera, noise | 20 | 30 % (40, 20) | 90 % (90, 90) |" in text
+    assert "| LIBERO's own, views black | 10 | 5 % (10, 0) | 20 % (20, 20) |" in text
     assert "| robot | +60 (" in text
     assert "| turn on the stove | stove 2 of 2 | stove 2 of 2 |" in text, "of these rows, another goal's name"
     assert "| put the bowl on the plate | 0 of 2 | 0 of 2 |" in text

@@ -103,6 +103,10 @@ class Work:
         with self._timed(f"evaluation {policy.name}"), server as address:
             words = ["evaluate", str(folder), "--server", address, "--label", label, "--tasks-from", str(tasks)]
             run("-m", "pipeline", *words)
+            own, black = [task for task in tested if task.source == "libero"], folder / "black"
+            write_tasks(own, 0, folder / "own.json")
+            words[1], words[-1] = str(black), str(folder / "own.json")
+            run("-m", "pipeline", *words, "--black", "all")
             reading = evaluation.tell(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)
         losses = (policy / "training.jsonl").read_text().splitlines()
@@ -121,7 +125,9 @@ class Work:
         )
         settings["run"] = self.experiment.run.model_dump(mode="json", include={"demos", "plan", "replay", "render"})
         rows = [row for row in EpisodeFiles(folder).rows() if row.trial[0] in tested]
-        return PolicyResults(arm, seed, settings, made, rows, reading).write(kept)
+        seen = [row for row in EpisodeFiles(black).rows() if row.trial[0] in own]
+        nothing = [{"task": row.base, "state": row.number, "success": row.success} for row in seen]
+        return PolicyResults(arm, seed, settings, made, rows, reading, nothing).write(kept)
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:

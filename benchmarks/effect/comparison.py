@@ -106,6 +106,9 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     for line in lines_of(results):
         of = of_line(results, line)
         rows.append([LINES[line], str(len(next(iter(of[arms[0]].values())))), *(_rates(of[arm]) for arm in arms)])
+    if any(one.black for one in results):
+        each = [[one.black for one in results if one.arm == arm and one.black] for arm in arms]
+        rows.append(["LIBERO's own, views black", str(len(next(filter(None, each))[0])), *map(_seeing_nothing, each)])
     text = "Success, in brackets of each seed:\n\n" + _table(rows)
     cells: dict[str, dict[str, str]] = defaultdict(dict)
     for one in differences(results):
@@ -136,6 +139,12 @@ def _rates(seeds: Rows) -> str:
     rate = success_rate([*chain.from_iterable(seeds.values())])
     each = ", ".join(f"{100 * success_rate(rows)['rate']:.0f}" for rows in seeds.values())
     return f"{100 * rate['rate']:.0f} %" + (f" ({each})" if len(seeds) > 1 else "")
+
+
+def _seeing_nothing(seeds: Sequence[Sequence[Mapping[str, Any]]]) -> str:
+    rates = [100 * sum(row["success"] for row in rows) / len(rows) for rows in seeds]
+    each = f" ({', '.join(f'{rate:.0f}' for rate in rates)})" if len(rates) > 1 else ""
+    return f"{sum(rates) / len(rates):.0f} %{each}" if rates else "-"
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:

@@ -22,6 +22,7 @@ class PolicyResults:
         made: hashes of data, sentences and policy, axes of the episodes, losses, packages, and what each step took.
         rows: episodes of test tasks.
         reading: rows of ``evaluation.tell``.
+        black: ``task``, ``state`` and ``success`` from LIBERO's own states with both views black.
     """
 
     arm: str
@@ -30,6 +31,7 @@ class PolicyResults:
     made: dict[str, Any]
     rows: Sequence[EpisodeResult]
     reading: Sequence[dict[str, Any]]
+    black: Sequence[dict[str, Any]] = ()
 
     def made_by(self) -> dict[str, Any]:
         """What has to be the same for policies to be compared."""
@@ -52,7 +54,7 @@ class PolicyResults:
             temporary.write_text(
                 f'{{{head},\n"columns": {json.dumps(columns)},\n'
                 f'"rows": [\n{_lines([[row[name] for name in columns] for row in rows])}\n],\n'
-                f'"reading": [\n{_lines(self.reading)}\n]}}\n'
+                f'"reading": [\n{_lines(self.reading)}\n],\n"black": [\n{_lines(self.black)}\n]}}\n'
             )
         return file
 
