@@ -23,7 +23,10 @@ class AgentView:
         self._slope = np.tan(np.deg2rad(model.camera("agentview").fovy[0]) / 2)
 
     def shown(self, pixels: Pixels) -> NDArray[np.intp]:
-        """(P,) the body at the root of what each pixel (P, 2) shows; -1 where there is nothing."""
+        """(P,) the body at the root of what each pixel (P, 2) shows; -1 where there is nothing.
+
+        ``mj_multiRay`` misses some meshes that ``mj_ray`` hits: in a first state at 0.08 % of 2,500 pixels.
+        """
         camera, count = self._data.cam("agentview"), len(pixels)
         x, y = ((pixels + 0.5) / _HALF_PX - 1).T * self._slope
         rays = np.column_stack([x, -y, -np.ones(count)]) @ camera.xmat.reshape(3, 3).T
