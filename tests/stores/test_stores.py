@@ -162,7 +162,7 @@ def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_ma
     file = next(trajectories.glob("*.h5"))
     before = file.read_bytes()
     fault(file)
-    with pytest.raises(PipelineError, match=rf"(?s){file.name}.*run the replay stage again"):
+    with pytest.raises(PipelineError, match=rf"(?s){file.name}.*stages/replay.py CONFIG"):
         outcome.replayed(rows, trajectories)
     Replays(config.demos, config.replay, trajectories, loop).of(rows)
     assert file.read_bytes() == before
