@@ -38,6 +38,11 @@ def test_plain_frames_and_surfaces_are_those_of_mujocos_renderer(arena: Arena) -
             theirs.update_scene(data, camera, option)
             assert np.array_equal(plain.frame(data, camera), theirs.render()[::-1])
             _, number, kind = plain.surfaces(data, camera)
+            # robosuite hides sites by a negative opacity; MuJoCo segments all that are not at 0.
+            opacity = opened.model.site_rgba[:, 3].copy()
+            opened.model.site_rgba[:, 3] = opacity.clip(0)
+            theirs.update_scene(data, camera, option)
+            opened.model.site_rgba[:, 3] = opacity
             theirs.enable_segmentation_rendering()
             assert np.array_equal(np.stack([number, kind], axis=-1), theirs.render()[::-1])
             theirs.disable_segmentation_rendering()
