@@ -49,6 +49,20 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
     return read(SHIPPED)
 
 
+def test_the_further_round_changes_the_policy_alone(shipped: Experiment) -> None:
+    further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
+    assert further.keys() == {"pre_norm", "no_state"}
+    for one in further.values():
+        assert one.dataset_name("ours") == shipped.dataset_name("ours")
+        assert (one.evaluation, one.training.steps) == (shipped.evaluation, shipped.training.steps)
+    kept = results.read(EFFECT / "further" / "results")
+    assert [(one.arm, one.seed, len(one.rows), len(one.black)) for one in kept] == [
+        ("clean", 0, 244, 60),
+        ("ours", 0, 244, 60),
+    ]
+    assert all(one.settings["policy"] == further["pre_norm"].policy for one in kept)
+
+
 def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:
     """The same names of episodes, as many in both perturbed arms, and each task as many."""
     runs = {arm: load(EFFECT / "gpu" / f"{arm}.yaml") for arm in shipped.arms}
