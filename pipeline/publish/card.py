@@ -109,12 +109,9 @@ def render(
     axes = _axes(kept, shown)
     return TEMPLATES.get_template("card.md.j2").render(
         line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
+        **_of_format(shown, name, kept, clients),
         metadata=_metadata(shown, name, free=free, libero=libero).to_yaml(),
-        format=shown.title,
-        kind=shown.name,
         others=" and ".join(others),
-        key=shown.keys,
-        loading=shown.loading(name, REPOSITORY, kept),
         name=name,
         kept=kept,
         origins=origins(kept, source),
@@ -133,14 +130,9 @@ def render(
         yields=_yields(rows),
         leakage={axis: finding for axis, finding in leakage.items() if axis in axes},
         schema=SCHEMA,
-        gripper=shown.gripper,
-        extras=shown.extras,
-        language=shown.language,
-        held_out=shown.options.validation,
         statistics=statistics,
         validation=validation,
         failed=[check for check, found in validation.items() if found["findings"]],
-        clients={client: call for client, call in clients.items() if client in shown.clients},
         # Any will do: whoever has the dataset can try the command as it stands.
         example=min(row["episode_id"] for row in kept),
         versions=manifest.made_with(kept[0]),
@@ -149,6 +141,22 @@ def render(
         citation=schema_file("citation.bib").read_text(),
         owed=owed,
     )
+
+
+def _of_format(
+    shown: AnyFormat, name: str, kept: Sequence[Mapping[str, Any]], clients: Mapping[str, Mapping[str, str]]
+) -> dict[str, Any]:
+    return {
+        "format": shown.title,
+        "kind": shown.name,
+        "key": shown.keys,
+        "loading": shown.loading(name, REPOSITORY, kept),
+        "gripper": shown.gripper,
+        "extras": shown.extras,
+        "language": shown.language,
+        "held_out": shown.options.validation,
+        "clients": {client: call for client, call in clients.items() if client in shown.clients},
+    }
 
 
 def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
