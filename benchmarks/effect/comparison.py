@@ -105,10 +105,11 @@ def markdown(results: Sequence[PolicyResults]) -> str:
     rows = [["tests", "episodes", *arms]]
     for line in lines_of(results):
         of = of_line(results, line)
-        rows.append([LINES[line], str(len(next(iter(of[arms[0]].values())))), *(_rates(of[arm]) for arm in arms)])
+        rows.append([LINES[line], str(len(next(iter(of[arms[0]].values())))), *(_solved(of[arm]) for arm in arms)])
     if any(one.black for one in results):
-        each = [[one.black for one in results if one.arm == arm and one.black] for arm in arms]
-        rows.append(["LIBERO's own, views black", str(len(next(filter(None, each))[0])), *map(_seeing_nothing, each)])
+        black = [[[row["success"] for row in one.black] for one in results if one.arm == arm] for arm in arms]
+        number = max(len(seed) for seeds in black for seed in seeds)
+        rows.append(["LIBERO's own, views black", str(number), *map(_rates, black)])
     text = "Success, in brackets of each seed:\n\n" + _table(rows)
     cells: dict[str, dict[str, str]] = defaultdict(dict)
     for one in differences(results):
@@ -135,16 +136,17 @@ def _reached(counts: Counter[str | None], told: str, tasks: Sequence[str]) -> st
     return f"{', '.join([*own, *others]) or 0} of {counts.total()}"
 
 
-def _rates(seeds: Rows) -> str:
-    rate = success_rate([*chain.from_iterable(seeds.values())])
-    each = ", ".join(f"{100 * success_rate(rows)['rate']:.0f}" for rows in seeds.values())
-    return f"{100 * rate['rate']:.0f} %" + (f" ({each})" if len(seeds) > 1 else "")
+def _solved(seeds: Rows) -> str:
+    return _rates([[row.success for row in rows] for rows in seeds.values()])
 
 
-def _seeing_nothing(seeds: Sequence[Sequence[Mapping[str, Any]]]) -> str:
-    rates = [100 * sum(row["success"] for row in rows) / len(rows) for rows in seeds]
-    each = f" ({', '.join(f'{rate:.0f}' for rate in rates)})" if len(rates) > 1 else ""
-    return f"{sum(rates) / len(rates):.0f} %{each}" if rates else "-"
+def _rates(seeds: Sequence[Sequence[bool]]) -> str:
+    """Of all seeds that were tried, and of each where there are several."""
+    tried = [seed for seed in seeds if seed]
+    if not tried:
+        return "-"
+    all_of_them, *each = (f"{100 * sum(trials) / len(trials):.0f}" for trials in ([*chain(*tried)], *tried))
+    return f"{all_of_them} %" + (f" ({', '.join(each)})" if len(each) > 1 else "")
 
 
 def _table(rows: Sequence[Sequence[str]]) -> str:

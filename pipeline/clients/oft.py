@@ -84,12 +84,7 @@ def datasets(root: Path) -> list[Path]:
     """
     found = sorted(file.parent for file in root.glob("*/*/dataset_info.json"))
     if not found:
-        raise PipelineError(
-            "no RLDS dataset",
-            where=root,
-            expected="NAME/1.0.0/dataset_info.json",
-            remedy=MAKE_AGAIN,
-        )
+        raise PipelineError("no RLDS dataset", where=root, expected="NAME/1.0.0/dataset_info.json", remedy=MAKE_AGAIN)
     return found
 
 

@@ -113,11 +113,7 @@ class Format(ABC, Generic[Options]):
             record = Export(**json.loads(self.record_file.read_text()))
             return replace(record, files=dict(record.files))
         except (OSError, ValueError, TypeError) as error:
-            raise PipelineError(
-                f"no finished dataset ({error})",
-                where=self.record_file,
-                remedy=MAKE_AGAIN,
-            ) from error
+            raise PipelineError(f"no finished dataset ({error})", where=self.record_file, remedy=MAKE_AGAIN) from error
 
     def written(self) -> list[Written]:
         """The files of the finished dataset.

@@ -64,10 +64,7 @@ def readable(root: Path, version: str = "v3.0", also: tuple[type[Exception], ...
         yield
     except (*UNREADABLE, *also) as error:
         raise PipelineError(
-            f"{type(error).__name__}: {error}",
-            where=root,
-            expected=f"a LeRobot {version} dataset",
-            remedy=MAKE_AGAIN,
+            f"{type(error).__name__}: {error}", where=root, expected=f"a LeRobot {version} dataset", remedy=MAKE_AGAIN
         ) from error
 
 

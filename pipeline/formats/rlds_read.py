@@ -103,10 +103,7 @@ def _info(folder: Path) -> Any:
         return _opened(edition(folder / "dataset_info.json"))
     except (OSError, ValueError, KeyError) as error:
         raise PipelineError(
-            f"{type(error).__name__}: {error}",
-            where=folder,
-            expected="a set that TFDS opens",
-            remedy=MAKE_AGAIN,
+            f"{type(error).__name__}: {error}", where=folder, expected="a set that TFDS opens", remedy=MAKE_AGAIN
         ) from error
 
 

@@ -238,7 +238,7 @@ def _disk(data: Path, need_gb: float) -> Diagnosis:
     there_gb = free_gb(data)
     detail = f"{there_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
     # What changes a dataset is known once the plan is made.
-    if largest_mb := max((size_mb(data / kind.name) for kind in FORMATS), default=0.0):
+    if largest_mb := max(size_mb(data / kind.name) for kind in FORMATS):
         detail += f", up to {largest_mb / 1e3:.1f} more where a dataset is made anew, as the old one stays until then"
     if there_gb < need_gb:
         return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")
