@@ -53,9 +53,12 @@ def test_the_further_round_changes_the_policy_alone(shipped: Experiment) -> None
     further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
     assert further.keys() == {"pre_norm", "no_state"}
     for one in further.values():
-        assert one.dataset_name("ours") == shipped.dataset_name("ours")
-        assert (one.evaluation, one.training.steps) == (shipped.evaluation, shipped.training.steps)
-    kept = results.read(EFFECT / "further" / "results")
+        assert one.policy == {**shipped.policy, "pre_norm": True}
+        assert one == shipped.model_copy(update={"policy": one.policy, "training": one.training})
+    steps = [one.training.model_dump(exclude={"proprioception"}) for one in (shipped, *further.values())]
+    assert steps[0] == steps[1] == steps[2]
+    assert not further["no_state"].training.proprioception
+    kept = results.read(EFFECT / "further" / "results" / "pre_norm")
     assert [(one.arm, one.seed, len(one.rows), len(one.black)) for one in kept] == [
         ("clean", 0, 244, 60),
         ("ours", 0, 244, 60),

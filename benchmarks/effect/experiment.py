@@ -147,13 +147,18 @@ class Experiment(Frozen):
 
 
 def read(path: Path) -> Experiment:
-    """Read and validate the experiment.
+    """Read and validate the experiment. One with a ``base``, another file, gives only what differs from it.
 
     Raises:
         PipelineError: naming the file and every field that is wrong.
     """
     try:
-        return Experiment.model_validate(yaml.safe_load(path.read_text()))
+        settings = yaml.safe_load(path.read_text())
+        if isinstance(settings, dict) and (base := settings.pop("base", None)):
+            of_base = yaml.safe_load((path.parent / base).read_text())
+            parts = {name: of_base.get(name, {}) | part for name, part in settings.items() if isinstance(part, dict)}
+            settings = of_base | settings | parts
+        return Experiment.model_validate(settings)
     except (OSError, yaml.YAMLError) as error:
         raise PipelineError(f"cannot read the experiment ({error})", where=path) from error
     except ValidationError as error:
