@@ -21,16 +21,27 @@ Fill = Callable[[argparse.ArgumentParser], object]
 
 
 class LazyParser(argparse.ArgumentParser):
-    """Gets its arguments when it is first asked to parse, as what they may be can take long to import."""
+    """Gets its arguments when it is first asked to parse, as what they may be can take long to import.
+
+    Options may stand between arguments: argparse itself takes an argument that may be left out, as CONFIG, for left out
+    when an option comes before it.
+    """
 
     summary: str = ""
     fills: tuple[Fill, ...] = ()
+    _sorting = False
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         fills, self.fills = self.fills, ()
         for fill in fills:
             fill(self)
-        return super().parse_known_args(args, namespace)
+        if self._subparsers or self._sorting:
+            return super().parse_known_args(args, namespace)
+        self._sorting = True  # what follows calls this method again
+        try:
+            return self.parse_known_intermixed_args(args, namespace)
+        finally:
+            self._sorting = False
 
 
 def argument(*names: str, **how: Any) -> Fill:

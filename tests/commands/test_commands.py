@@ -57,6 +57,21 @@ def test_every_command_is_listed_and_explains_itself(command: list[str], capsys:
     assert capsys.readouterr().out.startswith(f"usage: python -m pipeline {' '.join(command)} ")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["regenerate", "ID", "--out", "again", "mine.yaml"],
+        ["push", "rlds", "me/x", "--really", "mine.yaml"],
+        ["preview", "libero_goal/*", "camera", "--out", "a.png", "mine.yaml"],
+        ["preview", "--out", "a.png", "libero_goal/*", "camera", "mine.yaml"],
+        ["clean", "--only", "rlds", "mine.yaml", "--yes"],
+    ],
+    ids=" ".join,
+)
+def test_the_configuration_is_the_last_argument_whatever_stands_before_it(words: list[str]) -> None:
+    assert str(parser().parse_args(words).config) == "mine.yaml"
+
+
 def test_lists(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["pipeline", "tasks"])
     assert main() == 0
