@@ -33,12 +33,12 @@ def suites() -> tuple[str, ...]:
     for name in own:
         # Datasets are called after the suite without libero_, some with val at the end, and OpenVLA-OFT takes
         # those with aloha in it for another robot's.
-        if f"libero_{name}" in SUITES or not re.fullmatch(r"(?!libero_)(?!.*aloha)[a-z][a-z0-9_]*(?<!_val)", name):
+        if f"libero_{name}" in SUITES or not re.fullmatch(r"(?!libero_|val$|.*aloha)[a-z][a-z0-9_]*(?<!_val)", name):
             raise PipelineError(
                 f"a suite cannot be called {name!r}",
                 where=OWN / name,
                 expected="lower-case letters, digits and _; none of LIBERO's suites, with or without libero_; no aloha "
-                "in it, and not _val at its end",
+                "in it, and neither val nor _val at its end",
                 remedy="rename the folder, and that of its demonstrations",
             )
     return (*SUITES, *own)

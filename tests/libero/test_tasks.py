@@ -37,7 +37,7 @@ def test_own_tasks_stand_beside_liberos(tmp_path: Path, monkeypatch: pytest.Monk
     assert find_task("my_suite", "bowl_down") == task
     with pytest.raises(PipelineError, match="my_suite has no task 'bowl_up'"):
         find_task("my_suite", "bowl_up")
-    for name in ("My suite", "goal", "libero_mine", "mine_val", "my_aloha"):
+    for name in ("My suite", "goal", "libero_mine", "mine_val", "val", "my_aloha"):
         own_task(tmp_path / "tasks" / name)
         with pytest.raises(PipelineError, match=f"a suite cannot be called '{name}'"):
             suites()
