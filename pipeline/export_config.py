@@ -197,7 +197,9 @@ class ExportConfig(Frozen):
         Raises:
             PipelineError: when a share holds none of them out.
         """
+        asked = self.where.suite if self.where else None
+        written = [number for suite, number in demonstrations.items() if asked is None or suite in asked]
         for name, options in self.formats.items():
             least = min if name == "rlds" else max
-            if options.validation and not validating(options.validation, least(demonstrations.values())):
+            if options.validation and not validating(options.validation, least(written, default=0)):
                 raise too_few(options.validation, f"export.{name}.validation")

@@ -26,7 +26,7 @@ from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_
 
 from pipeline.clients import recipe
 from pipeline.errors import PipelineError
-from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig, Where
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
@@ -62,6 +62,8 @@ def test_each_suite_of_rlds_must_have_a_validation_split() -> None:
     options.refuse_too_few({"libero_goal": 10, "my_suite": 6})
     with pytest.raises(PipelineError, match="no task has enough demonstrations"):
         options.refuse_too_few({"libero_goal": 10, "my_suite": 4})
+    of_goal = options.model_copy(update={"where": Where(suite=("libero_goal",))})
+    of_goal.refuse_too_few({"libero_goal": 10, "my_suite": 4})
     of_one = ExportConfig(rlds=None, lerobot=LeRobotConfig(name=NAME, validation=0.1))
     of_one.refuse_too_few({"libero_goal": 10, "my_suite": 4})
 
