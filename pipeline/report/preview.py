@@ -15,6 +15,7 @@ from PIL import Image
 
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer
 from pipeline.axes.disturbance import DisturbancePerturbation
+from pipeline.axes.language import LanguageAxis
 from pipeline.compute.pool import Workers
 from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
@@ -223,7 +224,8 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     tiles = [Tile(Image.fromarray(stage.frames([view])[0]), f"clean twin: {demo.task.instruction}")]
     for name in AXES:
         axis = configured(name, config)
-        if axis.applies(demo.task):
+        without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, [name], test)
+        if axis.applies(demo.task) and not without_rewrites:
             tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test), view))
     return sheet(f"{demo.task.suite}/{demo.task.name}: first frame of the agent view, one draw of each axis", tiles, 5)
 
