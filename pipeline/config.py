@@ -21,7 +21,7 @@ from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
-from pipeline.types import RenderedExtra
+from pipeline.types import Place, RenderedExtra
 
 
 class DemosConfig(Frozen):
@@ -36,7 +36,7 @@ class DemosConfig(Frozen):
     """
 
     source: Literal["starter", "hdf5"] = "starter"
-    root: Path | None = None
+    root: Place | None = None
     tasks: tuple[str, ...] = ("libero_spatial/*", "libero_object/*", "libero_goal/*", "libero_10/*")
     per_task: Count | None = None
 
@@ -193,7 +193,7 @@ class Config(Frozen):
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
     # Left out where it says nothing, so that what was finished before there was the field stays what it is.
-    folder: Path = Field(default=Path("data"), exclude_if=lambda folder: folder == Path("data"))
+    folder: Place = Field(default=Path("data"), exclude_if=lambda folder: folder == Path("data"))
     demos: DemosConfig = DemosConfig()
     plan: PlanConfig
     replay: ReplayConfig = ReplayConfig()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 if TYPE_CHECKING:
     import mujoco
@@ -28,6 +28,10 @@ class Frozen(BaseModel):
     """A record that cannot change and refuses fields it does not know, and numbers that are not finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+Place = Annotated[Path, AfterValidator(Path.expanduser)]
+"""A path of a configuration; ``~`` is the home folder, as in a shell."""
 
 
 class State(NamedTuple):

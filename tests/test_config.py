@@ -11,6 +11,9 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
+from pipeline.axes.background import BackgroundAxis
+from pipeline.axes.language import LanguageAxis
+from pipeline.catalogue.sources import Folder
 from pipeline.commands.develop import schemas
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
@@ -187,6 +190,22 @@ def test_a_folder_of_demonstrations_is_of_hdf5_files_and_one_format_is_enough(tm
     assert config.data == Path("/big/disk/mine")
     assert list(config.export.formats) == ["rlds"]
     assert config.export.name == config.export.formats["rlds"].name == "libero_mine"
+
+
+def test_a_path_may_begin_at_the_home_folder(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    own = "{sources: [{folder: ~/own, licence: mine}]}"
+    axes = f"{{language: {{bank: ~/bank.yaml}}, background: {own}}}"
+    plan = f"plan: {{episodes: {{language: 1, background: 1}}, axes: {axes}}}"
+    file.write_text(f"name: mine\ndemos: {{root: ~/d}}\nfolder: ~/runs\n{plan}")
+    config = load(file)
+    language, background = (config.plan.axes.drawn()[axis] for axis in ("language", "background"))
+    assert isinstance(language, LanguageAxis)
+    assert isinstance(background, BackgroundAxis)
+    (source,) = background.sources
+    assert isinstance(source, Folder)
+    found = [config.folder, config.demos.root, language.bank, source.folder]
+    assert found == [Path.home() / name for name in ("runs", "d", "bank.yaml", "own")]
 
 
 def test_what_a_field_had_before_it_existed_leaves_no_trace() -> None:

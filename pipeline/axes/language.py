@@ -30,7 +30,7 @@ from pipeline.jit import compiled
 from pipeline.libero.tasks import Same
 from pipeline.strict_yaml import FastStrictLoader
 from pipeline.testset.benchmark import TestSet
-from pipeline.types import Task
+from pipeline.types import Place, Task
 
 Bank = dict[str, dict[str, dict[Component, tuple[str, ...]]]]
 """Suite to task name to class to rewrites."""
@@ -79,7 +79,7 @@ class LanguageAxis(Axis):
     not_held_out: ClassVar[str] = "its rewrites are a list, and plans train on all of it"
 
     classes: tuple[Component, ...] = Field(default=CLASSES, min_length=1)
-    bank: Path | None = None
+    bank: Place | None = None
 
     def beside(self, axes: Collection[str]) -> LanguageAxis:
         """Among objects that the layout axis adds: of the classes ``NAMED`` only.

@@ -1,8 +1,8 @@
 """A folder of the user's own as a source, of textures or of object models."""
 
-from pathlib import Path
-
 from pydantic import BaseModel
+
+from pipeline.types import Place
 
 
 class Folder(BaseModel, frozen=True, extra="forbid"):
@@ -14,5 +14,5 @@ class Folder(BaseModel, frozen=True, extra="forbid"):
         licence: what they may be used under, recorded with every episode that shows one.
     """
 
-    folder: Path
+    folder: Place
     licence: str
