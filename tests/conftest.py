@@ -69,7 +69,13 @@ LONG = (
     *("test_expand", "test_render", "test_cluster", "test_run", "test_light", "test_geometry", "test_validate"),
     *("test_evaluation_identity", "test_background", "test_portable", "test_version", "test_stepping", "test_failures"),
     *("test_writers", "test_replay", "test_golden", "test_doctor", "test_skins", "test_examples", "test_exports"),
-    *("test_evaluation_analyses", "test_look_every", "test_asset_archive", "test_bad_demonstrations"),
+    *(
+        "test_composition_gap",
+        "test_goals_and_views",
+        "test_look_every",
+        "test_asset_archive",
+        "test_bad_demonstrations",
+    ),
     *("test_without_gl", "test_fuzz"),
 )
 """Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
