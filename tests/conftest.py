@@ -64,13 +64,14 @@ SLOW_FIXTURES = {"whole", "environment", "plate_environment", "crowded", "stage"
 
 
 LONG = (
-    *("test_finished", "test_evaluation", "test_kills", "test_reserves", "test_compute", "test_stores", "test_effect"),
-    *("test_lerobot_eval", "test_commands", "test_renderer", "test_preview", "test_evaluation_policies", "test_arenas"),
-    *("test_expand", "test_render", "test_cluster", "test_run", "test_light", "test_geometry", "test_validate"),
-    *("test_evaluation_identity", "test_background", "test_portable", "test_version", "test_stepping", "test_failures"),
-    *("test_writers", "test_replay", "test_golden", "test_doctor", "test_skins", "test_examples", "test_exports"),
-    *("test_evaluation_analyses", "test_look_every", "test_asset_archive", "test_bad_demonstrations"),
-    *("test_without_gl", "test_fuzz"),
+    *("test_finished", "test_evaluation", "test_kills", "test_reserves", "test_compute", "test_frame_store"),
+    *("test_effect", "test_lerobot_eval", "test_commands", "test_renderer", "test_preview", "test_evaluation_policies"),
+    *("test_arenas", "test_expand", "test_render", "test_cluster", "test_run", "test_light", "test_geometry"),
+    *("test_validate", "test_evaluation_identity", "test_background", "test_portable", "test_version", "test_stepping"),
+    *("test_failures", "test_validate_lerobot", "test_formats_agree", "test_replay", "test_rlds", "test_golden"),
+    *("test_doctor", "test_skins", "test_examples", "test_exports", "test_goals_and_views", "test_look_every"),
+    *("test_trajectory_store", "test_verify", "test_asset_archive", "test_lerobot", "test_composition_gap"),
+    *("test_bad_demonstrations", "test_without_gl", "test_fuzz"),
 )
 """Modules that take longest: they come first, so that of several processes none is left alone with one at the end.
 

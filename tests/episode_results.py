@@ -1,8 +1,9 @@
-"""Results of episodes that nobody ran, for what reads them."""
+"""Results of episodes that nobody ran, and the command that reads them."""
 
 from dataclasses import asdict
 from typing import Any
 
+from pipeline.__main__ import parser
 from pipeline.evaluation.environment import STEP_LIMITS
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
@@ -32,3 +33,9 @@ def result(
         "versions": {"mujoco": "3.2.7", "OpenGL": "llvmpipe"},
     }
     return EpisodeResult(**{**row, **fields})
+
+
+def analyse(*arguments: str) -> int:
+    """Run the command ``analyse``; its exit code."""
+    parsed = parser().parse_args(["analyse", *arguments])
+    return int(parsed.run(parsed) or 0)

@@ -4,6 +4,7 @@ Nothing heavy is imported here: a process that is killed on purpose must start s
 """
 
 import struct
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
@@ -97,6 +98,10 @@ def with_extras(episode_id: str) -> Episode:
 
 def loop(fn: Callable[[Any], Any], items: Sequence[Any], description: str) -> list[Any]:
     return [fn(item) for item in items]
+
+
+def loaded_packages() -> set[str]:
+    return {name.split(".")[0] for name in sys.modules}
 
 
 def files(folder: Path) -> Tree:

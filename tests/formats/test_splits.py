@@ -27,7 +27,7 @@ from synthetic import EXTRAS, IDS, NAME, SET, episode, loop, with_extras, write_
 from pipeline.clients import recipe
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig, Where
-from pipeline.formats.episodes import Episodes, Known
+from pipeline.formats.episodes import Episodes, Known, split
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.rlds import Rlds
@@ -54,6 +54,16 @@ def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
     assert episodes.by_split(0.0) == {"train": IDS}
     with pytest.raises(PipelineError, match=r"(?s)no task has enough demonstrations.*6 or more"):
         episodes.by_split(0.1)
+
+
+def test_split_keeps_order_and_balance() -> None:
+    ids = [str(k) for k in range(11)]
+    pieces = split(ids, 4)
+    assert [name for piece in pieces for name in piece] == ids
+    assert sorted(map(len, pieces)) == [2, 3, 3, 3]
+    assert split(ids[:2], 4) == [["0"], ["1"]]
+    with pytest.raises(PipelineError, match="no episodes to write"):
+        Episodes({}, episode).by_split(0.0)
 
 
 def test_each_suite_of_rlds_must_have_a_validation_split() -> None:

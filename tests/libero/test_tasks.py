@@ -16,6 +16,23 @@ def test_names_instructions_and_files_are_liberos(suite: str) -> None:
     folder = Path(get_libero_path("bddl_files")).resolve() / suite
     theirs = [(known.name, known.language, folder / known.bddl_file) for known in task_maps[suite].values()]
     assert [(task.name, task.instruction, task.bddl_file) for task in tasks(suite)] == theirs
+    assert all(task.bddl_file.is_file() for task in tasks(suite))
+
+
+def test_tasks_are_selected_by_pattern_in_order() -> None:
+    assert select_tasks(["libero_goal/turn_on*", "libero_goal/*stove"]) == [
+        task for task in tasks("libero_goal") if task.name.endswith("stove")
+    ]
+    with pytest.raises(PipelineError, match="no task matches 'libero_gaol/") as caught:
+        select_tasks(["libero_goal/*", "libero_gaol/*"])
+    assert "libero_goal/" in str(caught.value)
+
+
+def test_unknown_task_names_the_closest() -> None:
+    with pytest.raises(PipelineError, match="turn_on_the_stove"):
+        find_task("libero_goal", "turn_on_stove")
+    with pytest.raises(PipelineError, match="libero_spatial or libero_object"):
+        tasks("libero_kitchen")
 
 
 def own_task(folder: Path, language: str = "Put the bowl down") -> Path:

@@ -1,156 +1,45 @@
 """The card says what the run's files say, its pictures are beside it, and the hub can read its metadata."""
 
-import hashlib
 import json
 import re
 import shutil
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
 
-import pyarrow as pa
 import pytest
-import yaml
-from conftest import BOWL, MILK, STOVE
-from huggingface_hub import DatasetCard
+from card_of_run import (
+    CAMERA,
+    NAME,
+    OPTIONS,
+    ROWS,
+    VALIDATION,
+    cells,
+    metadata_of,
+    row,
+    write,
+    write_files,
+    write_rows,
+    written,
+)
+from conftest import BOWL
 
-from pipeline.axes import to_json
-from pipeline.axes.background import BackgroundAxis, BackgroundPerturbation
-from pipeline.axes.base import Perturbation
-from pipeline.axes.camera import CameraAxis
-from pipeline.axes.language import LanguagePerturbation, deal
-from pipeline.axes.layout import LayoutAxis
 from pipeline.axes.pose import PoseAxis
-from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.episode_schema import SCHEMA
-from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
-from pipeline.formats.registry import FORMATS, columns, formats_of
-from pipeline.publish import card
-from pipeline.run import manifest
+from pipeline.export_config import ExportConfig, LeRobotConfig, RldsConfig
+from pipeline.formats.registry import FORMATS
 from pipeline.seeding import rng
-from pipeline.types import Extra, Task
-
-NAME = "libero_tiny"
-CAMERA = CameraAxis(levels=(4,)).sample(rng("card"), MILK, 0)
-BACKGROUND = BackgroundAxis(levels=(2,)).sample(rng("card"), MILK, 0)
-LAYOUT = LayoutAxis(levels=(1,)).sample(rng("card"), MILK, 0)
-
-
-def row(axis: str, *changes: Perturbation, task: Task = MILK, reason: str = "kept", **other: Any) -> dict[str, Any]:
-    kept = reason == "kept"
-    number = f"{axis}{len(changes)}{task.name}{reason}"
-    return {
-        "episode_id": number,
-        "role": "perturbed" if changes else "twin",
-        "suite": task.suite,
-        "task": task.name,
-        "demo_id": f"{task.suite}/{task.name}/demo_0",
-        "demo_origin": "human",
-        "axis": axis,
-        "perturbations": to_json(list(changes)),
-        "kept": kept,
-        "reason": reason,
-        "chosen": True,
-        "replay_mode": "open_loop",
-        "steps": 100,
-        "gl_device": "llvmpipe" if kept else None,
-        "rlds_shard": f"{NAME}-train.tfrecord-00000-of-00001" if kept else None,
-        "mujoco_version": "3.2.7",
-        **other,
-    }
-
-
-ROWS = [
-    row("clean"),
-    row("clean", task=STOVE),
-    row("camera", CAMERA),
-    row("camera", CAMERA, task=STOVE),
-    row("background", BACKGROUND),
-    row("layout", LAYOUT, replay_mode="tracked"),
-    row("layout", LAYOUT, task=STOVE, reason="goal_not_reached"),
-    row("layout", LAYOUT, task=STOVE, reason="reserve_not_needed", steps=None),
-    row("camera+background", CAMERA, BACKGROUND),
-]
-COVERAGE = {"test_tasks": 313, "compared": 313, "smallest": 5.379, "median": 6.12, "p90": 7.34, "largest": 8.56}
-FINDING = {"rows": 3, "test_tasks": 1599, "comparisons": 4797, "smallest": 5.379, "closest": "e", "clearance": 5.0}
-FINDING |= {"not_compared": 0}
-DATA_SHA256 = hashlib.sha256(b"data").hexdigest()
-VALIDATION: dict[str, dict[str, Any]] = {"gripper": {"checked": 7, "findings": []}}
 
 
 @pytest.fixture
 def data(tmp_path: Path) -> Path:
-    """The folder of a run, as far as the card reads it."""
-    write_rows(tmp_path, ROWS)
-    column = list(range(1, 8))
-    for name, report in {
-        "leakage.json": {
-            "camera": FINDING
-            | {"measure": "degrees | turned", "overlaps": 0, "verdict": "disjoint", "coverage": {"distance": COVERAGE}},
-            # Of the plan, and of no episode that is kept.
-            "robot": FINDING | {"measure": "radians", "overlaps": 0, "verdict": "disjoint", "coverage": {}},
-        },
-        "validation.json": VALIDATION,
-        "dataset_statistics.json": {
-            NAME: {"action": dict.fromkeys(("mean", "std", "min", "max", "q01", "q99"), column)}
-        },
-    }.items():
-        (tmp_path / name).write_text(json.dumps(report))
-    for kind in FORMATS:
-        record = {"identity": "", "files": {f"{NAME}/data.bin": DATA_SHA256}, "places": {}}
-        (tmp_path / f"{kind.name}.json").write_text(json.dumps(record))
-    (tmp_path / "sheets").mkdir()
-    for axis in ("camera", "camera+background"):
-        (tmp_path / "sheets" / f"{axis}.png").write_bytes(axis.encode())
-    (tmp_path / "finetune").mkdir()
-    clients = {
-        name: {"where": "there", "command": f"train --with {name}"}
-        for name in ("openvla_oft", "lerobot_act", "starvla")
-    }
-    (tmp_path / "finetune" / "finetune.yaml").write_text(yaml.safe_dump({"clients": clients}))
+    write_files(tmp_path)
     return tmp_path
-
-
-def write_rows(data: Path, rows: list[dict[str, Any]], source: Literal["starter", "hdf5"] = "starter") -> None:
-    settings = manifest.Settings(source=source, replay=ReplayConfig(), render=RenderConfig())
-    table = pa.Table.from_pylist(rows, schema=manifest.schema(columns()))
-    manifest.write(table, data / "manifest.parquet", settings)
-
-
-OPTIONS = ExportConfig(
-    rlds=RldsConfig(name=NAME, shards=1),
-    lerobot=LeRobotConfig(name=NAME, shards=1),
-    lerobot_v21=LeRobotV21Config(name=NAME, convention="ipec"),
-)
-
-
-def write(data: Path, options: ExportConfig = OPTIONS, extras: Sequence[Extra] = ()) -> None:
-    card.write(data, formats_of(data, options, extras), NAME)
 
 
 def test_other_formats_are_named_where_there_are_any(data: Path) -> None:
     assert "the same episodes exist as LeRobot and LeRobot v2.1,\njoined by `episode_id`." in written(data, "rlds")
-    card.write(data, formats_of(data, ExportConfig(rlds=RldsConfig(name=NAME), lerobot=None)), NAME)
-    alone = (data / "card" / "rlds" / "README.md").read_text()
+    alone = written(data, "rlds", ExportConfig(rlds=RldsConfig(name=NAME), lerobot=None))
     assert "This repository holds the RLDS form. `manifest.parquet` has" in alone
-
-
-def written(data: Path, kind: str, options: ExportConfig = OPTIONS, extras: Sequence[Extra] = ()) -> str:
-    write(data, options, extras)
-    return (data / "card" / kind / "README.md").read_text()
-
-
-def metadata_of(text: str) -> dict[str, Any]:
-    return dict(yaml.safe_load(DatasetCard(text).data.to_yaml()))
-
-
-def cells(text: str, first: str, under: str) -> list[str]:
-    """The row that begins with ``first`` in the section ``under``."""
-    section = text.partition(f"## {under}\n")[2]
-    found = re.search(rf"^\| {re.escape(first)} \|(.*)\|$", section, re.MULTILINE)
-    assert found, f"no {first} under {under}"
-    return [cell.strip() for cell in found[1].split(" | ")]
 
 
 @pytest.mark.parametrize("kind", [kind.name for kind in FORMATS])
@@ -245,71 +134,6 @@ def test_a_failed_check_is_not_hidden(data: Path) -> None:
     assert "**rotation failed**" in text
     assert cells(text, "rotation", "Conventions") == ["7", "1 findings, such as: episode 3 stands upside down"]
     assert "and passed" not in text
-
-
-def test_everything_shown_is_attributed(data: Path) -> None:
-    text = written(data, "rlds")
-    assert isinstance(BACKGROUND, BackgroundPerturbation)
-    for covering in BACKGROUND.coverings:
-        assert cells(text, covering.texture, "Licences and attributions")[1] == covering.licence
-    for added in LAYOUT.objects:
-        assert cells(text, added.name, "Licences and attributions")[2] == added.attribution
-
-
-@pytest.mark.parametrize(
-    ("licence", "free"),
-    [("CC-BY-3.0-US", True), ("CC0-1.0", True), ("CC-BY-NC-4.0", False), ("CC-BY-SA-4.0", False), ("mine", False)],
-)
-def test_a_licence_that_forbids_it_is_not_overruled(data: Path, licence: str, free: bool) -> None:
-    coverings = tuple(covering.model_copy(update={"licence": licence}) for covering in BACKGROUND.coverings)
-    rows = [*ROWS[:2], row("background", BACKGROUND.model_copy(update={"coverings": coverings}))]
-    write_rows(data, rows)
-    text = written(data, "rlds")
-    assert metadata_of(text)["license"] == ("cc-by-4.0" if free else "other")
-    assert ("licensed under [CC BY 4.0]" in text) == free
-
-
-def test_demonstrations_of_own_tasks_are_not_attributed_to_libero(data: Path) -> None:
-    own = [row(one["axis"], suite="my_suite") for one in ROWS[:1]]
-    write_rows(data, own, "hdf5")
-    text = written(data, "lerobot")
-    metadata = metadata_of(text)
-    assert metadata["license"] == "other"
-    assert "source_datasets" not in metadata
-    for claim in ("Liu, Zhu", "yifengzhu-hf", "human", "LIBERO demonstration", "LIBERO's wording", "[CC BY 4.0]"):
-        assert claim not in text
-    assert "1 recorded demonstrations of 1 tasks went in" in text
-    assert "**Demonstrations and tasks of my_suite**: of whoever published this dataset" in text
-    # Beside LIBERO's, both are named.
-    write_rows(data, [*own, row("clean", task=STOVE)], "hdf5")
-    text = written(data, "lerobot")
-    metadata = metadata_of(text)
-    assert metadata["license"] == "other"
-    assert metadata["source_datasets"] == ["yifengzhu-hf/LIBERO-datasets"]
-    assert "**Demonstrations of LIBERO's tasks**: [LIBERO]" in text
-    assert "tasks of my_suite" in text
-
-
-def test_only_the_starter_sets_demonstrations_are_called_human(data: Path) -> None:
-    assert "2 human demonstrations of 2 tasks" in written(data, "rlds")
-    write_rows(data, ROWS, "hdf5")
-    text = written(data, "rlds")
-    assert "2 recorded demonstrations of 2 tasks" in text
-    assert "Whether the publisher's files are LIBERO's own was not checked." in text
-    assert metadata_of(text)["license"] == "cc-by-4.0"
-
-
-def test_rewrites_of_another_bank_are_not_licensed(data: Path) -> None:
-    shipped = deal(STOVE)[0]
-    write_rows(data, [row("clean", task=STOVE), row("language", shipped, task=STOVE)])
-    text = written(data, "rlds")
-    assert "that made this dataset are under MIT.\n" in text
-    assert metadata_of(text)["license"] == "cc-by-4.0"
-    own = LanguagePerturbation(component="paraphrase", level=1, text="please turn that stove on for me")
-    write_rows(data, [row("clean", task=STOVE), row("language", own, task=STOVE)])
-    text = written(data, "rlds")
-    assert "others are of\n  whoever published it, and their licence is not known here." in text
-    assert metadata_of(text)["license"] == "other"
 
 
 LEROBOT_COLUMNS = [f"camera.{view}.{name}" for view in ("agent", "wrist") for name in ("depth", "segmentation")]

@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from episode_results import result
+from episode_results import analyse, result
 from html_page import Page, needs_nothing_beside_itself, screenshot
 from scipy.stats import binomtest
 
-from pipeline.__main__ import parser
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read, stored
 from pipeline.evaluation.selection import Selection, select
@@ -129,20 +128,17 @@ def test_results_under_different_prompts_or_limits_are_not_compared(
 ) -> None:
     one, other = result(subset[0], True, "one"), result(subset[0], True, "other", **second)
     folders = [write(tmp_path / "one", [one]), write(tmp_path / "other", [other])]
-    graded = ["analyse", "grade", *map(str, folders), "--out", str(tmp_path / "graded.json")]
-    page = str(tmp_path / "report.html")
-    for command in (graded, ["analyse", "report", *map(str, folders), "--out", page]):
-        arguments = parser().parse_args(command)
+    out = [*map(str, folders), "--out", str(tmp_path / "report.html")]
+    for command in ("grade", "report"):
         with pytest.raises(PipelineError) as caught:
-            arguments.run(arguments)
+            analyse(command, *out)
         told = str(caught.value)
         assert f"cannot be compared, on {subset[0].source}/{subset[0].suite}: {field} " in told
         assert f"{getattr(one, field)} and {getattr(other, field)}" in told
         for folder, row in zip(folders, (one, other), strict=True):
             assert str(EpisodeFiles(folder).path(row.episode)) in told
-        assert (f"--across {field}" in told) == (command[1] == "report"), "grade has no such option"
-    arguments = parser().parse_args(["analyse", "report", *map(str, folders), "--out", page, "--across", field])
-    arguments.run(arguments)
+        assert (f"--across {field}" in told) == (command == "report"), "grade has no such option"
+    analyse("report", *out, "--across", field)
     # Another suite has another limit, and another source another wording.
     elsewhere = result(EvaluationTask("libero", "libero_10", "a", "a_state0", "clean", "clean", 0, 0), policy="other")
     assert len(read([folders[0], write(tmp_path / "elsewhere", [elsewhere])])) == 2

@@ -4,41 +4,32 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import chdir, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import av
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from conftest import BOWL, MILK, STOVE, rot, run_stages, tiny_config
 
 from pipeline.compute.pool import loop
-from pipeline.config import Config, RenderConfig, load
+from pipeline.config import RenderConfig, load
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import PipelineError
-from pipeline.export_config import LeRobotV21Config
 from pipeline.files import checksum
 from pipeline.formats import lerobot_video, rlds_write
-from pipeline.formats.lerobot import LeRobot
-from pipeline.formats.lerobot_v21 import LeRobotV21
 from pipeline.formats.read_back import Copy, Fault
-from pipeline.formats.registry import formats_of
 from pipeline.formats.tfrecord import METADATA, columns, framed, records
 from pipeline.images.jpeg import decode, encode
-from pipeline.run import manifest, outcome
+from pipeline.run import manifest
 from pipeline.run.episode_loader import EpisodeLoader
-from pipeline.run.export import episodes_of, export
 from pipeline.types import Episode, Task, Trajectory
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import witnesses
-from pipeline.validation.validate import EpisodesJob, validate
-from pipeline.validation.verify import verify
+from pipeline.validation.validate import validate
 
 Tree = dict[str, Any]
 Rows = list[dict[str, Any]]
@@ -221,218 +212,6 @@ def test_a_good_run_passes(finished: Path) -> None:
     assert not (finished / ".work").exists()
 
 
-def test_planted_faults_stop_the_run_and_nothing_else_is_found(
-    finished: Path, short_demos: Path, tmp_path: Path
-) -> None:
-    data = tmp_path / "data" / "tiny"
-    shutil.copytree(finished, data)
-    rows = manifest.read(data / "manifest.parquet")
-    names = named(rows)
-    (other,) = (episode_id for episode_id, name in names.items() if name == "other")
-    spoil_rlds(data, names)
-    index = {names[row["episode_id"]]: row["lerobot_episode_index"] for row in rows if row["kept"]}
-    spoil_lerobot(data / "lerobot" / "tiny", index)
-    spoil_manifest(data, rows, other)
-    record_as_written(data)
-    killed = data / ".work" / "validate" / "of a killed run"
-    killed.mkdir(parents=True)
-    with pytest.raises(AssertionError, match=r"(?s)findings in all: counts 1, .*try: read data/tiny/validation\.json"):
-        run_stages(tmp_path, tiny_config(short_demos), ["validate"])
-    report = json.loads((data / "validation.json").read_text())
-    found = {
-        (check, finding["dataset"], names.get(finding["episode"]))
-        for check, result in report.items()
-        for finding in result["findings"]
-    }
-    again = {names[episode_id] for episode_id in witnesses(rows)}
-    assert ("clean", BOWL) in again
-    assert found == EXPECTED | {("rendered", dataset, name) for name, dataset in OTHER_FRAMES.items() if name in again}
-    assert not (data / ".work").exists()
-
-
-VERSIONS = ("lerobot", "lerobot_v21")
-KEYS = {"lerobot": "observation.images.image2", "lerobot_v21": "observation.images.wrist_image"}
-"""Version to its key of the wrist view."""
-
-
-@pytest.fixture(scope="module")
-def exported(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a copy of the run that has LeRobot v2.1 too, in IPEC's convention."""
-    folder = tmp_path_factory.mktemp("exported")
-    shutil.copytree(finished, folder / "data" / "tiny")
-    with chdir(folder):
-        config = with_v21(finished)
-        assert config.export.lerobot_v21 is not None
-        target = LeRobotV21(config.data, config.export.lerobot_v21)
-        export(target, episodes_of(target, config, outcome.read(config)), loop)
-    return folder
-
-
-def with_v21(finished: Path) -> Config:
-    config = load(finished.parent.parent / "configs" / "tiny.yaml")
-    v21 = LeRobotV21Config(name="tiny", convention="ipec")
-    return config.model_copy(update={"export": config.export.model_copy(update={"lerobot_v21": v21})})
-
-
-def checked(version: str, config: Config) -> dict[str, list[Fault]]:
-    """What is found in one dataset, by check; nothing is rendered anew."""
-    data = config.data.resolve()
-    kept = {row["episode_id"]: row for row in manifest.read(data / "manifest.parquet") if row["kept"]}
-    (target,) = (one for one in formats_of(data, config.export) if one.name == version)
-    results = EpisodesJob(config, data, [target], data, frozenset())(list(kept.values()))
-    with suppress(PipelineError):  # An episode says it too.
-        for check, fault in target.check(kept, data / "cache"):
-            results.note(check, [fault])
-    return {check: faults for check, faults in results.findings.items() if faults}
-
-
-def change_lines(file: Path, change: Callable[[Rows], Rows]) -> None:
-    rows = change([json.loads(line) for line in file.read_text().splitlines()])
-    file.write_text("".join(json.dumps(row) + "\n" for row in rows))
-
-
-def change_column(file: Path, name: str, change: Callable[[Any], Any]) -> None:
-    table = pq.read_table(file)
-    values = change(np.array(table[name].to_pylist(), np.float32))
-    place, field = table.schema.get_field_index(name), table.schema.field(name)
-    pq.write_table(table.set_column(place, field, pa.array(list(values), field.type)), file)
-
-
-def swap_videos(root: Path, version: str) -> None:
-    folders = [min(root.glob(f"videos/**/{key}")) for key in ("observation.images.image", KEYS[version])]
-    one, other = (min(folder.rglob("*.mp4")) for folder in folders)
-    content = one.read_bytes()
-    one.write_bytes(other.read_bytes())
-    other.write_bytes(content)
-
-
-def shift_timestamps(root: Path, version: str) -> None:
-    # All but the last: there may be no frame behind that.
-    late = np.float32(1 / SCHEMA.fps_hz)
-    change_column(min(root.glob("data/*/*")), "timestamp", lambda found: np.append(found[:-1] + late, found[-1]))
-
-
-def shorten(root: Path, version: str) -> None:
-    def change(rows: Rows) -> Rows:
-        return [{**rows[0], "length": rows[0]["length"] - 1}, *rows[1:]]
-
-    if version == "lerobot_v21":
-        change_lines(root / "meta" / "episodes.jsonl", change)
-        return
-    file = min((root / "meta" / "episodes").rglob("*.parquet"))
-    table = pq.read_table(file)
-    pq.write_table(pa.Table.from_pylist(change(table.to_pylist()), schema=table.schema), file)
-
-
-def lose_a_task(root: Path, version: str) -> None:
-    if version == "lerobot_v21":
-        change_lines(root / "meta" / "tasks.jsonl", lambda rows: rows[1:])
-    else:
-        tasks = pd.read_parquet(root / "meta" / "tasks.parquet")
-        tasks[1:].to_parquet(root / "meta" / "tasks.parquet")
-
-
-def change_an_episode(root: Path, version: str) -> None:
-    """What lerobot reads of it, and its steps do not say."""
-    if version == "lerobot_v21":
-        file = root / "meta" / "episodes.jsonl"
-        change_lines(file, lambda rows: [{**rows[0], "tasks": ["another"]}, *rows[1:]])
-        return
-    file = min((root / "meta" / "episodes").rglob("*.parquet"))
-    table = pq.read_table(file)
-    place, field = table.schema.get_field_index("dataset_to_index"), table.schema.field("dataset_to_index")
-    pq.write_table(table.set_column(place, field, pa.array([int(end) + 7 for end in table[place].to_numpy()])), file)
-
-
-def change_a_quantile(root: Path, version: str) -> None:
-    file = root / "meta" / "stats.json"
-    found = json.loads(file.read_text())
-    found["action"]["q99"][0] += 0.01
-    file.write_text(json.dumps(found))
-
-
-def bleach(root: Path, version: str) -> None:
-    for file in root.glob("videos/**/*.mp4"):
-        with av.open(str(file)) as video:
-            grey = [frame.to_ndarray(format="gray") for frame in video.decode(video=0)]
-        with lerobot_video.Video(file) as again:
-            for frame in grey:
-                again.add(np.repeat(frame[..., None], 3, axis=2), first=False)
-
-
-def turn_the_gripper(root: Path, version: str) -> None:
-    def change(found: Any) -> Any:
-        command = -found[:, 6:] if version == "lerobot" else 1 - found[:, 6:]
-        return np.hstack([found[:, :6], command])
-
-    change_column(min(root.glob("data/*/*")), "action", change)
-
-
-@pytest.mark.parametrize("version", VERSIONS)
-def test_nothing_is_found_where_nothing_was_planted(
-    version: str, exported: Path, finished: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(exported)
-    assert checked(version, with_v21(finished)) == {}
-
-
-@pytest.mark.parametrize("version", VERSIONS)
-@pytest.mark.parametrize(
-    ("plant", "checks"),
-    [
-        (swap_videos, {"cameras"}),
-        (shift_timestamps, {"clock"}),
-        (shorten, {"length", "readable"}),
-        (lose_a_task, {"readable"}),
-        (turn_the_gripper, {"motion"}),
-        (change_an_episode, {"readable"}),
-        (change_a_quantile, {"format"}),
-        (bleach, {"video"}),
-    ],
-)
-def test_faults_of_either_version_are_found(
-    version: str,
-    plant: Callable[[Path, str], None],
-    checks: set[str],
-    exported: Path,
-    finished: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    shutil.copytree(exported, tmp_path, dirs_exist_ok=True)
-    monkeypatch.chdir(tmp_path)
-    config = with_v21(finished)
-    plant(min(path for path in (config.data / version).iterdir() if path.is_dir()), version)
-    found = checked(version, config)
-    assert checks & found.keys()
-    assert {fault.dataset for faults in found.values() for fault in faults} == {version}
-
-
-def test_language_columns_are_held_against_what_was_to_be_written(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shutil.copytree(finished, tmp_path / "data" / "tiny")
-    config = load(finished.parent.parent / "configs" / "tiny.yaml")
-    assert config.export.lerobot is not None
-    # Before 0.6, lerobot cannot read it and a configuration that asks for it is refused; here lerobot is not asked.
-    told = config.export.lerobot.model_copy(update={"language": True})
-    config = config.model_copy(update={"export": config.export.model_copy(update={"lerobot": told})})
-    monkeypatch.chdir(tmp_path)
-    target = LeRobot(config.data, told)
-    export(target, episodes_of(target, config, outcome.read(config)), loop)
-    job = EpisodesJob(config, config.data, [target], config.data, frozenset())
-    rows = [row for row in manifest.read(config.data / "manifest.parquet") if row["kept"]]
-    assert not any(job(rows).findings.values())
-    file = min(target.root.glob("data/*/*"))
-    table = pq.read_table(file)
-    place, field = table.schema.get_field_index("language_persistent"), table.schema.field("language_persistent")
-    # All say what the last step does.
-    pq.write_table(table.set_column(place, field, table[place].take([len(table) - 1] * len(table))), file)
-    found = {check: faults for check, faults in job(rows).findings.items() if faults}
-    assert found.keys() == {"instruction"}
-    assert all(fault.what.startswith("language column of step 0 has") for fault in found["instruction"])
-
-
 def test_gripper_sign_is_held_against_the_fingers(whole: dict[Task, Trajectory]) -> None:
     """On a whole demonstration: in the last second of one, fingers hardly move."""
     trajectory = whole[MILK]
@@ -462,35 +241,33 @@ def record_as_written(data: Path) -> None:
         file.write_text(json.dumps(json.loads(file.read_text()) | {"files": files}))
 
 
-@pytest.mark.parametrize("part", ["trajectories", "frames", "rlds", "lerobot"])
-def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -> None:
-    data = tmp_path / "data" / "tiny"
-    shutil.copytree(finished, data)
-    config = load(finished.parent.parent / "configs" / "tiny.yaml")
-    with chdir(tmp_path):
-        assert all(result["checked"] and not result["damaged"] for result in verify(config, loop).values())
-        # The largest: a file that holds data.
-        file = max((path for path in (data / part).rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
-        rot(file)
-        results = verify(config, loop)
-    (told,) = results.pop(part)["damaged"]
-    assert str(file.relative_to(data)) in told
-    assert "delete" in told
-    assert not any(result["damaged"] for result in results.values())
-
-
-def test_a_changed_dataset_is_not_read_any_further(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_planted_faults_stop_the_run_and_nothing_else_is_found(
+    finished: Path, short_demos: Path, tmp_path: Path
 ) -> None:
     data = tmp_path / "data" / "tiny"
-    monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])
     shutil.copytree(finished, data)
-    for name in ("rlds", "lerobot"):
-        rot(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))
-    with chdir(tmp_path):
-        report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
-    assert {finding["dataset"] for finding in report["checksums"]["findings"]} == {"rlds", "lerobot"}
-    assert not any(result["findings"] for check, result in report.items() if check != "checksums")
+    rows = manifest.read(data / "manifest.parquet")
+    names = named(rows)
+    (other,) = (episode_id for episode_id, name in names.items() if name == "other")
+    spoil_rlds(data, names)
+    index = {names[row["episode_id"]]: row["lerobot_episode_index"] for row in rows if row["kept"]}
+    spoil_lerobot(data / "lerobot" / "tiny", index)
+    spoil_manifest(data, rows, other)
+    record_as_written(data)
+    killed = data / ".work" / "validate" / "of a killed run"
+    killed.mkdir(parents=True)
+    with pytest.raises(AssertionError, match=r"(?s)findings in all: counts 1, .*try: read data/tiny/validation\.json"):
+        run_stages(tmp_path, tiny_config(short_demos), ["validate"])
+    report = json.loads((data / "validation.json").read_text())
+    found = {
+        (check, finding["dataset"], names.get(finding["episode"]))
+        for check, result in report.items()
+        for finding in result["findings"]
+    }
+    again = {names[episode_id] for episode_id in witnesses(rows)}
+    assert ("clean", BOWL) in again
+    assert found == EXPECTED | {("rendered", dataset, name) for name, dataset in OTHER_FRAMES.items() if name in again}
+    assert not (data / ".work").exists()
 
 
 def test_what_is_missing_or_cannot_be_read_is_a_finding(

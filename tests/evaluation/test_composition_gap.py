@@ -1,0 +1,116 @@
+"""The composition gap is the paper's, over trials that have all four combinations of the same draws."""
+
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import STOVE
+from episode_results import analyse, result
+
+from pipeline.axes import to_json
+from pipeline.errors import PipelineError
+from pipeline.evaluation import composition
+from pipeline.evaluation.composition import Pair
+from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.own_draws import draw
+from pipeline.evaluation.results import EpisodeFiles, stored
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import EvaluationTask
+
+
+def some_pairs(**fields: Any) -> list[EvaluationTask]:
+    return select(Selection(source="pairs", suites=(STOVE.suite,), tasks=(STOVE.name,), **fields))
+
+
+def test_the_gap_is_as_worked_by_hand() -> None:
+    pair = Pair("robot", "camera", trials=100, neither=90, only_one=60, only_other=50, both=20)
+    # 220 successes: the joint probability is 20 / 220, the marginal ones are 80 / 220 and 70 / 220.
+    assert pair.joint == pytest.approx(1 / 11)
+    assert pair.product == pytest.approx(80 * 70 / 220**2)
+    assert pair.gap == pytest.approx(-3 / 121)
+    # 220 (90 * 20 - 60 * 50)^2 / (140 * 80 * 150 * 70)
+    assert pair.chi_square()[0] == pytest.approx(2.693878, abs=1e-6)
+    assert pair.chi_square()[1] == pytest.approx(0.100735, abs=1e-6)
+    indicators = np.repeat([[0, 0], [1, 0], [0, 1], [1, 1]], [90, 60, 50, 20], axis=0)
+    assert pair.gap == pytest.approx(np.cov(indicators.T, bias=True)[0, 1])
+    # Where each perturbation keeps its own share, whatever the other does, there is no gap.
+    assert Pair("robot", "camera", 100, 80, 40, 20, 10).gap == pytest.approx(0)
+    assert Pair("robot", "camera", 100, 80, 40, 20, 10).chi_square() == pytest.approx((0, 1))
+    assert Pair("robot", "camera", 10, 0, 0, 0, 0).figures()["gap"] is None
+
+
+def test_pairs_reuse_the_draws_and_initial_states_of_their_singles() -> None:
+    tasks = some_pairs(axes=("robot", "camera", "light", "noise"), episodes=5)
+    assert Counter(len(task.axis.split("+")) for task in tasks if task.axis != "clean") == {1: 5 * 4, 2: 5 * 6}
+    assert sum(task.axis == "clean" for task in tasks) == 5
+    assert {task.level for task in tasks if task.axis == "robot"} == {1, 2, 3, 4, 5}
+    singles = {(task.axis, task.number): task for task in tasks}
+    for task in tasks:
+        for axis in task.axis.split("+") if task.axis != "clean" else ():
+            single = singles[axis, task.number]
+            assert draw(task, 0, axis=axis) == draw(single, 0)
+            assert single.level == task.level
+    alone = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot",)))
+    assert singles["robot", 0] in alone, "results of held-out perturbations serve pairs too"
+    assert some_pairs(axes=("noise", "robot"))[-1].axis == "robot+noise", "in the order in which they apply"
+    both_suites = select(Selection(source="pairs", suites=("libero_object", STOVE.suite), axes=("robot", "noise")))
+    assert set(some_pairs(axes=("robot", "noise"))) < set(both_suites), "levels do not depend on what else is chosen"
+    with pytest.raises(PipelineError, match="combinations"):
+        some_pairs(subset=10)
+
+
+def test_the_gap_counts_trials_with_all_four_combinations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tasks = some_pairs(axes=("robot", "noise"), episodes=4)
+    for task in tasks:
+        # The last trial lacks its pair, that before it was refused.
+        if task.axis == "robot+noise" and task.number == 3:
+            continue
+        ended = {"reason": "refused"} if task.axis == "robot+noise" and task.number == 2 else {}
+        success = task.axis == "clean" or (task.axis == "noise" and task.number == 0)
+        EpisodeFiles(tmp_path).save(result(task, success, **ended))
+    assert analyse("gap", str(tmp_path)) == 0
+    (pair,) = composition.pairs(stored([tmp_path]))
+    assert replace(pair, interval=None) == Pair("robot", "noise", 2, neither=2, only_one=0, only_other=1, both=0)
+    printed = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert printed["robot+noise"]["trials"] == 2
+    assert printed["robot+noise"]["bootstrap"]["resampled"] == "2 trials"
+    assert printed["robot+noise"]["papers_chi_square"] == {"statistic": None, "p_value": None}
+    assert json.loads((tmp_path / "gap.json").read_text()) == printed
+    assert (tmp_path / "gap.png").read_bytes().startswith(b"\x89PNG")
+    names, shown = composition.matrix([pair, Pair("robot", "camera", 100, 90, 60, 50, 20)])
+    assert names == ["robot", "camera", "noise"]
+    assert shown[0, 1] == pytest.approx(80 * 70 / 220**2), "the product stands above the diagonal"
+    assert shown[1, 0] == pytest.approx(1 / 11)
+    EpisodeFiles(tmp_path).save(result(tasks[0], True, "q"))
+    with pytest.raises(PipelineError, match="several policies"):
+        analyse("gap", str(tmp_path))
+
+
+def test_the_gap_leaves_out_a_pair_of_other_draws_than_its_singles(tmp_path: Path) -> None:
+    for task in some_pairs(axes=("robot", "noise"), episodes=2):
+        axes = task.axis.split("+") if task.axis != "clean" else ()
+        drawn = json.loads(to_json(draw(task, task.number if len(axes) == 2 else 0, axis=axis) for axis in axes))
+        EpisodeFiles(tmp_path).save(result(task, perturbations=drawn))
+    (pair,) = composition.pairs(stored([tmp_path]))
+    assert pair.trials == 1, "the second pair was drawn under another seed"
+
+
+@pytest.mark.slow
+def test_a_pair_composes_what_its_singles_draw() -> None:
+    evaluated = EpisodeEnvironment()
+    tasks = {task.axis: task for task in some_pairs(axes=("layout", "robot", "camera"))}
+    evaluated.reset(tasks["robot"])
+    robot = evaluated.perturbations
+    evaluated.reset(tasks["layout"])
+    layout, placed = evaluated.perturbations, evaluated.resolved["layout"]
+    evaluated.reset(tasks["layout+robot"])
+    assert tuple(evaluated.perturbations) == (*layout, *robot)
+    assert evaluated.resolved["layout"] == placed, "objects stand where they stand without the other axis"
+    assert evaluated.resolved.keys() == {"layout", "robot"}
+    evaluated.reset(tasks["robot+camera"])
+    assert [one.axis for one in evaluated.perturbations] == ["robot", "camera"]
+    evaluated.close()

@@ -1,0 +1,109 @@
+"""A policy can be asked for another goal, told nothing, or shown black views, and nothing else changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import STOVE
+
+from pipeline.errors import PipelineError
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import EvaluationTask, find_replacement, replacements
+from pipeline.libero import bddl
+from pipeline.libero.tasks import find_task
+from pipeline.types import Floats
+
+
+def test_goals_are_replaced_by_what_fits_and_is_named_alone() -> None:
+    def asked(suite: str, name: str) -> set[str]:
+        return {one.instruction for one in replacements(find_task(suite, name))}
+
+    assert asked("libero_goal", "put_the_bowl_on_top_of_the_cabinet") == {
+        "put the cream cheese on top of the cabinet",
+        "put the wine bottle on top of the cabinet",
+    }
+    between = "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate"
+    assert asked("libero_spatial", between) == {
+        "pick up the cookie box and place it on the plate",
+        "pick up the ramekin and place it on the plate",
+    }
+    # The bowl stands on the ramekin, the other bowl on the cookie box.
+    assert not asked("libero_spatial", "pick_up_the_black_bowl_on_the_ramekin_and_place_it_on_the_plate")
+    assert not asked("libero_goal", STOVE.name)
+    assert "put both the alphabet soup and the milk in the basket" in asked(
+        "libero_10", "LIVING_ROOM_SCENE2_put_both_the_alphabet_soup_and_the_tomato_sauce_in_the_basket"
+    )
+    assert not asked("libero_10", "KITCHEN_SCENE8_put_both_moka_pots_on_the_stove")
+
+
+def test_a_goal_task_changes_nothing_but_its_goal() -> None:
+    for task in select(Selection(source="goals")):
+        base = find_task(task.suite, task.base)
+        replacement = find_replacement(base, task.name)
+        ours, theirs = bddl.parse(replacement.bddl_text(base), task.name), bddl.read(base.bddl_file)
+        assert replace(ours, goal=theirs.goal) == theirs
+        assert not set(ours.goal) <= set(ours.start), "asks for something that does not hold at the start"
+        assert [fact for fact in ours.goal if replacement.new in fact] != []
+        assert not any(replacement.old in fact for fact in ours.goal)
+        assert replacement.instruction != base.instruction
+    with pytest.raises(PipelineError, match="no goal"):
+        find_replacement(base, "put_the_moon_on_the_plate_goal_a_b_state0")
+
+
+@pytest.mark.slow
+def test_liberos_environment_judges_the_new_goal_and_not_the_old() -> None:
+    evaluated = EpisodeEnvironment()
+    name = "put_the_bowl_on_the_plate"
+    clean = select(Selection(suites=("libero_goal",), tasks=(name,)))[0]
+    asked = select(Selection(source="goals", suites=("libero_goal",), tasks=(f"{name}_goal_*_cream_cheese_*",)))[0]
+
+    starts: list[Floats] = []
+
+    def dropped(task: EvaluationTask, thing: str) -> bool:
+        """Whether the episode succeeds when ``thing`` is let go above the plate."""
+        progress = evaluated.reset(task)
+        assert not progress.success
+        simulator = evaluated.simulator
+        state = simulator.state
+        starts.append(state.copy())
+        joint = simulator.model.joint(f"{thing}_joint0")
+        plate = simulator.pose("plate_1")
+        state[1 + joint.qposadr[0] :][:3] = plate[:3] + np.array([0, 0, 0.06])
+        simulator._env.sim.set_state_from_flattened(state)
+        simulator._env.sim.forward()
+        for _ in range(20):
+            progress = evaluated.step([0, 0, 0, 0, 0, 0, -1])
+            if progress.over:
+                break
+        return progress.success
+
+    assert dropped(asked, "cream_cheese_1")
+    assert not dropped(asked, "akita_black_bowl_1")
+    assert evaluated.instruction == "put the cream cheese on the plate"
+    assert dropped(clean, "akita_black_bowl_1")
+    assert not dropped(clean, "cream_cheese_1")
+    assert evaluated.instruction == "put the bowl on the plate"
+    assert (np.array(starts) == starts[0]).all(), "the scene is LIBERO's own"
+    evaluated.close()
+
+
+@pytest.mark.slow
+def test_nothing_is_said_and_black_views_are_not_rendered() -> None:
+    task = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))[0]
+    environment = EpisodeEnvironment(EpisodeSettings(prompt="blank", black="all"))
+    environment.reset(task)
+    seen = environment.observation(Wanted())
+    assert seen["task_description"] == ""
+    assert {view: (image.shape, image.any()) for view, image in seen["images"].items()} == {
+        "agentview": ((256, 256, 3), np.False_),
+        "wrist": ((256, 256, 3), np.False_),
+    }
+    assert environment._picture._opened._renderer is None
+    environment.settings = EpisodeSettings(black="agentview")
+    environment.reset(task)
+    images = environment.observation(Wanted())["images"]
+    assert not images["agentview"].any()
+    assert images["wrist"].any()
+    environment.close()

@@ -1,0 +1,103 @@
+"""Tasks are graded as the paper grades them, and a constructed benchmark is balanced and read back as it was drawn."""
+
+import json
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from conftest import STOVE
+from episode_results import analyse, result
+
+from pipeline.axes.camera import CameraAxis, SphericalRange
+from pipeline.errors import PipelineError
+from pipeline.evaluation import own_draws
+from pipeline.evaluation.own_draws import OWN_AXES
+from pipeline.evaluation.results import EpisodeFiles, read
+from pipeline.evaluation.selection import Selection, candidates, construct, select
+from pipeline.evaluation.statistics import difficulty
+from pipeline.evaluation.task_list import write_tasks
+from pipeline.evaluation.tasks import EvaluationTask
+
+
+def test_difficulty_is_the_papers_for_four_models_and_even_for_others() -> None:
+    assert [difficulty(solved, 4) for solved in range(5)] == [5, 4, 3, 2, 1]
+    assert [difficulty(solved, 2) for solved in range(3)] == [5, 3, 1]
+    assert [difficulty(solved, 3) for solved in range(4)] == [5, 4, 2, 1]
+    assert [difficulty(solved, 1) for solved in range(2)] == [5, 1]
+    # 8 models: 4 solved / 8 is 0.5 at one model, and goes to the harder.
+    assert [difficulty(solved, 8) for solved in range(9)] == [5, 5, 4, 4, 3, 3, 2, 2, 1]
+
+
+def test_tasks_are_graded_by_the_models_that_solve_them(tmp_path: Path) -> None:
+    tasks = select(Selection(suites=(STOVE.suite,)))
+    for model in range(4):
+        for place, task in enumerate(tasks[: 9 if model == 0 else 10]):
+            EpisodeFiles(tmp_path / str(model)).save(result(task, place > 2 * model))
+    graded = tmp_path / "graded.json"
+    assert analyse("grade", *(str(tmp_path / str(model)) for model in range(4)), "--out", str(graded)) == 0
+    content = json.loads(graded.read_text())
+    expected = {task.name: 5 - sum(place > 2 * model for model in range(4)) for place, task in enumerate(tasks[:9])}
+    assert {task["name"]: task["difficulty"] for task in content["tasks"]} == expected
+    assert set(select(Selection(file=graded))) == set(tasks[:9])
+
+
+def test_a_graded_task_keeps_its_name_where_another_component_was_drawn(tmp_path: Path) -> None:
+    (task,) = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot",), levels=(3,)))
+    (other,) = {"controller_posture", "initial_joints"} - {task.component}
+    EpisodeFiles(tmp_path).save(result(replace(task, component=other), True))
+    graded = tmp_path / "graded.json"
+    assert analyse("grade", str(tmp_path), "--out", str(graded)) == 0
+    assert select(Selection(file=graded)) == [task]
+
+
+def test_a_task_that_was_run_twice_under_one_setting_does_not_count_twice(tmp_path: Path) -> None:
+    (task,) = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,)))
+    for episode in ("a", "b"):
+        EpisodeFiles(tmp_path).save(result(task, True, episode=episode))
+    with pytest.raises(PipelineError, match=r"counts twice: libero/.* by p: episode a and b"):
+        read([tmp_path])
+
+
+@pytest.mark.slow
+def test_a_benchmark_is_drawn_filtered_balanced_and_read_back(tmp_path: Path) -> None:
+    drawn = candidates(seed=3, each=20)
+    assert Counter((task.suite, task.axis) for task in drawn) == {
+        (suite, axis): 20 for suite in Selection().suites for axis in OWN_AXES if axis != "disturbance"
+    }
+    assert len(set(drawn)) == len(drawn)
+    refused = [task for task in drawn if task.axis == "layout"][:5]
+    chosen, counts = construct(drawn, 3, 210, [result(task, reason="refused", seed=3) for task in refused])
+    assert (counts["candidates"], counts["refused"], counts["overlapping"]) == (560, 5, 0)
+    assert set(Counter(task.axis for task in chosen).values()) == {30}
+    assert not set(refused) & set(chosen)
+    assert set(chosen) < set(drawn)
+    file = tmp_path / "tasks.json"
+    write_tasks(chosen, 3, file)
+    assert select(Selection(file=file, seed=3)) == chosen
+    lights = select(Selection(file=file, seed=3, axes=("light",), subset=10))
+    assert len(lights) == 10
+    assert {task.axis for task in lights} == {"light"}
+    with pytest.raises(PipelineError, match="--seed 3"):
+        select(Selection(file=file))
+    file.write_text("[]")
+    with pytest.raises(PipelineError, match="not a list of tasks"):
+        select(Selection(file=file))
+
+
+def test_a_list_is_of_the_draws_that_it_was_made_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("camera",)))
+    file = tmp_path / "tasks.json"
+    write_tasks(drawn, 0, file)
+    assert select(Selection(file=file)) == drawn
+    ranges = CameraAxis(spherical=SphericalRange(elevation_deg=((0.0, 1.0),)))
+    monkeypatch.setattr(own_draws, "held_out", lambda _: ranges)
+    with pytest.raises(PipelineError, match="this version draws other perturbations"):
+        select(Selection(file=file))
+
+
+def test_a_benchmark_is_filtered_by_results_of_its_own_seed() -> None:
+    candidate = EvaluationTask("own", STOVE.suite, STOVE.name, "a", "robot", "initial_joints", 1, 0)
+    with pytest.raises(PipelineError, match=r"a result of seed 0(?s:.*)expected: seed 3"):
+        construct([candidate], 3, 1, [result(candidate, reason="refused")])
+    assert construct([candidate], 3, 1, [result(candidate, reason="refused", seed=3)])[0] == []

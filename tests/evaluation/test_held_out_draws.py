@@ -1,0 +1,97 @@
+"""No held-out perturbation is near one of a training run's plan: a planted copy is found, in results too."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import STOVE
+from episode_results import analyse, result
+
+from pipeline.axes import Perturbation, to_json
+from pipeline.axes.noise import NoiseAxis, NoisePerturbation
+from pipeline.errors import PipelineError
+from pipeline.evaluation import own_draws
+from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
+from pipeline.evaluation.own_draws import OWN_AXES, PlannedDraws, draw
+from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.selection import Selection, select
+from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.libero.tasks import find_task
+from pipeline.planning import plan
+
+
+def planned_row(task: EvaluationTask, *perturbations: Perturbation) -> plan.Row:
+    """A row of a plan that a training run would make."""
+    fields: dict[str, Any] = dict.fromkeys(plan.Row.__dataclass_fields__, "")
+    fields |= {"suite": task.suite, "task": task.base, "episode_id": "planted", "perturbations": to_json(perturbations)}
+    return plan.Row(**{**fields, "demo_steps": 1, "rank": 0, "wanted": True, "seed": 0, "variant": 0})
+
+
+@pytest.mark.parametrize("axis", OWN_AXES)
+def test_a_planted_copy_of_a_held_out_draw_is_found(axis: str) -> None:
+    tasks = select(Selection(source="own", suites=(STOVE.suite,), tasks=("put_the_bowl_on_the_plate",), axes=(axis,)))
+    base = find_task(tasks[0].suite, tasks[0].base)
+    drawn = [(task.name, draw(task, 0), base) for task in tasks]
+    (found,) = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], drawn[2][1])])).values()
+    assert found["overlaps"] >= 1
+    assert found["smallest"] == 0
+    assert found["closest"] == (tasks[2].name, "planted")
+    other = own_draws.compare(drawn, PlannedDraws([planned_row(tasks[2], draw(tasks[2], 1))]))[axis]
+    assert other["draws"] == 5
+    assert other["planned"] == 1
+    assert own_draws.compare(drawn, PlannedDraws([]))[axis]["smallest"] is None
+
+
+def test_held_out_noise_keeps_clear_of_every_strength_that_plans_have() -> None:
+    axis = NoiseAxis()
+    effects = [effect for name in ("motion", "gaussian", "zoom", "fog", "glass") for effect in getattr(axis, name)]
+    trained = [NoisePerturbation(component=effect.component, effect=effect, level=1, seed=0) for effect in effects]
+    tasks = select(Selection(source="own", axes=("noise",), episodes=2))
+    planned = PlannedDraws([planned_row(tasks[0], one) for one in trained])
+    found = own_draws.compare(((task.name, draw(task, 0), STOVE) for task in tasks), planned)["noise"]
+    assert found["overlaps"] == 0
+    assert found["smallest"] is not None
+    assert found["smallest"] >= found["clearance"]
+
+
+def test_leakage_of_results_is_a_fault(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tasks = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot", "light")))
+    for task in tasks:
+        recorded = json.loads(to_json([draw(task, 0)]))
+        EpisodeFiles(tmp_path).save(result(task, perturbations=recorded))
+    config = tmp_path / "mine.yaml"
+    config.write_text(f"name: mine\nfolder: {tmp_path}\nplan:\n  episodes: {{robot: 1}}\n")
+    file = tmp_path / "mine" / "plan.parquet"
+    file.parent.mkdir()
+    plan.write([planned_row(tasks[0], draw(tasks[0], 0))], file)
+    assert analyse("leakage", str(tmp_path), str(config)) == 1
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["robot"]["overlaps"], printed["light"]["overlaps"]) == (1, 0)
+    plan.write([planned_row(tasks[0], draw(tasks[0], 1))], file)
+    assert analyse("leakage", str(tmp_path), str(config)) == 0
+
+
+def test_language_has_no_held_out_draws_and_says_what_else_there_is() -> None:
+    with pytest.raises(PipelineError, match="language has no held-out perturbations") as caught:
+        select(Selection(source="own", axes=("language",)))
+    assert "--source libero_plus --axis language" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_draws_that_a_plan_has_are_drawn_anew(tmp_path: Path) -> None:
+    task = select(Selection(source="own", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("camera",), levels=(3,)))[0]
+    file = tmp_path / "plan.parquet"
+    plan.write([planned_row(task, draw(task, 0))], file)
+    settings = EpisodeSettings(plan=file)
+    assert settings.model_dump()["plan"] == own_draws.sha256_of(file)
+    assert "plan" not in EpisodeSettings().model_dump()
+    environment = EpisodeEnvironment(settings)
+    environment.reset(task)
+    (used,) = environment.perturbations
+    assert used == draw(task, 0, attempt=1)
+    plan.write([planned_row(task, draw(task, 0, attempt=attempt)) for attempt in range(20)], tmp_path / "all.parquet")
+    environment.settings = EpisodeSettings(plan=tmp_path / "all.parquet")
+    progress = environment.reset(task)
+    assert (progress.over, progress.success, progress.reason) == (True, False, "refused")
+    environment.close()

@@ -1,0 +1,80 @@
+"""Every image, number, id and statistic of either version of LeRobot is read back and held against what went in."""
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from synthetic import IDS, episode, write_lerobot, write_lerobot_v21
+
+from pipeline.errors import PipelineError
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.types import Scene, Trajectory, Verdict
+from pipeline.validation.case import Case
+from pipeline.validation.checks import CHECKS
+
+WITH_IMAGES: dict[str, Callable[[Path], LeRobot | LeRobotV21]] = {
+    "v3.0": partial(write_lerobot, frames="images"),
+    "v2.1": partial(write_lerobot_v21, convention="openpi"),
+}
+
+
+def put(file: Path, column: str, value: Any) -> None:
+    """Into the last step of a data file."""
+    table = pq.read_table(file)
+    place, field = table.schema.get_field_index(column), table.schema.field(column)
+    cells = [*table[column].to_pylist()[:-1], value]
+    pq.write_table(table.set_column(place, field, pa.array(cells, field.type)), file)
+
+
+@pytest.mark.parametrize("version", WITH_IMAGES)
+def test_every_image_file_is_read_back(version: str, tmp_path: Path) -> None:
+    target, source = WITH_IMAGES[version](tmp_path), episode(IDS[-1])
+    copy = target.read(source.provenance, tmp_path)
+    assert copy is not None
+    assert copy.episode.frames == source.frames
+    other = {"bytes": source.frames["wrist_image"][0], "path": None}
+    put(max(target.folder.glob("*/data/**/*.parquet")), target.keys["wrist_image"], other)
+    copy = target.read(source.provenance, tmp_path)
+    assert copy is not None
+    none = np.zeros((0, 0), np.float32)
+    replay = Trajectory("", "open_loop", Scene("", np.zeros(1)), np.zeros(0), np.zeros(0), none, Verdict(True, "kept"))
+    (fault,) = CHECKS["jpeg"](Case({}, source, replay, [copy], None))
+    assert fault.what == f"wrist_image differs at 1 steps, first at {len(source) - 1}"
+
+
+def stored_otherwise(text: str) -> str:
+    """Statistics with another mean of an action."""
+    found = json.loads(text)
+    stats = found.get("stats", found)
+    name = next(name for name in stats if name.startswith("action"))
+    stats[name]["mean"][2] += 1e-3
+    return json.dumps(found)
+
+
+@pytest.mark.parametrize("version", WITH_IMAGES)
+def test_ids_and_numbers_of_steps_and_statistics_are_read(version: str, tmp_path: Path) -> None:
+    target = WITH_IMAGES[version](tmp_path)
+    kept = {one: {**episode(one).provenance, "steps": len(episode(one))} for one in IDS}
+    assert list(target.check(kept, tmp_path)) == []
+    for file in target.folder.glob("*/meta/*stats.json*"):
+        first, *others = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]
+        file.write_text("\n".join([stored_otherwise(first), *others]))
+        ((check, fault),) = target.check(kept, tmp_path)
+        assert check == "format"
+        assert f"mean of {target.keys['action']} is" in fault.what
+        file.write_text("\n".join([first, *others]))
+    data = max(target.folder.glob("*/data/**/*.parquet"))
+    whole = data.read_bytes()
+    for column, value in (("episode_id", IDS[0]), ("index", 0), ("episode_index", 0)):
+        put(data, column, value)
+        with pytest.raises(PipelineError, match=f"by {column}, these are not the {len(episode(IDS[-1]))} steps"):
+            target.read(kept[IDS[-1]], tmp_path)
+        data.write_bytes(whole)
+    assert target.read(kept[IDS[-1]], tmp_path) is not None

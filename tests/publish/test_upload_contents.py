@@ -1,0 +1,138 @@
+"""What would be sent is the dataset as it was written and validated, with its card, and nothing else."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY, Once, dvc, rot
+from lerobot.datasets.lerobot_dataset import CODEBASE_VERSION
+from synthetic import SET
+from validated_run import NAME, prepare, write_run
+
+from pipeline.errors import PipelineError
+from pipeline.files import replaced
+from pipeline.publish.card import REPORTS
+
+
+@pytest.fixture(scope="module")
+def made(once: Once) -> Path:
+    return once("validated_run", write_run)
+
+
+@pytest.fixture
+def data(made: Path, tmp_path: Path) -> Path:
+    """A copy to spoil, with the times of its files."""
+    return Path(shutil.copytree(made, tmp_path / "data"))
+
+
+@pytest.mark.slow
+def test_dry_run_says_what_would_go(made: Path) -> None:
+    upload = prepare(made, "rlds")
+    folder = f"rlds/{SET}/1.0.0"
+    assert list(upload.files) == sorted(
+        [
+            *("README.md", "pictures/camera.png", "manifest.parquet", *REPORTS, "finetune/finetune.yaml"),
+            *(f"{folder}/{file.name}" for file in (made / folder).iterdir()),
+        ]
+    )
+    size = sum(file.stat().st_size for file in upload.files.values())
+    summary = upload.summary()
+    assert re.search(rf"6 files .* MB  {folder}/", summary)
+    assert re.search(rf"{len(upload.files)} files +{size / 1e6:.1f} MB  in all", summary)
+    assert "tag: none" in summary
+    assert f"tag: {CODEBASE_VERSION}" in prepare(made, "lerobot").summary()
+
+
+def unvalidated(data: Path) -> None:
+    (data / "validation.json").unlink()
+
+
+def failed(data: Path) -> None:
+    (data / "validation.json").write_text(json.dumps({"gripper": {"checked": 6, "findings": ["episode-1 is turned"]}}))
+
+
+def vacuous(data: Path) -> None:
+    (data / "validation.json").write_text("{}")
+
+
+def exported_since(data: Path) -> None:
+    with replaced(data / "lerobot" / NAME / "meta" / "info.json") as file:
+        file.write_bytes((data / "lerobot" / NAME / "meta" / "info.json").read_bytes())
+
+
+def validated_since(data: Path) -> None:
+    (data / "validation.json").write_bytes((data / "validation.json").read_bytes())
+
+
+def without_card(data: Path) -> None:
+    (data / "card" / "lerobot" / "README.md").unlink()
+
+
+def foreign(data: Path) -> None:
+    (data / "lerobot" / NAME / "meta" / "passwords.txt").write_text("secret")
+
+
+def hidden(data: Path) -> None:
+    (data / "lerobot" / NAME / ".cache").mkdir()
+    (data / "lerobot" / NAME / ".cache" / "note").write_text("")
+
+
+def elsewhere(data: Path) -> None:
+    file = data / "lerobot" / NAME / "meta" / "stats.json"
+    file.rename(data / "secret.json")
+    file.symlink_to(data / "secret.json")
+
+
+def folder_elsewhere(data: Path) -> None:
+    (data / "lerobot" / NAME / "more").symlink_to(data / "rlds")
+
+
+def incomplete(data: Path) -> None:
+    next((data / "lerobot" / NAME / "videos").rglob("*.mp4")).unlink()
+
+
+def rotten(data: Path) -> None:
+    rot(next((data / "lerobot" / NAME / "videos").rglob("*.mp4")))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "complaint"),
+    [
+        (rotten, r"\.mp4: was changed since it was written"),
+        (unvalidated, r"validation\.json: not there"),
+        (failed, r"1 of 1 checks failed: gripper \(episode-1 is turned\)"),
+        (vacuous, "at least one check"),
+        (exported_since, r"validation\.json: older than .*info\.json"),
+        (validated_since, r"README\.md: older than .*validation\.json"),
+        (without_card, r"README\.md: not there"),
+        (foreign, r"1 files that are not of the dataset.*passwords\.txt"),
+        (hidden, r"not of the dataset.*\.cache/note"),
+        (elsewhere, r"1 that lie elsewhere, such as tiny/meta/stats\.json"),
+        (folder_elsewhere, "such as tiny/more"),
+        (incomplete, r"lacks 1 files, such as tiny/videos/.*\.mp4"),
+    ],
+)
+def test_refuses(data: Path, spoil: Callable[[Path], None], complaint: str) -> None:
+    assert prepare(data, "lerobot").files
+    spoil(data)
+    with pytest.raises(PipelineError, match=complaint):
+        prepare(data, "lerobot")
+
+
+def test_passes_by_the_statistics_that_openvla_oft_leaves_in_rlds(data: Path) -> None:
+    files = prepare(data, "rlds").files
+    statistics = f"{SET}/1.0.0/dataset_statistics_{'0a' * 32}.json"
+    (data / "rlds" / statistics).write_text("{}")
+    assert prepare(data, "rlds").files == files
+    # Nor does DVC see a changed output.
+    assert dvc(REPOSITORY, "check-ignore", f"data/starter/rlds/{statistics}").returncode == 0
+
+
+def test_refuses_what_else_training_left_in_rlds(data: Path) -> None:
+    (data / "rlds" / SET / "1.0.0" / "loss.csv").write_text("1,2")
+    with pytest.raises(PipelineError, match=r"not of the dataset.*loss\.csv") as caught:
+        prepare(data, "rlds")
+    assert "move them away" in str(caught.value)

@@ -1,0 +1,42 @@
+"""A run's folder with the datasets of six episodes, validated and with cards, to be uploaded."""
+
+import json
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from synthetic import write_lerobot, write_lerobot_v21, write_rlds
+
+from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.formats.registry import formats_of
+from pipeline.publish import push
+from pipeline.publish.card import REPORTS
+from pipeline.publish.push import Upload
+
+NAME = "tiny"
+
+
+def prepare(data: Path, kind: str) -> Upload:
+    options = ExportConfig(
+        rlds=RldsConfig(name="synthetic", shards=3),
+        lerobot=LeRobotConfig(name=NAME, shards=3),
+        lerobot_v21=LeRobotV21Config(name="synthetic", convention="ipec"),
+    )
+    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind))
+
+
+def write_run(data: Path) -> None:
+    """In the order in which the stages write it."""
+    write_rlds(data)
+    write_lerobot(data, name=NAME)
+    write_lerobot_v21(data)
+    pq.write_table(pa.Table.from_pylist([{"kept": True}, {"kept": False}]), data / "manifest.parquet")
+    (data / "finetune" / "__pycache__").mkdir(parents=True)
+    (data / "finetune" / "finetune.yaml").write_text("recipe: {}\n")
+    (data / "finetune" / "__pycache__" / "run.pyc").write_bytes(b"compiled")
+    for name in REPORTS:
+        (data / name).write_text(json.dumps({"counts": {"checked": 6, "findings": []}}))
+    for kind in ("rlds", "lerobot", "lerobot_v21"):
+        (data / "card" / kind / "pictures").mkdir(parents=True)
+        (data / "card" / kind / "README.md").write_text(f"---\nlicense: mit\n---\n{kind}: hf download OWNER/NAME\n")
+        (data / "card" / kind / "pictures" / "camera.png").write_bytes(b"picture")

@@ -1,0 +1,41 @@
+"""One demonstration of the bowl, cut short, and a plan of it: what the tests of the stores replay and render."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from conftest import BOWL, tiny_config
+
+from pipeline.compute.pool import loop
+from pipeline.config import Config
+from pipeline.planning import plan
+from pipeline.run.replay_stage import Replays
+from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.testset.benchmark import TestSet
+
+
+def bowl_config(demos: Path) -> Config:
+    fields = tiny_config(demos)
+    fields["demos"] = {"source": "hdf5", "root": str(demos), "tasks": [f"{BOWL.suite}/{BOWL.name}"]}
+    fields["plan"] = {"seed": 7, "axes": {"light": {}}, "episodes": {"light": 1}, "reserve": 1.0}
+    return Config.model_validate(fields)
+
+
+def bowl_plan(config: Config) -> list[plan.Row]:
+    """A clean twin, a light episode and its reserve."""
+    return plan.make(config.demos.index().entries, config.plan, config.replay, TestSet(()))
+
+
+def replay_bowl(config: Config, folder: Path) -> None:
+    judged = Replays(config.demos, config.replay, folder, loop).of(bowl_plan(config))
+    TrajectoryStore(folder).keep(judged)
+    assert all(verdict.kept for verdict in judged.values())
+
+
+def given_up(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
+    """What a cluster does with work that no worker survives; see tests/compute/test_compute.py for workers that die."""
+    return [fn.lost(item) for item in items]
+
+
+def nothing_to_do(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
+    raise AssertionError(f"{description}: {len(items)} items are made again")

@@ -1,0 +1,238 @@
+"""A stored trajectory is read whole or not at all, the table tells of it without opening files, and nothing is lost."""
+
+import errno
+import os
+import resource
+import shutil
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from bowl import bowl_config, bowl_plan, given_up, nothing_to_do, replay_bowl
+from conftest import Once, limited, read_with_flipped_bits
+
+from pipeline.compute.pool import loop
+from pipeline.config import Config, FilterConfig
+from pipeline.errors import PipelineError
+from pipeline.planning import plan, selection
+from pipeline.run import outcome
+from pipeline.run.outcome import outdated
+from pipeline.run.replay_stage import Replays
+from pipeline.seeding import rng
+from pipeline.stores.sealed_file import sealed
+from pipeline.stores.store import TABLE
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.tables import read_table
+from pipeline.types import Verdict
+
+
+@pytest.fixture(scope="module")
+def config(short_demos: Path) -> Config:
+    return bowl_config(short_demos)
+
+
+@pytest.fixture(scope="module")
+def rows(config: Config) -> list[plan.Row]:
+    return bowl_plan(config)
+
+
+@pytest.fixture(scope="module")
+def whole_replay(config: Config, once: Once) -> Path:
+    return once("bowl", partial(replay_bowl, config))
+
+
+@pytest.fixture
+def trajectories(whole_replay: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole_replay, tmp_path / "trajectories"))
+
+
+def test_the_table_spares_opening_the_files(whole_replay: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = TrajectoryStore(whole_replay).rows()
+    assert len(rows) == 1
+
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("a file was opened although the table tells what is in it")
+
+    monkeypatch.setattr(h5py, "File", never)
+    assert TrajectoryStore(whole_replay).rows() == rows
+
+
+def test_quality_is_stored_and_a_filter_drops_by_it(config: Config, rows: list[plan.Row], whole_replay: Path) -> None:
+    store = TrajectoryStore(whole_replay)
+    ((name, told),) = store.rows().items()
+    quality = store.load(name).quality
+    assert quality is not None
+    figures = asdict(quality)
+    assert {column: told[column] for column in figures} == figures
+    assert set(FilterConfig.model_fields) == set(figures)
+    assert verdicts_of(store.rows(), FilterConfig()) == {name: Verdict(True, "kept")}
+    for column, figure in figures.items():
+        if column == "joint_margin_rad":
+            refusing, letting = figure + 0.01, figure
+        else:
+            refusing, letting = figure * 0.99, figure
+        if figure > 0:
+            refused = verdicts_of(store.rows(), FilterConfig(**{column: refusing}))
+            assert refused == {name: Verdict(False, column)}
+        assert verdicts_of(store.rows(), FilterConfig(**{column: letting}))[name].kept
+
+    limits = FilterConfig(path_m=figures["path_m"] / 2)
+    judged = Replays(config.demos, config.replay, whole_replay, nothing_to_do, limits).of(rows)
+    assert set(judged.values()) == {Verdict(False, "path_m")}
+
+
+def test_a_lost_or_damaged_table_is_rebuilt(trajectories: Path) -> None:
+    rows = TrajectoryStore(trajectories).rows()
+    (trajectories / TABLE).write_bytes(b"PAR1 and then nothing")
+    assert TrajectoryStore(trajectories).rows() == rows
+    (trajectories / TABLE).unlink()
+    assert TrajectoryStore(trajectories).refresh() == rows
+    assert (trajectories / TABLE).exists()
+
+
+def _shorten(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:-100])
+
+
+def _remove(file: Path) -> None:
+    file.unlink()
+
+
+def _make_foreign(file: Path) -> None:
+    store = TrajectoryStore(file.parent)
+    trajectory, store.made_by = store.load(file.stem), "somebody else"
+    store.save(trajectory)
+
+
+def _take_out_states(file: Path) -> None:
+    with h5py.File(file, "r+") as opened:
+        del opened["states"]
+
+
+@pytest.mark.parametrize("fault", [_shorten, _remove, _make_foreign, _take_out_states])
+def test_a_trajectory_that_is_lost_after_replay_stops_what_comes_after_and_is_made_again(
+    config: Config, rows: list[plan.Row], trajectories: Path, fault: Any
+) -> None:
+    file = next(trajectories.glob("*.h5"))
+    before = file.read_bytes()
+    fault(file)
+    with pytest.raises(PipelineError, match=rf"(?s){file.name}.*stages/replay.py CONFIG"):
+        outcome.replayed(rows, trajectories)
+    Replays(config.demos, config.replay, trajectories, loop).of(rows)
+    assert file.read_bytes() == before
+    assert outcome.replayed(rows, trajectories)
+
+
+@pytest.mark.parametrize("error", [MemoryError("mine"), KeyError("mine"), ValueError("mine"), OSError("mine")])
+def test_an_error_of_who_reads_a_file_is_not_called_damage(whole_replay: Path, error: Exception) -> None:
+    store = TrajectoryStore(whole_replay)
+    (name,) = store.names()
+    with pytest.raises(type(error)) as caught, store.opened(name):
+        raise error
+    assert caught.value is error
+
+
+def test_a_file_that_does_not_fit_into_memory_is_not_called_damaged(tmp_path: Path) -> None:
+    store = TrajectoryStore(tmp_path)
+    with store.created("large", {"mode": "open_loop"}) as file:
+        file["states"] = np.zeros(2**23)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    with pytest.raises(MemoryError), limited(resource.RLIMIT_AS, used + 2**25), store.opened("large") as read:
+        read.array("states")
+
+
+def test_a_table_that_does_not_fit_into_memory_is_not_called_damaged(
+    whole_replay: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def short_of_memory(*_: object, **__: object) -> None:
+        raise pa.ArrowMemoryError("malloc of size 64 failed")
+
+    # In place of a limit, under which PyArrow may wait for ever for a thread that it cannot start.
+    monkeypatch.setattr(pq, "ParquetFile", short_of_memory)
+    with pytest.raises(MemoryError):
+        read_table(whole_replay / TABLE, [], "")
+
+
+def test_files_that_the_system_does_not_open_are_not_called_missing(trajectories: Path) -> None:
+    """Or a stage would make them again, and delete them."""
+    store = TrajectoryStore(trajectories)
+    (name,) = store.names()
+    free = os.open(os.devnull, os.O_RDONLY)
+    os.close(free)
+    with limited(resource.RLIMIT_NOFILE, free), pytest.raises(OSError, match="Too many open files") as caught:
+        store.row(name)
+    assert caught.value.errno == errno.EMFILE
+
+
+@pytest.mark.parametrize(("name", "place"), [("states", (3, 1)), ("actions", (2, 0))])
+def test_a_changed_number_is_not_read(trajectories: Path, name: str, place: Any) -> None:
+    file = next(trajectories.glob("*.h5"))
+    with h5py.File(file, "r+") as opened:
+        opened[name][place] = -opened[name][place]
+    with pytest.raises(PipelineError, match=rf"damaged .*{name}(?s:.*)delete the file"):
+        TrajectoryStore(trajectories).load(file.stem)
+
+
+def test_no_flipped_bit_is_read(trajectories: Path) -> None:
+    """Either the file is refused, or what is read is what was written."""
+    file = next(trajectories.glob("*.h5"))
+    store = TrajectoryStore(trajectories)
+    loaded = store.load(file.stem)
+    # Half of them in the first part, which has HDF5's own structure.
+    places = rng("test_stores").integers([2048, file.stat().st_size], size=(60, 2)).ravel()
+    results = read_with_flipped_bits(file, places, lambda: store.load(file.stem))
+    for read in results:
+        for name, value in vars(loaded).items():
+            assert np.array_equal(getattr(read, name), value), name
+    assert len(places) - len(results) > len(places) / 2
+
+
+def test_files_that_nobody_wrote_down_what_they_were_made_with_are_not_replaced_unasked(
+    config: Config, rows: list[plan.Row], trajectories: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As those of the versions before."""
+    monkeypatch.setattr(Config, "data", trajectories.parent)
+    _make_foreign(next(trajectories.glob("*.h5")))
+    assert outdated(rows, config) == {"trajectories, made with something that was not written down": 1}
+    _shorten(next(trajectories.glob("*.h5")))
+    assert not outdated(rows, config), "a damaged file is made again anyway"
+
+
+@pytest.mark.parametrize("change", [_shorten, _remove])
+def test_the_table_no_longer_tells_of_files_that_are_gone_or_changed(trajectories: Path, change: Any) -> None:
+    """DVC looks at the table alone, and starts the stage that makes the file again."""
+    store, table = TrajectoryStore(trajectories), trajectories / TABLE
+    before = table.read_bytes()
+    store.notice_changes()
+    assert table.read_bytes() == before
+    change(next(trajectories.glob("*.h5")))
+    store.notice_changes()
+    assert table.read_bytes() != before
+    assert not store.rows()
+
+
+def test_a_replay_that_is_given_up_is_dropped_with_its_reason_and_not_tried_again(
+    config: Config, rows: list[plan.Row], tmp_path: Path
+) -> None:
+    judged = Replays(config.demos, config.replay, tmp_path, given_up).of(rows)
+    assert judged == {rows[0].trajectory_id: Verdict(False, "worker_lost")}
+    assert Replays(config.demos, config.replay, tmp_path, nothing_to_do).of(rows) == judged
+    assert {verdict.reason for verdict in selection.select(rows, judged).values()} == {"worker_lost"}
+    assert "too long" in TrajectoryStore(tmp_path).load(rows[0].trajectory_id).resolved
+    assert outcome.replayed(rows, tmp_path)
+
+
+def test_a_file_has_the_same_bytes_whoever_still_holds_one_of_its_arrays(tmp_path: Path) -> None:
+    held = []
+    for name, holds in (("alone.h5", False), ("held.h5", True)):
+        with sealed(tmp_path / name, {"reason": "none"}) as file:
+            array = file.create_dataset("site_alpha", data=np.zeros((100, 31), np.float32), compression="gzip")
+            held += [array] * holds
+            del array
+    assert (tmp_path / "alone.h5").read_bytes() == (tmp_path / "held.h5").read_bytes()

@@ -1,0 +1,44 @@
+"""A flipped bit in a file of any part is found, and what is damaged is not read any further."""
+
+import shutil
+from contextlib import chdir
+from pathlib import Path
+
+import pytest
+from conftest import rot
+
+from pipeline.compute.pool import loop
+from pipeline.config import load
+from pipeline.validation.validate import validate
+from pipeline.validation.verify import verify
+
+
+@pytest.mark.parametrize("part", ["trajectories", "frames", "rlds", "lerobot"])
+def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    config = load(finished.parent.parent / "configs" / "tiny.yaml")
+    with chdir(tmp_path):
+        assert all(result["checked"] and not result["damaged"] for result in verify(config, loop).values())
+        # The largest: a file that holds data.
+        file = max((path for path in (data / part).rglob("*") if path.is_file()), key=lambda path: path.stat().st_size)
+        rot(file)
+        results = verify(config, loop)
+    (told,) = results.pop(part)["damaged"]
+    assert str(file.relative_to(data)) in told
+    assert "delete" in told
+    assert not any(result["damaged"] for result in results.values())
+
+
+def test_a_changed_dataset_is_not_read_any_further(
+    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = tmp_path / "data" / "tiny"
+    monkeypatch.setattr("pipeline.validation.validate.witnesses", lambda rows: [])
+    shutil.copytree(finished, data)
+    for name in ("rlds", "lerobot"):
+        rot(max((data / name).rglob("*.json"), key=lambda path: path.stat().st_size))
+    with chdir(tmp_path):
+        report = validate(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
+    assert {finding["dataset"] for finding in report["checksums"]["findings"]} == {"rlds", "lerobot"}
+    assert not any(result["findings"] for check, result in report.items() if check != "checksums")
