@@ -17,6 +17,7 @@ from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.episode_schema import SCHEMA
+from pipeline.export_config import validating
 from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.base import Format
 from pipeline.libero.tasks import SUITES
@@ -146,6 +147,8 @@ def render(
 def _of_format(
     shown: AnyFormat, name: str, kept: Sequence[Mapping[str, Any]], clients: Mapping[str, Mapping[str, str]]
 ) -> dict[str, Any]:
+    demos = {row["demo_id"] for row in kept}
+    of_task = Counter(demo.rpartition("/")[0] for demo in demos)
     return {
         "format": shown.title,
         "kind": shown.name,
@@ -154,7 +157,8 @@ def _of_format(
         "gripper": shown.gripper,
         "extras": shown.extras,
         "language": shown.language,
-        "held_out": shown.options.validation,
+        "demos": demos,
+        "held_out": sum(validating(shown.options.validation, number) for number in of_task.values()),
         "clients": {client: call for client, call in clients.items() if client in shown.clients},
     }
 

@@ -21,7 +21,7 @@ from card_of_run import (
     write_rows,
     written,
 )
-from conftest import BOWL
+from conftest import BOWL, MILK, STOVE
 
 from pipeline.axes.pose import PoseAxis
 from pipeline.episode_schema import SCHEMA
@@ -178,7 +178,11 @@ def test_a_language_column_and_who_can_open_it_are_named(data: Path) -> None:
 def test_a_validation_split_is_named(data: Path, kind: str, words: str) -> None:
     assert "For validation" not in written(data, kind)
     split = {one: options.model_copy(update={"validation": 0.2}) for one, options in OPTIONS.formats.items()}
-    told = written(data, kind, OPTIONS.model_copy(update=split)).partition("For validation, 20 % of")[2]
+    # Of eight demonstrations of a task 1.6 are two, and of the one of another task none is.
+    eight = [row("clean", demo_id=f"{MILK.suite}/{MILK.name}/demo_{number}") for number in range(8)]
+    write_rows(data, [*eight, row("clean", task=STOVE)])
+    options = OPTIONS.model_copy(update=split)
+    told = written(data, kind, options).partition("For validation, 2 of the 9 demonstrations, with all")[2]
     assert words in told.partition("## Episodes")[0]
 
 
