@@ -192,7 +192,9 @@ def test_a_folder_of_demonstrations_is_of_hdf5_files_and_one_format_is_enough(tm
     assert config.export.name == config.export.formats["rlds"].name == "libero_mine"
 
 
-def test_a_path_may_begin_at_the_home_folder(tmp_path: Path) -> None:
+def test_a_path_may_begin_at_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "bank.yaml").write_text("{}")
     file = tmp_path / "mine.yaml"
     own = "{sources: [{folder: ~/own, licence: mine}]}"
     axes = f"{{language: {{bank: ~/bank.yaml}}, background: {own}}}"
@@ -205,7 +207,7 @@ def test_a_path_may_begin_at_the_home_folder(tmp_path: Path) -> None:
     (source,) = background.sources
     assert isinstance(source, Folder)
     found = [config.folder, config.demos.root, language.bank, source.folder]
-    assert found == [Path.home() / name for name in ("runs", "d", "bank.yaml", "own")]
+    assert found == [tmp_path / name for name in ("runs", "d", "bank.yaml", "own")]
 
 
 def test_what_a_field_had_before_it_existed_leaves_no_trace() -> None:
