@@ -38,6 +38,7 @@ FLOORS = (
     "seeding",
     "jit",
     "tables",
+    "grouping",
     "files",
     "strict_yaml",
     "rotations",

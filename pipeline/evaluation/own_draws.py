@@ -17,6 +17,7 @@ from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
+from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task, shared
 from pipeline.physics.replay import roll_out
 from pipeline.planning import plan
@@ -189,11 +190,8 @@ def compare(drawn: Iterable[tuple[str, Perturbation, Task]], planned_draws: Plan
         ``smallest`` distance with the names of its draw and of its planned episode (``closest``), None where nothing
         could be compared. ``clearance`` is the least distance that the leakage report allows.
     """
-    by_axis: dict[str, list[tuple[str, Perturbation, Task]]] = defaultdict(list)
-    for name, one, task in drawn:
-        by_axis[one.axis].append((name, one, task))
     found = {}
-    for axis, draws in by_axis.items():
+    for axis, draws in grouped((named[1].axis, named) for named in drawn).items():
         smallest, episode, name = min((*planned_draws.nearest(one, task), name) for name, one, task in draws)
         compared = math.isfinite(smallest)
         found[axis] = {

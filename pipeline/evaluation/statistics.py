@@ -16,7 +16,7 @@ and 97.5 but further out, by as much as Student's t is wider than the normal dis
 """
 
 import math
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from itertools import chain
@@ -31,6 +31,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.own_draws import drawn_task
 from pipeline.evaluation.results import REFUSED, EpisodeResult, Stored, one_setting, refuse_different
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
 from pipeline.types import Floats
 
@@ -56,13 +57,11 @@ def summary(rows: Iterable[EpisodeResult]) -> dict[str, Any]:
     """
     every = list(rows)
     listed = [row for row in every if row.reason != REFUSED]
-    grouped: dict[str, Any] = {"all": success_rate(listed), "refused": len(every) - len(listed)}
+    found: dict[str, Any] = {"all": success_rate(listed), "refused": len(every) - len(listed)}
     for columns in GROUPINGS:
-        groups: dict[str, list[EpisodeResult]] = defaultdict(list)
-        for row in listed:
-            groups["/".join(str(getattr(row, column)) for column in columns)].append(row)
-        grouped["by_" + "_and_".join(columns)] = {name: success_rate(groups[name]) for name in sorted(groups)}
-    return grouped
+        groups = grouped(("/".join(str(getattr(row, column)) for column in columns), row) for row in listed)
+        found["by_" + "_and_".join(columns)] = {name: success_rate(groups[name]) for name in sorted(groups)}
+    return found
 
 
 def success_rate(rows: Sequence[EpisodeResult]) -> dict[str, Any]:
@@ -175,9 +174,7 @@ def compare(pairs: Sequence[Pair]) -> dict[str, Any]:
         ``all`` and ``by_axis`` with ``p_value`` of McNemar's exact test, and ``difference``: the second rate minus the
         first as ``value``, and its ``Interval``.
     """
-    by_axis: dict[str, list[Pair]] = defaultdict(list)
-    for pair in pairs:
-        by_axis[pair[0].axis].append(pair)
+    by_axis = grouped((pair[0].axis, pair) for pair in pairs)
     return {"all": _compared(pairs), "by_axis": {axis: _compared(by_axis[axis]) for axis in sorted(by_axis)}}
 
 

@@ -21,6 +21,7 @@ from pipeline import seeding
 from pipeline.axes.language_goal import pattern, words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
+from pipeline.grouping import grouped
 from pipeline.libero import bddl
 from pipeline.libero.assets import libero_folder
 from pipeline.libero.bddl import Bddl
@@ -99,9 +100,7 @@ def _in_turn(wanted: list[EvaluationTask], columns: tuple[str, ...], seed: int) 
     if not columns:
         return sorted(wanted, key=lambda task: seeding.digest("subset", seed, str(task)))
     column, *rest = columns
-    groups: dict[object, list[EvaluationTask]] = defaultdict(list)
-    for task in wanted:
-        groups[getattr(task, column)].append(task)
+    groups = grouped((getattr(task, column), task) for task in wanted)
     names = sorted(groups, key=lambda name: seeding.digest("turn", seed, column, name, str(min(groups[name]))))
     rows = [_in_turn(groups[name], tuple(rest), seed) for name in names]
     return [task for turn in zip_longest(*rows) for task in turn if task is not None]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from pipeline.errors import PipelineError
 from pipeline.export_config import too_few, validating
+from pipeline.grouping import grouped
 from pipeline.seeding import digest
 from pipeline.types import Episode
 
@@ -149,7 +150,4 @@ def by_suite(suites: Mapping[str, str], name: str) -> dict[str, list[str]]:
         suites: episode id to LIBERO suite.
         name: what the sets' names begin with; ``libero_spatial`` comes into ``<name>_spatial``.
     """
-    sets: dict[str, list[str]] = {}
-    for episode_id, suite in suites.items():
-        sets.setdefault(f"{name}_{suite.removeprefix('libero_')}", []).append(episode_id)
-    return sets
+    return grouped((f"{name}_{suite.removeprefix('libero_')}", one) for one, suite in suites.items())

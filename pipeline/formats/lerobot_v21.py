@@ -13,6 +13,7 @@ from pipeline.formats.episodes import Episodes, Load, Piece, by_suite, in_a_row,
 from pipeline.formats.lerobot import LeRobot
 from pipeline.formats.lerobot_columns import CONVENTIONS
 from pipeline.formats.read_back import Copy, Fault
+from pipeline.grouping import grouped
 from pipeline.identity import Step
 from pipeline.types import Extra
 
@@ -63,10 +64,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def assemble(self, work: Path, pieces: Sequence[Piece]) -> dict[str, dict[str, Any]]:
         from pipeline.formats import lerobot_v21_write
 
-        sets: dict[str, list[Piece]] = {}
-        for piece in pieces:
-            sets.setdefault(Path(piece.path).parent.name, []).append(piece)
-        for name, members in sets.items():
+        for name, members in grouped((Path(piece.path).parent.name, piece) for piece in pieces).items():
             lerobot_v21_write.finish(work, work / "dataset" / name, members, self.convention, self.extras)
         return {}
 

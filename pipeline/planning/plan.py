@@ -1,6 +1,6 @@
 """The plan: a table with one row per wanted episode. All randomness is drawn here, keyed, never by position."""
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache
@@ -14,6 +14,7 @@ import pyarrow as pa
 from pipeline.axes import Axis, Perturbation, PhysicsPerturbation, TextPerturbation, in_order, of_layer, to_json
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
 from pipeline.tables import read_table, write_table
@@ -68,9 +69,7 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     Raises:
         PipelineError: when there is nothing to plan from for an axis.
     """
-    by_task: dict[str, list[DemoEntry]] = defaultdict(list)
-    for demo in demos:
-        by_task[f"{demo.task.suite}/{demo.task.name}"].append(demo)
+    by_task = grouped((demo.task, demo) for demo in demos)
     rows = [row for group in by_task.values() for row in twins(group, plan.seed, replay)]
     for name, episodes in plan.episodes.items():
         draws = Draws(name, plan.drawn_from(name), plan.seed, test)

@@ -1,8 +1,8 @@
 """What became of each planned episode, and what has to be replayed next to know it."""
 
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+from pipeline.grouping import grouped
 from pipeline.planning.plan import Row
 from pipeline.types import Verdict
 
@@ -44,10 +44,7 @@ def _verdicts(
 
     The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
     """
-    quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
-    for row in rows:
-        quotas[row.axis, row.suite, row.task].append(row)
-    for quota in quotas.values():
+    for quota in grouped(((row.axis, row.suite, row.task), row) for row in rows).values():
         group = sorted(quota, key=lambda row: row.rank)
         need = sum(row.wanted for row in group)
         for row in group:

@@ -20,6 +20,7 @@ from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import read_json
 from pipeline.formats.base import Format
+from pipeline.grouping import grouped
 from pipeline.publish.card import REPORTS, REPOSITORY
 
 SCRIPTS = {".py", ".yaml", ".json"}
@@ -48,9 +49,7 @@ class Upload:
 
     def summary(self) -> str:
         """Files and megabytes of each folder, the total, and the tag."""
-        folders: dict[str, list[int]] = {}
-        for path, file in self.files.items():
-            folders.setdefault(f"{Path(path).parent}/", []).append(file.stat().st_size)
+        folders = grouped((f"{Path(path).parent}/", file.stat().st_size) for path, file in self.files.items())
         folders["in all"] = [size for sizes in folders.values() for size in sizes]
         lines = [f"{len(sizes):6,} files {sum(sizes) / 1e6:10,.1f} MB  {name}" for name, sizes in folders.items()]
         return "\n".join([*lines, f"tag: {self.tag or 'none'}"])

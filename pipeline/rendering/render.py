@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.axes import PixelPerturbation, RenderPerturbation, of_layer
+from pipeline.axes import PixelPerturbation, of_layer
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA, named
+from pipeline.grouping import grouped
 from pipeline.images.jpeg import encode, to_policy
 from pipeline.planning.streams import Stream
 from pipeline.rendering.geometry import Instances, see
@@ -42,10 +43,7 @@ def render(
     first_frame = FirstFrame(renderer, trajectory, task, state[:, :3].astype(float))
     encoded: dict[str, list[bytes]] = {stream.stream_id: [] for stream in streams}
     rejected: dict[str, str] = {}
-    scenes: dict[tuple[RenderPerturbation, ...], list[Stream]] = {}
-    for stream in streams:
-        scenes.setdefault(stream.changes, []).append(stream)
-    for changes, scene in scenes.items():
+    for changes, scene in grouped((stream.changes, stream) for stream in streams).items():
         with renderer.perturbed(changes):
             if fault := first_frame.fault(scene):
                 rejected |= {stream.stream_id: fault for stream in scene}

@@ -1,6 +1,6 @@
 """All that a report of evaluations says, as JSON: rates, the paper's table, comparisons, failures."""
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -12,6 +12,7 @@ import yaml
 
 from pipeline.evaluation.results import PER_TASK, EpisodeResult, Evaluated
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary, wilson
+from pipeline.grouping import grouped
 from pipeline.testset import benchmark
 
 SOURCES = ("libero_plus", "own", "libero")
@@ -77,9 +78,7 @@ def _shown_failures(policy: Evaluated) -> list[EpisodeResult]:
     """Of each source and axis those with a video first, then the weakest perturbations, then by name."""
     failed = [row for row in policy.rows if not row.success]
     failed.sort(key=lambda row: (row.axis, row.episode not in policy.videos, row.level, row.episode))
-    groups: dict[tuple[str, str], list[EpisodeResult]] = defaultdict(list)
-    for row in failed:
-        groups[row.axis, row.source].append(row)
+    groups = grouped(((row.axis, row.source), row) for row in failed)
     return [row for group in groups.values() for row in group[:FAILURES]]
 
 
@@ -163,10 +162,8 @@ def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, An
 
 
 def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None:
-    outcomes: dict[tuple[Any, ...], list[bool]] = defaultdict(list)
     chosen = [row for row in rows if row.axis in axes]
-    for row in chosen:
-        outcomes[row.axis, row.component, row.level].append(row.success)
+    outcomes = grouped(((row.axis, row.component, row.level), row.success) for row in chosen)
     if not outcomes:
         return None
     strata = {
@@ -190,9 +187,7 @@ def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
 
 def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
     run, sizes = {(row.axis, row.component, row.level) for row in rows}, _sizes(axes, 3)
-    missing: dict[tuple[str, str], list[int]] = defaultdict(list)
-    for axis, component, level in sorted(sizes.keys() - run):
-        missing[axis, component].append(level)
+    missing = grouped((stratum[:2], stratum[2]) for stratum in sorted(sizes.keys() - run))
     told = []
     for kind, levels in missing.items():
         partly = any(stratum[:2] == kind for stratum in run)

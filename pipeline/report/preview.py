@@ -21,6 +21,7 @@ from pipeline.config import Config, ReplayConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError, RefusedError
 from pipeline.files import replaced
+from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import Problem
 from pipeline.libero.starts import recorded_start
 from pipeline.libero.tasks import select_tasks
@@ -253,9 +254,7 @@ def for_run(config: Config, folder: Path, workers: Workers) -> None:
 
     A sheet is ``<folder>/<suite>/<axis>.png``.
     """
-    by_suite: dict[str, list[Task]] = {}
-    for task in select_tasks(config.demos.tasks):
-        by_suite.setdefault(task.suite, []).append(task)
+    by_suite = grouped((task.suite, task) for task in select_tasks(config.demos.tasks))
     test = benchmark.load()
     with replaced(folder) as temporary:
         jobs = [(tasks, config, temporary / suite, test) for suite, tasks in by_suite.items()]

@@ -29,6 +29,7 @@ from pipeline.axes.pose import PosePerturbation, ScenePerturbation, Shifts, disp
 from pipeline.axes.robot import RobotPerturbation
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
+from pipeline.grouping import grouped
 from pipeline.images.jpeg import decode
 from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
@@ -167,12 +168,9 @@ def measure(config: Config, test: TestSet) -> list[Measure]:
 
 
 def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
-    values: dict[str, list[float]] = defaultdict(list)
-    for name, value in pairs:
-        values[name].append(value)
     return {
         name: Share(len(found), round(float(np.mean(found)), 4)) if isinstance(found[0], bool) else spread(found)
-        for name, found in values.items()
+        for name, found in grouped(pairs).items()
     }
 
 
@@ -266,10 +264,8 @@ def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, f
 
 def to_nearest_test(test: TestSet) -> Iterator[tuple[str, float]]:
     """The same to the nearest place in another test of the same task: how close tests are to each other."""
-    moved: Places = defaultdict(list)
-    for one in test.of("pose"):
-        moved[one.suite, one.base].append((one.name, displacements(one.parameters)))
-    return _to_nearest(test, moved)
+    moved = (((one.suite, one.base), (one.name, displacements(one.parameters))) for one in test.of("pose"))
+    return _to_nearest(test, grouped(moved))
 
 
 def _to_nearest(test: TestSet, places: Places) -> Iterator[tuple[str, float]]:

@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import HUMAN
 from pipeline.planning.selection import NOT_NEEDED
 from pipeline.run.outcome import MADE
@@ -77,10 +78,7 @@ def tally(rows: Rows, column: str) -> dict[str, Counter[str]]:
 
 def by_axis(rows: Rows) -> dict[str, list[Mapping[str, Any]]]:
     """Axis to its rows."""
-    groups: dict[str, list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault(row["axis"], []).append(row)
-    return groups
+    return grouped((row["axis"], row) for row in rows)
 
 
 def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:

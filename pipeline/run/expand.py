@@ -25,6 +25,7 @@ from pipeline.compute.pool import LOST, Workers
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.files import remove
+from pipeline.grouping import grouped
 from pipeline.identity import DISTRIBUTION, refuse_unasked
 from pipeline.libero import bddl, hdf5
 from pipeline.libero.demonstrations import DemoEntry
@@ -97,11 +98,9 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     unwanted = {"kept", selection.NOT_NEEDED}
     reasons = [outcome[row.episode_id].reason for row in rows if row.role == "perturbed"]
     result = Expansion(dropped=Counter(reason for reason in reasons if reason not in unwanted))
-    by_task: dict[str, list[plan.Row]] = defaultdict(list)
-    for row in kept:
-        by_task[f"{row.suite}/{row.task}"].append(row)
+    by_task = grouped((f"{row.suite}/{row.task}", row) for row in kept)
     for task, file in file_of.items():
-        made = by_task[name := f"{task.suite}/{task.name}"]
+        made = by_task.get(name := f"{task.suite}/{task.name}", [])
         if len(made) < per_task:
             result.short[name] = per_task - len(made)
         if made:
@@ -143,9 +142,7 @@ def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> l
 
 def resets(demos: DemosConfig, per_task: int, seed: int) -> list[plan.Row]:
     """A plan for ``expand``: every candidate starts as LIBERO's recordings do, from a reset of its environment."""
-    by_task: dict[Task, list[DemoEntry]] = defaultdict(list)
-    for entry in demos.index().entries:
-        by_task[entry.task].append(entry)
+    by_task = grouped((entry.task, entry) for entry in demos.index().entries)
     return [row for group in by_task.values() for row in plan.resets(group, per_task, RESERVE, seed, REPLAY)]
 
 

