@@ -77,8 +77,13 @@ def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
 
 def write_json(file: Path, content: object) -> None:
     """Write what ``read_json`` reads; the file is whole or not there."""
+    write(file, json.dumps(content, indent=1) + "\n")
+
+
+def write(file: Path, content: str | bytes) -> None:
+    """Write a file, text as UTF-8; it is whole or not there."""
     with replaced(file) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n")
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 @contextmanager

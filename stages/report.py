@@ -1,6 +1,7 @@
 """Stage report: one HTML page about the run, with its counts, plots, pictures and videos in it."""
 
 from pipeline.config import Config
+from pipeline.files import write
 from pipeline.run import finished
 from pipeline.run.stage import main
 
@@ -9,10 +10,10 @@ def run(config: Config) -> None:
     file = config.data / "report.html"
     memory = finished.of_report(config)
     if not memory.holds():
-        from pipeline.report import pages, report
+        from pipeline.report import report
         from pipeline.testset import benchmark
 
-        pages.write(report.page(config, benchmark.load()), file)
+        write(file, report.page(config, benchmark.load()))
         memory.keep()
     print(f"{file} ({file.stat().st_size / 1e6:.1f} MB) opens in any browser")
 

@@ -23,7 +23,7 @@ from pipeline.catalogue import procedural
 from pipeline.catalogue.downloads import Wheel, fetch_wheel
 from pipeline.catalogue.sources import Folder
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import write
 from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.types import Frame
 
@@ -151,8 +151,7 @@ def keep(texture: Texture) -> None:
     """Copy a user's image to where ``kept`` finds it, whatever becomes of the folder."""
     copy = FOLDER / "own" / texture.sha256
     if texture.own is not None and not copy.exists():
-        with replaced(copy) as temporary:
-            temporary.write_bytes(texture.own.read_bytes())
+        write(copy, texture.own.read_bytes())
 
 
 def kept(name: str, sha256: str) -> Texture:

@@ -27,9 +27,8 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 def schema(arguments: argparse.Namespace) -> None:
     """write the files of schemas/ that follow from the code"""
-    from pipeline.files import replaced
+    from pipeline.files import write
 
     for name, content in schemas().items():
-        with replaced(SCHEMAS / name) as temporary:
-            temporary.write_text(json.dumps(content, indent=2) + "\n")
+        write(SCHEMAS / name, json.dumps(content, indent=2) + "\n")
         print(f"wrote {SCHEMAS / name}")

@@ -24,7 +24,7 @@ from pipeline.evaluation.rollout import Evaluation, PolicyConfig, roll_out_polic
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import summary
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import write_json
+from pipeline.files import write, write_json
 from pipeline.images.mp4 import mp4
 from pipeline.types import Frame
 
@@ -225,7 +225,7 @@ class EvaluationJob:
             # The policy did not look at how it ended, which is what one wants to see of a failure.
             film[progress.steps] = environment.image("agentview")
             # Before the episode's own file: where that exists, nothing is missing.
-            evaluation.files.save_video(evaluation.episode(task), mp4(list(film.values()), list(film)))
+            write(evaluation.files.video(evaluation.episode(task)), mp4(list(film.values()), list(film)))
         evaluation.save(environment, policy.wanted)
 
 

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
-from pipeline.files import read_json, replaced
+from pipeline.files import read_json, write
 from pipeline.seeding import digest
 
 REFUSED = "refused"
@@ -83,13 +83,8 @@ class EpisodeFiles:
     def video(self, episode: str) -> Path:
         return self.folder / "videos" / f"{episode}.mp4"
 
-    def save_video(self, episode: str, content: bytes) -> None:
-        with replaced(self.video(episode)) as temporary:
-            temporary.write_bytes(content)
-
     def save(self, row: EpisodeResult) -> None:
-        with replaced(self.path(row.episode)) as temporary:
-            temporary.write_text(json.dumps(asdict(row), sort_keys=True) + "\n")
+        write(self.path(row.episode), json.dumps(asdict(row), sort_keys=True) + "\n")
 
     def row(self, episode: str) -> EpisodeResult | None:
         """One episode, if it is there."""

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pipeline.errors import PipelineError
 from pipeline.evaluation.own_draws import first_draws
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import replaced
+from pipeline.files import write
 from pipeline.seeding import digest
 
 
@@ -65,5 +65,4 @@ def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, fi
     content = [task if isinstance(task, dict) else asdict(task) for task in listed]
     drawn = TaskList.model_validate({"seed": seed, "tasks": content}).drawn()
     lines = ",\n".join(map(json.dumps, content))
-    with replaced(file) as temporary:
-        temporary.write_text(f'{{"seed": {seed}, "draws": "{drawn}", "tasks": [\n{lines}\n]}}\n')
+    write(file, f'{{"seed": {seed}, "draws": "{drawn}", "tasks": [\n{lines}\n]}}\n')

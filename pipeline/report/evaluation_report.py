@@ -5,10 +5,10 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+from pipeline import files
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import Evaluated
 from pipeline.evaluation.statistics import FEW, RESAMPLES, SAMPLE, wilson
-from pipeline.files import write_json
 from pipeline.report import figures, pages
 from pipeline.report.evaluation_findings import FAILURES, findings
 from pipeline.report.figures import Panel, Share
@@ -47,9 +47,9 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
     if path.suffix != ".html":
         raise PipelineError("not the name of a page", where=path, expected="a name that ends in .html")
     found = findings(policies)
-    pages.write(page(found, {episode: file for policy in policies for episode, file in policy.videos.items()}), path)
+    files.write(path, page(found, {episode: file for policy in policies for episode, file in policy.videos.items()}))
     beside = path.with_suffix(".json")
-    write_json(beside, found)
+    files.write_json(beside, found)
     rates = {
         name: {source: one["all"] for source, one in policy["results"].items()}
         for name, policy in found["policies"].items()

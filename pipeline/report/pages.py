@@ -11,7 +11,6 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from pipeline.files import replaced
 from pipeline.images.jpeg import decode
 from pipeline.images.mp4 import mp4
 from pipeline.report import figures
@@ -39,11 +38,6 @@ def render(template: str, **values: Any) -> str:
 def counted(number: int, one: str, several: str = "") -> str:
     """Such as ``1 episode`` and ``10,030 episodes``; ``several`` where it is not ``one`` with an s."""
     return f"{number:,} {one if number == 1 else several or f'{one}s'}"
-
-
-def write(html: str, path: Path) -> None:
-    with replaced(path) as temporary:
-        temporary.write_text(html)
 
 
 class Clip(NamedTuple):

@@ -19,7 +19,7 @@ from pydantic import TypeAdapter
 from pipeline.axes.language import Bank, load_bank, read_bank
 from pipeline.axes.language_lint import CLASSES, LENGTH, REMEDY, Component, lint, normalise
 from pipeline.errors import PipelineError
-from pipeline.files import replaced
+from pipeline.files import write
 from pipeline.libero.bddl import Fact, read
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.rewriting.language_model import UnusableError
@@ -186,5 +186,4 @@ def _write(bank: Bank, path: Path) -> None:
     lines = path.read_text(encoding="ascii").splitlines(keepends=True) if path.exists() else []
     head = "".join(takewhile(lambda line: line.startswith("#"), lines))
     plain = TypeAdapter(Bank).dump_python(bank, mode="json")
-    with replaced(path) as temporary:
-        temporary.write_text(head + yaml.safe_dump(plain, sort_keys=False, width=10_000), encoding="ascii")
+    write(path, head + yaml.safe_dump(plain, sort_keys=False, width=10_000))

@@ -14,7 +14,7 @@ import yaml
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import Terminated
-from pipeline.files import remove, replaced
+from pipeline.files import remove, write
 from pipeline.formats.registry import formats_of
 from pipeline.run.stage import PARAMS
 
@@ -66,8 +66,7 @@ def choose(config: Config) -> None:
     """Have ``dvc repro`` run this configuration from now on."""
     text = HEADER + yaml.safe_dump({"run": config.name, "data": config.folder.as_posix()}, sort_keys=False)
     if not PARAMS.exists() or PARAMS.read_text() != text:
-        with replaced(PARAMS) as temporary:
-            temporary.write_text(text)
+        write(PARAMS, text)
         print(f"{PARAMS} names {config.name} from now on", flush=True)
 
 

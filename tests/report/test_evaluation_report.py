@@ -12,6 +12,7 @@ from episode_results import analyse, result
 from html_page import Page, needs_nothing_beside_itself, screenshot
 from scipy.stats import binomtest
 
+from pipeline import files
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read, stored
 from pipeline.evaluation.selection import Selection, select
@@ -180,7 +181,7 @@ def written(subset: list[EvaluationTask], tmp_path_factory: pytest.TempPathFacto
     worse = write(folder / "worse", [result(task, at % 4 == 0, "worse") for at, task in enumerate(tasks)])
     film = mp4([np.full((256, 256, 3), grey, np.uint8) for grey in (0, 90, 200)], [0, 8, 20])
     for path in (worse / "episodes").glob("*.json"):
-        EpisodeFiles(worse).save_video(path.stem, film)
+        files.write(EpisodeFiles(worse).video(path.stem), film)
     evaluation_report.write(read([better, worse]), folder / "report.html")
     return folder / "report.html"
 

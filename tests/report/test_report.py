@@ -221,7 +221,7 @@ def test_an_unfinished_run_says_what_to_run(config: Config, tmp_path: Path, monk
 
 @pytest.mark.parametrize("width_px", [360, 1200])
 def test_a_browser_shows_it(html: str, width_px: int, tmp_path: Path) -> None:
-    pages.write(html, tmp_path / "report.html")
+    (tmp_path / "report.html").write_text(html)
     shown = screenshot(tmp_path / "report.html", width_px, 3000)
     # Something on every screenful, and a margin that nothing runs into.
     assert all(screenful.std() > 5 for screenful in np.split(shown, 5))
