@@ -108,10 +108,16 @@ def render(
     libero = own_suites != kept_suites
     free = all(FREE.match(one.licence) for one in owed) and not (own_suites or own_rewrites)
     axes = _axes(kept, shown)
+    demos = {row["demo_id"] for row in kept}
+    of_task = Counter(demo.rpartition("/")[0] for demo in demos)
     return TEMPLATES.get_template("card.md.j2").render(
         line=lambda *cells: f"| {' | '.join(map(_cell, cells))} |",
-        **_of_format(shown, name, kept, clients),
+        shown=shown,
+        loading=shown.loading(name, REPOSITORY, kept),
+        clients={client: call for client, call in clients.items() if client in shown.clients},
         metadata=_metadata(shown, name, free=free, libero=libero).to_yaml(),
+        demos=demos,
+        held_out=sum(validating(shown.options.validation, number) for number in of_task.values()),
         others=" and ".join(others),
         name=name,
         kept=kept,
@@ -142,25 +148,6 @@ def render(
         citation=schema_file("citation.bib").read_text(),
         owed=owed,
     )
-
-
-def _of_format(
-    shown: AnyFormat, name: str, kept: Sequence[Mapping[str, Any]], clients: Mapping[str, Mapping[str, str]]
-) -> dict[str, Any]:
-    demos = {row["demo_id"] for row in kept}
-    of_task = Counter(demo.rpartition("/")[0] for demo in demos)
-    return {
-        "format": shown.title,
-        "kind": shown.name,
-        "key": shown.keys,
-        "loading": shown.loading(name, REPOSITORY, kept),
-        "gripper": shown.gripper,
-        "extras": shown.extras,
-        "language": shown.language,
-        "demos": demos,
-        "held_out": sum(validating(shown.options.validation, number) for number in of_task.values()),
-        "clients": {client: call for client, call in clients.items() if client in shown.clients},
-    }
 
 
 def attributions(perturbations: Iterable[str]) -> dict[Credit, int]:
