@@ -175,11 +175,8 @@ class _Workers:
 
     client: Any
     workplace: Workplace | None = None
-    """What workers elsewhere have to have in common with the run."""
     refill: Callable[[], None] = lambda: None
-    """Brings back workers that are missing."""
     patience_s: float = ALONE_S
-    """How long to wait for a worker where none is left."""
 
     def __call__(self, fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
         from distributed import KilledWorker

@@ -40,7 +40,6 @@ class Regions(NamedTuple):
     front: Region
     back: Region
     front_share: float
-    """How often an object is put in front."""
 
     def order(self, rng: np.random.Generator) -> tuple[Region, Region]:
         """The region for an object, and the one to try where it does not fit there."""
