@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
@@ -75,12 +76,12 @@ def _steps(
     frames: Mapping[str, Shown],
     rejected: Mapping[str, str],
 ) -> Iterator[tuple[str, str]]:
-    changed = _changed(config)
+    changed = _changed(config.data / "settings.json", inputs.settings(config))
     of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
     if not rows:
         yield "plan", "there is no plan yet"
         return
-    if files := _changed_files(config):
+    if files := sorted(_changed(config.data / "inputs.json", inputs.listing(config))):
         of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
     if of_plan:
         yield "plan", f"another configuration: {', '.join(of_plan)}"
@@ -124,21 +125,13 @@ def _follow(config: Config) -> Iterator[tuple[str, str]]:
             yield stage, "not made from these files"
 
 
-def _changed(config: Config) -> list[str]:
+def _changed(file: Path, now: Mapping[str, Any]) -> list[str]:
+    """Names of what is not as the file has it; none where there is no such file."""
     try:
-        before = read_json(config.data / "settings.json")
+        before = read_json(file)
     except PipelineError:
         return []
-    return list(_differences(before, inputs.settings(config)))
-
-
-def _changed_files(config: Config) -> list[str]:
-    try:
-        before = read_json(config.data / "inputs.json")
-    except PipelineError:
-        return []
-    now = inputs.listing(config)
-    return sorted(file for file in before.keys() | now.keys() if before.get(file) != now.get(file))
+    return list(_differences(before, now))
 
 
 def _differences(before: Any, now: Any, field: str = "") -> Iterator[str]:
