@@ -1,7 +1,6 @@
 """The results of an evaluation: a record of each episode in a file of its own, and the results of several folders."""
 
 import json
-from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -12,6 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
 from pipeline.files import read_json, write
+from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
 REFUSED = "refused"
@@ -252,26 +252,12 @@ def read(folders: Sequence[Path], across: Collection[str] = ()) -> list[Evaluate
         remedy="leave one of the folders out; run the one again that other versions of the packages made, or give each "
         "of two policies behind a server a --label of its own",
     )
-    results: dict[str, Stored] = {}
-    for row, files in found:
-        results.setdefault(row.episode, (row, files))
-    groups: dict[str, dict[str, list[Stored]]] = defaultdict(lambda: defaultdict(list))
-    for row, files in results.values():
-        groups[row.identity][digest(row.settings)].append((row, files))
-    for alike in groups.values():
-        for group in alike.values():
-            acted = [(row, files.path(row.episode)) for row, files in group if row.reason != REFUSED]
-            _agree(
-                ((f"{row} by {row.policy}", {"episode": row.episode}, path) for row, path in acted),
-                "a task counts twice: ",
-                expected="one episode of each task",
-                remedy="delete one of the two files",
-            )
-    return [
-        _evaluated(group, [other[0][0] for other in alike.values()])
-        for alike in groups.values()
-        for group in alike.values()
-    ]
+    once = [first for first, *_ in grouped((one[0].episode, one) for one in found).values()]
+    evaluated = []
+    for of_policy in grouped((one[0].identity, one) for one in once).values():
+        alike = grouped((digest(one[0].settings), one) for one in of_policy).values()
+        evaluated += [_evaluated(group, [other[0][0] for other in alike]) for group in alike]
+    return evaluated
 
 
 def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evaluated:
@@ -279,15 +265,24 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
 
     Args:
         alike: an episode of the policy under each of its sets of settings; it has the first of its names.
+
+    Raises:
+        PipelineError: when a task has two episodes.
     """
+    acted = [(row, files) for row, files in group if row.reason != REFUSED]
+    _agree(
+        ((f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode)) for row, files in acted),
+        "a task counts twice: ",
+        expected="one episode of each task",
+        remedy="delete one of the two files",
+    )
     settings = group[0][0].settings
     differing = [key for key in settings if any(row.settings.get(key) != settings[key] for row in alike)]
     videos = {row.episode: files.video(row.episode) for row, files in group}
-    rows = [row for row, _ in group if row.reason != REFUSED]
     return Evaluated(
         name=", ".join([alike[0].policy, *(f"{key.replace('_', ' ')} {settings[key]}" for key in differing)]),
         settings=settings,
-        rows=rows,
+        rows=[row for row, _ in acted],
         videos={episode: path for episode, path in videos.items() if path.is_file()},
-        refused=len(group) - len(rows),
+        refused=len(group) - len(acted),
     )
