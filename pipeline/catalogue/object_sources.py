@@ -14,7 +14,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +26,7 @@ from pipeline.catalogue.meshes import RECIPE, convert
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.sources import Folder
 from pipeline.errors import PipelineError
-from pipeline.files import remove_leftovers, replaced
+from pipeline.files import checksum, remove_leftovers, replaced
 from pipeline.libero.assets import libero_assets, package_folder
 from pipeline.seeding import digest
 
@@ -145,7 +144,7 @@ def _own(source: Folder) -> Iterator[ObjectModel]:
         # A model's materials and textures lie beside it.
         beside = [file.relative_to(path.parent) for file in sorted(path.parent.rglob("*")) if file.is_file()]
         shown = [file for file in beside if not any(part.startswith(".") for part in file.parts)]
-        content = [(file.as_posix(), sha256((path.parent / file).read_bytes()).hexdigest()) for file in shown]
+        content = [(file.as_posix(), checksum(path.parent / file)) for file in shown]
         made_from = digest("object", RECIPE, path.name, content)
         # The name holds a hash of what it was made from, so that an earlier plan still finds its own objects.
         name = f"own/{category}_{path.stem.lower()}_{made_from[:8]}"

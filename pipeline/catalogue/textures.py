@@ -1,7 +1,6 @@
 """The surfaces that may be drawn, with name, licence and hash: images that are colour maps and whatever is procedural,
 and none that the benchmark shows."""
 
-import hashlib
 import re
 from functools import cache, lru_cache
 from typing import cast, get_args
@@ -9,6 +8,7 @@ from typing import cast, get_args
 from pipeline.catalogue.sources import Folder
 from pipeline.catalogue.texture_sources import Package, Source, Texture, kept, libero_images, offered
 from pipeline.errors import PipelineError
+from pipeline.files import checksum
 from pipeline.types import Frame
 
 IN_TEST_SET = frozenset(
@@ -58,8 +58,7 @@ def normalise(name: str) -> str:
 @cache
 def test_images() -> frozenset[str]:
     """SHA-256 of LIBERO's images that test tasks show."""
-    tested = (file for file in libero_images() if file.stem in IN_TEST_SET)
-    return frozenset(hashlib.sha256(file.read_bytes()).hexdigest() for file in tested)
+    return frozenset(checksum(file) for file in libero_images() if file.stem in IN_TEST_SET)
 
 
 test_images.__test__ = False  # type: ignore[attr-defined]  # not a test case, whatever its name starts with

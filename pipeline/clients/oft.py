@@ -193,7 +193,7 @@ def check_run(data: Path) -> dict[str, dict[str, Any]]:
         PipelineError: when there is no dataset, or a file that cannot be read.
     """
     folders = datasets(data / "rlds")
-    known = read_json(data / "dataset_statistics.json", MAKE_AGAIN)
+    known = read_json(data / "dataset_statistics.json")
     return {folder.parent.name: check(folder, known) for folder in folders}
 
 

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import chdir, contextmanager
 from dataclasses import dataclass
 from functools import cache
-from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, requires, version
 from itertools import chain
 from pathlib import Path
@@ -20,7 +19,7 @@ from uuid import uuid4
 from packaging.requirements import Requirement
 
 from pipeline.errors import PipelineError
-from pipeline.files import schema_file
+from pipeline.files import checksum, schema_file
 from pipeline.identity import DISTRIBUTION, PACKAGES
 from pipeline.machine_code import SETTINGS, in_shell, machine_code
 from pipeline.seeding import digest
@@ -104,7 +103,7 @@ def setup() -> dict[str, str]:
     package = Path(__file__).resolve().parent.parent
     files = [file for file in package.rglob("*") if file.suffix in SOURCES]
     files += schema_file("episode.json").parent.glob("*.json")
-    content = sorted((file.name, sha256(file.read_bytes()).hexdigest()) for file in files)
+    content = sorted((file.name, checksum(file)) for file in files)
     return versions | {f"code of {PACKAGE}": digest("code", content)[:16]}
 
 
