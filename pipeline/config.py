@@ -67,7 +67,7 @@ class DemosConfig(Frozen):
             PipelineError: naming the tasks.
         """
         usable = {entry.task for entry in entries}
-        if without := [f"{task.suite}/{task.name}" for task in select_tasks(self.tasks) if task not in usable]:
+        if without := [str(task) for task in select_tasks(self.tasks) if task not in usable]:
             raise PipelineError(
                 f"{len(without)} of the chosen tasks have no usable demonstration: {', '.join(without)}",
                 where=self.root,
@@ -211,7 +211,7 @@ class Config(Frozen):
             of_file = f"{error.where}: " if error.where else ""
             raise ValueError(f"tasks: {of_file}{error.what}, expected {error.expected}") from error
         if demos.root is None and (own := next((task for task in chosen if task.suite not in SUITES), None)):
-            raise ValueError(f"the starter set has no demonstration of {own.suite}/{own.name}: set root")
+            raise ValueError(f"the starter set has no demonstration of {own}: set root")
         return demos
 
     @field_validator("export")
@@ -237,7 +237,7 @@ class Config(Frozen):
         if axes.language:
             # LIBERO-90 has no rewrites among those that are shipped.
             banks = [load_bank(), *([load_bank(axes.language.bank)] if axes.language.bank else [])]
-            without = [f"{t.suite}/{t.name}" for t in chosen if not any(b.get(t.suite, {}).get(t.name) for b in banks)]
+            without = [str(t) for t in chosen if not any(b.get(t.suite, {}).get(t.name) for b in banks)]
             if without:
                 raise ValueError(
                     f"plan.axes.language: no rewrites of {len(without)} tasks, such as {without[0]}; leave language "

@@ -77,6 +77,9 @@ class Task:
     instruction: str
     bddl_file: Path
 
+    def __str__(self) -> str:
+        return f"{self.suite}/{self.name}"
+
 
 @dataclass(frozen=True)
 class Demo:
@@ -106,7 +109,7 @@ class Demo:
 
     @property
     def demo_id(self) -> str:
-        return f"{self.task.suite}/{self.task.name}/{self.key}"
+        return f"{self.task}/{self.key}"
 
 
 class Push(NamedTuple):

@@ -156,8 +156,7 @@ def deal(
     if dealt := _dealt(task, classes, levels, bank):
         return dealt
     raise PipelineError(
-        f"task {task.suite}/{task.name} has no rewrites of class {' or '.join(classes)} "
-        f"at level {' or '.join(map(str, levels))}",
+        f"task {task} has no rewrites of class {' or '.join(classes)} at level {' or '.join(map(str, levels))}",
         where=bank or BANK_FILE,
         expected=f"a task of {', '.join(load_bank())}",
         remedy="add rewrites of the task to the bank, or take language out of the configured axes",
@@ -182,7 +181,7 @@ def _dealt(
     for card in dealt:
         if fault := lint(card.text, task, card.component):
             raise PipelineError(
-                f"{card.component} rewrite {card.text!r} of {task.suite}/{task.name} is refused: {fault}",
+                f"{card.component} rewrite {card.text!r} of {task} is refused: {fault}",
                 where=bank or BANK_FILE,
                 expected=f"lower-case ASCII, {LENGTH}, no final punctuation, the task's goal",
                 remedy=REMEDY,

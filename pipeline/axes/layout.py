@@ -111,7 +111,7 @@ class LayoutAxis(Axis):
                 shelf.setdefault(fitting[index].category, fitting[index])
         if len(shelf) < level:
             raise PipelineError(
-                f"{len(shelf)} categories of objects go with {task.suite}/{task.name}, {level} are wanted",
+                f"{len(shelf)} categories of objects go with {task}, {level} are wanted",
                 where="plan.axes.layout",
                 remedy="add sources, widen area_m2 or leave out the higher levels",
             )

@@ -65,7 +65,7 @@ def tasks(arguments: argparse.Namespace) -> None:
     from pipeline.libero.tasks import select_tasks
 
     for task in select_tasks(arguments.patterns or ["*"]):
-        print(f"{task.suite}/{task.name}\t{task.instruction}")
+        print(f"{task}\t{task.instruction}")
 
 
 def _preview_arguments(command: argparse.ArgumentParser) -> None:

@@ -46,7 +46,7 @@ class DemoEntry:
 
     @property
     def demo_id(self) -> str:
-        return f"{self.task.suite}/{self.task.name}/{self.key}"
+        return f"{self.task}/{self.key}"
 
     @classmethod
     def of(cls, demo: Demo) -> DemoEntry:
@@ -105,8 +105,7 @@ class StarterSource:
     def of(self, task: Task) -> Demo:
         """The task's one demonstration."""
         if task.suite not in SUITES:
-            what = f"the starter set has no demonstration of {task.suite}/{task.name}"
-            raise PipelineError(what, expected="a LIBERO task")
+            raise PipelineError(f"the starter set has no demonstration of {task}", expected="a LIBERO task")
         group = "libero-90" if task.suite == "libero_90" else "libero"
         name = f"{task.suite.replace('_', '-')}-{tasks(task.suite).index(task)}"
         folder = package_folder("robouse") / "bundled_tasks" / group / name
@@ -119,11 +118,8 @@ class StarterSource:
             key, source = recorded["demo"], f"{recorded['source']} {recorded['demo']}"
             actions, init_state = np.array(recorded["actions"], np.float64), np.array(header["init_state"], np.float64)
         except (OSError, ValueError, LookupError, TypeError, yaml.YAMLError) as error:
-            raise PipelineError(
-                f"no starter demonstration of {task.suite}/{task.name} ({error})",
-                where=folder,
-                remedy=REINSTALL,
-            ) from error
+            what = f"no starter demonstration of {task} ({error})"
+            raise PipelineError(what, where=folder, remedy=REINSTALL) from error
         return _Recorded(task, key, source, HUMAN, actions, init_state[None], None).checked(str(folder))
 
 
@@ -143,7 +139,7 @@ class HDF5Source:
         problems = [stray for suite in suites_of_them for stray in self._files_of_no_task(suite)]
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
-            name, usable = f"{task.suite}/{task.name}", 0
+            usable = 0
             try:
                 with self._data(task) as data:
                     for key in hdf5.names(data, str(self._path(task))):
@@ -161,9 +157,9 @@ class HDF5Source:
                             entries.append(entry)
                             usable += 1
                         except PipelineError as error:
-                            problems.append(Problem(f"{name}/{key}", error))
+                            problems.append(Problem(f"{task}/{key}", error))
             except PipelineError as error:
-                problems.append(Problem(name, error))
+                problems.append(Problem(str(task), error))
         return DemoIndex(entries, problems)
 
     def load(self, demo_id: str) -> Demo:

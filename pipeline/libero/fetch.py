@@ -30,7 +30,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         PipelineError: for an unknown suite, when a file of an expansion is there, and when the hub could not be reached
             or lacks a file.
     """
-    wanted = [f"{task.suite}/{task.name}_demo.hdf5" for suite in suites for task in tasks(suite)]
+    wanted = [f"{task}_demo.hdf5" for suite in suites for task in tasks(suite)]
     for file in (out / name for name in wanted):
         if file.exists() and any(_expanded(file)):
             raise PipelineError(

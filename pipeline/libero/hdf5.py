@@ -142,7 +142,7 @@ def write(path: Path, task: Task, recordings: Iterable[Recording]) -> None:
     """
     bddl = task.bddl_file.read_text()
     (problem,), (language,) = (re.findall(rf"\({key}\s+([^()]+)\)", bddl) for key in ("problem", ":language"))
-    bddl_file = f"libero/libero/bddl_files/{task.suite}/{task.name}.bddl"
+    bddl_file = f"libero/libero/bddl_files/{task}.bddl"
     controller = package_folder("robosuite") / "controllers" / "config" / "osc_pose.json"
     env_kwargs = {
         "robots": ["Panda"],

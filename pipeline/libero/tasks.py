@@ -96,7 +96,7 @@ def select_tasks(patterns: Iterable[str]) -> list[Task]:
     Raises:
         PipelineError: when a pattern matches nothing.
     """
-    known = {f"{task.suite}/{task.name}": task for suite in suites() for task in tasks(suite)}
+    known = {str(task): task for suite in suites() for task in tasks(suite)}
     chosen: set[str] = set()
     for pattern in patterns:
         matched = fnmatch.filter(known, pattern)

@@ -31,7 +31,7 @@ class UnusableSceneError(PipelineError):
     def __init__(self, reason: str, what: str, task: Task):
         super().__init__(
             what,
-            where=f"{task.suite}/{task.name}",
+            where=str(task),
             expected="the scene of this task, and time, qpos and qvel of the same model",
             remedy="use demonstrations recorded with this LIBERO version, or ones that carry their model_file",
         )

@@ -150,10 +150,8 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
         PipelineError: when the axis has nothing to change in the task.
     """
     if not axis.applies(demo.task):
-        raise PipelineError(
-            f"the axis {name} has nothing to change in {demo.task.suite}/{demo.task.name}",
-            remedy="choose another task or another axis",
-        )
+        what = f"the axis {name} has nothing to change in {demo.task}"
+        raise PipelineError(what, remedy="choose another task or another axis")
     draws = Draws(name, (axis,), seed, test).of(demo.demo_id, demo.task)
     left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
     chosen: list[Perturbation] = []
@@ -228,7 +226,7 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
         without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, [name], test)
         if axis.applies(demo.task) and not without_rewrites:
             tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test), view))
-    return sheet(f"{demo.task.suite}/{demo.task.name}: first frame of the agent view, one draw of each axis", tiles, 5)
+    return sheet(f"{demo.task}: first frame of the agent view, one draw of each axis", tiles, 5)
 
 
 def _strongest(stage: Stage, drawn: Sequence[Perturbation], view: str) -> Tile:

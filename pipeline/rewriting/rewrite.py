@@ -90,7 +90,7 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     stored = {**dict.fromkeys(CLASSES, ()), **bank.get(task.suite, {}).get(task.name, {})}
     for component, text in ((component, text) for component, texts in stored.items() for text in texts):
         if fault := lint(text, task, component):  # which the language axis would refuse
-            what = f"{component} rewrite {text!r} of {task.suite}/{task.name} is refused: {fault}"
+            what = f"{component} rewrite {text!r} of {task} is refused: {fault}"
             raise PipelineError(what, where=out, remedy=REMEDY)
     shipped = load_bank().get(task.suite, {}).get(task.name, {})
     taken = {normalise(text) for texts in (*stored.values(), *shipped.values()) for text in texts}
@@ -111,7 +111,7 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
     if any(len(stored[component]) < per_class for component in CLASSES):
         counts = ", ".join(f"{component} {len(stored[component])}" for component in CLASSES)
         raise PipelineError(
-            f"too few acceptable rewrites of {task.suite}/{task.name}: {counts}{_because(refused)}",
+            f"too few acceptable rewrites of {task}: {counts}{_because(refused)}",
             where=out,
             expected=f"{per_class} of each class",
             remedy="run it again, it goes on from what was accepted; or ask another model",

@@ -100,7 +100,7 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
     result = Expansion(dropped=Counter(reason for reason in reasons if reason not in unwanted))
     by_task = grouped((f"{row.suite}/{row.task}", row) for row in kept)
     for task, file in file_of.items():
-        made = by_task.get(name := f"{task.suite}/{task.name}", [])
+        made = by_task.get(name := str(task), [])
         if len(made) < per_task:
             result.short[name] = per_task - len(made)
         if made:

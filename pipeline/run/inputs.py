@@ -32,7 +32,7 @@ def listing(config: Config) -> dict[str, list[str | int]]:
         (PurePosixPath(field) / file.relative_to(path)).as_posix(): _state(file)
         for field, path in _paths({name: section for name, section in config if name != "folder"})
         for file in sorted(_files(path))
-    } | {f"{OWN}/{task.suite}/{task.name}.bddl": _state(task.bddl_file) for task in own}
+    } | {f"{OWN}/{task}.bddl": _state(task.bddl_file) for task in own}
 
 
 def settings(config: Config) -> dict[str, Any]:

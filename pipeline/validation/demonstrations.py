@@ -92,8 +92,7 @@ class _FileJob:
     def __call__(self) -> _Result:
         index = HDF5Source(self.root).index([self.task])
         # Of the other files of the suite, their own check tells.
-        own = f"{self.task.suite}/{self.task.name}"
-        faults = [str(problem.error) for problem in index.problems if f"{problem.name}/".startswith(f"{own}/")]
+        faults = [str(problem.error) for problem in index.problems if f"{problem.name}/".startswith(f"{self.task}/")]
         # The first, the last and others evenly between them.
         count = min(self.replays, len(index.entries))
         chosen = [index.entries[round(k * (len(index.entries) - 1) / max(count - 1, 1))] for k in range(count)]

@@ -200,7 +200,7 @@ def _as_packed(file: PackagePath) -> bool:
 
 def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
     source = HDF5Source(root)
-    counts = {f"{task.suite}/{task.name}": len(source.lengths(task)) for task in select_tasks(demos.tasks)}
+    counts = {str(task): len(source.lengths(task)) for task in select_tasks(demos.tasks)}
     if without := [name for name, count in counts.items() if not count]:
         none = f"{len(without)} of {len(counts)} tasks have none under {root}, such as {without[0]}"
         remedy = "set demos.root to the folder that holds the suites, and demos.tasks to the tasks that it has"
