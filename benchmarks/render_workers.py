@@ -23,7 +23,6 @@ os.environ |= {"LP_NUM_THREADS": "1"}
 
 from episode_slice import sliced
 
-from pipeline import gl
 from pipeline.compute.pool import Workers, loop, runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
@@ -68,7 +67,7 @@ def main() -> None:
         for workers in (1, arguments.workers):
             config_of_workers = ComputeConfig(cluster="local", workers=workers)
             # A worker that has cores to spare would draw with as many threads.
-            with patch("dask.system.CPU_COUNT", workers), runner(config_of_workers, root, gl.WorkerSetup) as run:
+            with patch("dask.system.CPU_COUNT", workers), runner(config_of_workers, root, renders=True) as run:
                 run(_warm, range(4 * workers), "workers")
                 by_workers[workers] = rendered(run, f"by_{workers}")
     (bare_s, bare_cpu_s), several_s = map(sum, zip(*drawn_s, strict=True)), by_workers[arguments.workers]

@@ -27,7 +27,7 @@ def run(config: Config) -> None:
     replayed = int(read_json(config.data / "replay.json")["replayed"])
     trajectories = TrajectoryStore(config.data / "trajectories")
     frames = FrameStore(config.data / "frames", config.render)
-    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
+    with runner(config.compute, config.data, renders=True) as workers:
         rejected: dict[str, str] | None = None
         while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = known

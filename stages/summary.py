@@ -20,7 +20,6 @@ def run(config: Config) -> None:
 
 
 def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
-    from pipeline import gl
     from pipeline.compute.pool import runner
     from pipeline.report import preview, sheets
     from pipeline.run.episode_loader import EpisodeLoader
@@ -29,7 +28,7 @@ def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:
     sheets.write(rows, load, config.data / "sheets")
     previews = finished.of_previews(config)
     if not previews.holds():
-        with runner(config.compute, config.data, gl.WorkerSetup) as workers:
+        with runner(config.compute, config.data, renders=True) as workers:
             preview.for_run(config, config.data / "previews", workers)
         previews.keep()
 

@@ -14,11 +14,10 @@ def run(config: Config) -> None:
         file.touch()
         print(f"nothing has changed since the checks of {file} found nothing off")
         return
-    from pipeline import gl
     from pipeline.compute.pool import runner
     from pipeline.validation.validate import validate
 
-    with runner(config.compute, config.data, gl.WorkerSetup) as workers:
+    with runner(config.compute, config.data, renders=True) as workers:
         report = validate(config, workers)
     write_json(file, report)
     off = {check: found["findings"] for check, found in report.items() if found["findings"]}

@@ -13,7 +13,6 @@ from experiment import Experiment
 from numpy.typing import NDArray
 from sentences import Vectors, vector
 
-from pipeline import gl
 from pipeline.axes import axes_of
 from pipeline.compute.pool import Workers, runner
 from pipeline.config import PlanConfig
@@ -74,7 +73,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
     folder.mkdir(parents=True, exist_ok=True)
     plan.write(rows, folder / "plan.parquet")
     frames, trajectories = FrameStore(folder / "frames", run.render), TrajectoryStore(folder / "trajectories")
-    with runner(run.compute, folder, gl.WorkerSetup) as workers:
+    with runner(run.compute, folder, renders=True) as workers:
         rejected: dict[str, str] | None = None
         while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = known

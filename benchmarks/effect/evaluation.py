@@ -12,7 +12,6 @@ from typing import Any
 
 from experiment import Experiment
 
-from pipeline import gl
 from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.evaluation.environment import EpisodeEnvironment
@@ -68,7 +67,7 @@ def tell(experiment: Experiment, address: str, folder: Path) -> list[dict[str, A
     """
     wanted = tellings(experiment)
     if missing := [telling for telling in wanted if not (folder / telling.file).exists()]:
-        with runner(ComputeConfig(), folder, gl.WorkerSetup) as workers:
+        with runner(ComputeConfig(), folder, renders=True) as workers:
             job = partial(_tell, _tasks(experiment), address, folder)
             workers(job, [missing[::2], missing[1::2]], "reading, halves")
     return [read_json(folder / telling.file) for telling in wanted]

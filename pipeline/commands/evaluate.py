@@ -87,7 +87,6 @@ def evaluate(arguments: argparse.Namespace) -> None:
     """
     from dask.system import CPU_COUNT
 
-    from pipeline import gl
     from pipeline.compute.pool import runner
     from pipeline.compute_config import ComputeConfig
     from pipeline.evaluation.environment import EpisodeSettings
@@ -105,7 +104,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
     evaluation = Evaluation(settings, config, config.identity(), arguments.out, **given("videos", "archive"))
     workers = arguments.workers or CPU_COUNT
     compute = ComputeConfig(cluster="loop" if workers == 1 else "local", workers=workers)
-    with runner(compute, arguments.out, gl.WorkerSetup) as run:
+    with runner(compute, arguments.out, renders=True) as run:
         found = evaluate(evaluation, Selection.model_validate(given(*Selection.model_fields)), run, workers)
     print(json.dumps({"all": found["all"], "refused": found["refused"], "by_axis": found["by_axis"]}))
 

@@ -85,16 +85,14 @@ def _sizes(fn: Callable[[Item], Result], items: Sequence[Item]) -> list[int]:
 
 
 @contextmanager
-def runner(
-    config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None = None
-) -> Iterator[Workers]:
+def runner(config: ComputeConfig, folder: Path, renders: bool = False) -> Iterator[Workers]:
     """Yield the function that runs work on what ``config.cluster`` names. Nothing is started before there is work.
 
     With the first work comes a ``PipelineError`` when no scheduler answers, or a worker cannot work for this run.
 
     Args:
         folder: what the work writes into; the workers of a cluster elsewhere must see it too.
-        opengl: for work that renders, ``gl.WorkerSetup``: gives what each local worker calls with its number.
+        renders: whether the work does: local workers then render with what this process has chosen.
     """
     if config.cluster == "loop":
         yield loop
@@ -104,16 +102,14 @@ def runner(
 
         def run(fn: Callable[[Item], Result], items: Sequence[Item], description: str) -> list[Result]:
             if items and not workers:
-                workers.append(opened.enter_context(_started(config, folder, opengl)))
+                workers.append(opened.enter_context(_started(config, folder, renders)))
             return workers[0](fn, items, description) if items else []
 
         yield run
 
 
 @contextmanager
-def _started(
-    config: ComputeConfig, folder: Path, opengl: Callable[[], Callable[[int], None]] | None
-) -> Iterator[_Workers]:
+def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Workers]:
     # One thread a worker process: GL contexts and the simulator are not shared, and OpenCV and NumPy would otherwise
     # each start a thread for every core in every worker. The environment is inherited by spawned workers.
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
@@ -132,7 +128,7 @@ def _started(
         }
     )
     if config.cluster == "local":
-        with local_cluster(config.workers, opengl) as (client, refill):
+        with local_cluster(config.workers, renders) as (client, refill):
             yield _Workers(client, refill=refill)
     elif config.cluster == "slurm":
         with slurm_cluster(config, folder) as cluster, Client(cluster) as client:

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pipeline import gl
 from pipeline.compute_config import ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
@@ -21,12 +22,10 @@ STARTS = 2
 
 
 @contextmanager
-def local_cluster(
-    workers: int | None, opengl: Callable[[], Callable[[int], None]] | None
-) -> Iterator[tuple[Any, Callable[[], None]]]:
+def local_cluster(workers: int | None, renders: bool) -> Iterator[tuple[Any, Callable[[], None]]]:
     """A client of so many workers, one for each core when left out, and what brings back those that died.
 
-    ``opengl`` is that of ``runner``.
+    ``renders`` is that of ``runner``.
 
     Raises:
         PipelineError: when the workers end while they start.
@@ -39,8 +38,8 @@ def local_cluster(
     os.environ["LP_NUM_THREADS"] = str(max(1, CPU_COUNT // workers))
     with _ended(_started(workers)) as cluster, Client(cluster) as client:
         client.run(_leave_interrupts_to_the_run)
-        if opengl is not None:
-            _have_called(opengl(), client)
+        if renders:
+            _have_rendered_alike(client)
         # A worker that dies while it starts is not replaced by Dask alone.
         yield client, partial(cluster.scale, workers)
 
@@ -86,9 +85,11 @@ def _ended(cluster: Any) -> Iterator[Any]:
             cluster.close()
 
 
-def _have_called(prepare: Callable[[int], None], client: Any) -> None:
-    """Have each worker of this machine call a function with its number, also those that come later."""
+def _have_rendered_alike(client: Any) -> None:
+    """Have each worker of this machine render with what renders here, also those that come later."""
     from distributed import Worker, WorkerPlugin
+
+    prepare = gl.WorkerSetup()
 
     class Prepared(WorkerPlugin):  # type: ignore[misc]
         def setup(self, worker: Worker) -> None:

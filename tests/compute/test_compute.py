@@ -56,7 +56,7 @@ def test_workers_have_the_gpus_in_turn_and_so_have_those_that_replace_them(
     # None that is there: a worker that tried what renders would find another.
     monkeypatch.setattr(gl, "choose", lambda: gl.GlChoice("egl", "two GPUs", "a test"))
     monkeypatch.setattr(gl, "gpus", lambda: ("0", "2"))
-    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, gl.WorkerSetup) as run:
+    with runner(ComputeConfig(cluster="local", workers=3), tmp_path, renders=True) as run:
         found = sorted((device, index or "") for _, device, index in set(run(gpu, range(30), "GPUs")))
         assert found == [("two GPUs", "0"), ("two GPUs", "0"), ("two GPUs", "2")]
         with pytest.raises(PipelineError, match=f"ended {TRIES} workers"):
