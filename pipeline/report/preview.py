@@ -10,7 +10,6 @@ from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 
-import numpy as np
 from PIL import Image
 
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, TextPerturbation, of_layer
@@ -46,7 +45,7 @@ CANDIDATES = 200
 
 SIDE_PX = {1: 256, 2: 192}
 """Width of a frame, by how many views a tile shows."""
-REFUSED_GREY = 160
+REFUSED_GREY = (160, 160, 160)
 
 
 @dataclass
@@ -191,10 +190,9 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
         try:
             # What changes words alone is not rendered anew.
             frames = stage.frames(views, perturbation) if perturbation.views else original
+            tiles.append(Tile(side_by_side(frames, side), caption))
         except RefusedError as refused:
-            caption = f"refused, {refused.reason}: {caption}"
-            frames = [np.full_like(frame, REFUSED_GREY) for frame in original]
-        tiles.append(Tile(side_by_side(frames, side), caption))
+            tiles.append(_refused(refused, caption, tiles[0].picture.size))
     return sheet(
         f"{demo.demo_id}, {'replays' if strips else 'first state'}; axis {name}, seed {seed}; {', '.join(views)}", tiles
     )
@@ -207,7 +205,7 @@ def _strip(stage: Stage, push: Perturbation) -> list[Tile]:
     try:
         shown = stage.strip(push)
     except RefusedError as refused:
-        return [_refused(refused, stage.frames(["image"])[0], caption)]
+        return [_refused(refused, caption)]
     return [Tile(side_by_side(frames, SIDE_PX[2]), f"step {step}, {caption}") for step, frames in shown]
 
 
@@ -219,32 +217,32 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
     Args:
         test: the benchmark's test tasks, which the plan's draws keep clear of.
     """
-    demo, view = stage.demo, "image"
-    tiles = [Tile(Image.fromarray(stage.frames([view])[0]), f"clean twin: {demo.task.instruction}")]
+    demo = stage.demo
+    tiles = [Tile(Image.fromarray(stage.frames(["image"])[0]), f"clean twin: {demo.task.instruction}")]
     for name in AXES:
         axis = configured(name, config)
         without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, [name], test)
         if axis.applies(demo.task) and not without_rewrites:
-            tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test), view))
+            tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test)))
     return sheet(f"{demo.task}: first frame of the agent view, one draw of each axis", tiles, 5)
 
 
-def _strongest(stage: Stage, drawn: Sequence[Perturbation], view: str) -> Tile:
+def _strongest(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
     for perturbation in sorted(drawn, key=lambda p: -p.level):
         caption = f"{perturbation.axis}: {perturbation.component.replace('_', ' ')}, level {perturbation.level}"
         try:
-            (frame,) = stage.frames([view], perturbation)
+            (frame,) = stage.frames(["image"], perturbation)
         except RefusedError as refused:
-            last, reason = caption, refused
+            tile = _refused(refused, caption)
         else:
             for text in of_layer((perturbation,), TextPerturbation):
                 caption += f": {text.apply(stage.demo.task.instruction)}"
             return Tile(Image.fromarray(frame), caption)
-    return _refused(reason, stage.frames([view])[0], last)
+    return tile
 
 
-def _refused(why: RefusedError, like: Frame, caption: str) -> Tile:
-    return Tile(Image.fromarray(np.full_like(like, REFUSED_GREY)), f"refused, {why.reason}: {caption}")
+def _refused(why: RefusedError, caption: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
+    return Tile(Image.new("RGB", size_px, REFUSED_GREY), f"refused, {why.reason}: {caption}")
 
 
 def for_run(config: Config, folder: Path, workers: Workers) -> None:
