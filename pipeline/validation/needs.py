@@ -80,10 +80,7 @@ as to 16 of them, and 600 to one (`benchmarks/gpu.py`)."""
 
 
 def needed_mb(config: Config) -> dict[str, float]:
-    """Folder of a run to the megabytes that it takes.
-
-    Every planned episode counts as kept, and so does the clean twin of every demonstration.
-    """
+    """Folder of a run to the megabytes that it takes."""
     amounts, views, extras = Amounts.of(lengths(config.demos), config.plan), len(SCHEMA.views), config.render.extras
     twins, _, twin_steps, mean_steps = amounts
     export, (episodes, steps) = config.export, _exported(config, amounts)
@@ -120,8 +117,8 @@ def needed_mb(config: Config) -> dict[str, float]:
 def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     """Stage to the seconds that one core takes for it; under ``IN_TURN``, seconds that more cores do not make fewer.
 
-    Every planned episode counts as kept, and so does the clean twin of every demonstration. Savings are taken to gain
-    as much as on the reference machine. A GPU renders plainly and takes as long in every arena.
+    Savings are taken to gain as much as on the reference machine. A GPU renders plainly and takes as long in every
+    arena.
 
     Args:
         config: of the run.
