@@ -26,13 +26,7 @@ def add_commands(commands: Any) -> None:
         value("bddl_file", "BDDL_FILE", "the task, <suite>/<task>.bddl"),
         value("--out", "OUT", "bank to extend or to begin, such as bank.yaml", required=True),
         value("--per-class", "N", "rewrites of each class wanted (default: 9)", positive, default=9),
-        value(
-            "--endpoint",
-            "URL",
-            "before /chat/completions: http://localhost:8000/v1",
-            str,
-            required=True,
-        ),
+        value("--endpoint", "URL", "before /chat/completions: http://localhost:8000/v1", str, required=True),
         value("--model", "NAME", "name of the model at the endpoint", str, required=True),
     )
 

@@ -15,17 +15,7 @@ import numpy as np
 import tensorflow_datasets as tfds
 from numpy.typing import NDArray
 
-from pipeline.episode_schema import (
-    MAPS,
-    MATRICES,
-    SCHEMA,
-    MapSpec,
-    MatrixSpec,
-    VectorSpec,
-    check,
-    named,
-    provenance_of,
-)
+from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, MapSpec, MatrixSpec, VectorSpec, check, named, provenance_of
 from pipeline.files import read_json, schema_file
 from pipeline.formats.episodes import Load
 from pipeline.formats.rlds_layout import VERSION, split_of
