@@ -16,6 +16,7 @@ from pipeline.axes import TextPerturbation, from_json
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.files import read_json
+from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
 from pipeline.planning.streams import streams_of
 from pipeline.report import coverage, figures, pages, seen, yields
@@ -167,19 +168,17 @@ def _worst(kept: Rows, twins: ById, load: EpisodeLoader) -> list[Video]:
 
 
 def _coverage(tried: Rows, test: TestSet) -> dict[str, tuple[AxisPlots, Table]]:
-    draws: dict[str, list[Draw]] = {}
-    rows: dict[str, list[Mapping[str, Any]]] = {}
-    for row in tried:
-        for made in from_json(row["perturbations"]):
-            rows.setdefault(made.axis, []).append(row)
-            of_axis = draws.setdefault(made.axis, [])
-            if row["kept"]:
-                resolved = json.loads(row["resolved"]).get(made.axis)
-                of_axis.append(Draw(find_task(row["suite"], row["task"]), made, resolved))
-    return {
-        axis: (coverage.of(axis, made, test), yields.by_level("kept of planned, by component", rows[axis], axis))
-        for axis, made in draws.items()
-    }
+    shown = {}
+    changes = ((made.axis, (row, made)) for row in tried for made in from_json(row["perturbations"]))
+    for axis, of_axis in grouped(changes).items():
+        table = yields.by_level("kept of planned, by component", [row for row, _ in of_axis], axis)
+        draws = [
+            Draw(find_task(row["suite"], row["task"]), made, json.loads(row["resolved"]).get(axis))
+            for row, made in of_axis
+            if row["kept"]
+        ]
+        shown[axis] = coverage.of(axis, draws, test), table
+    return shown
 
 
 def _rewrites(kept: Rows) -> list[tuple[str, str, str]]:
