@@ -100,7 +100,10 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
         while (missing := per_class - len(stored[component])) > 0 and idle < IDLE_ANSWERS:
             have = [*shipped.get(component, ()), *stored[component]]
             question = prompt(told, component, min(missing, ASKED_AT_ONCE), have, refused)
-            accepted, reasons = _sift(_offered(ask, question), task, component, taken, missing)
+            try:
+                accepted, reasons = _sift(listed(ask(question)), task, component, taken, missing)
+            except UnusableError as error:
+                accepted, reasons = [], Counter([str(error)])
             idle = 0 if accepted else idle + 1
             refused += reasons
             if accepted:
@@ -118,20 +121,12 @@ def extend(bddl_file: Path, out: Path, per_class: int, ask: Callable[[str], str]
         )
 
 
-def _offered(ask: Callable[[str], str], question: str) -> list[str] | str:
-    """The sentences of one answer, or what is wrong with it as a whole."""
-    try:
-        return listed(ask(question)) or "an answer without a list"
-    except UnusableError as error:
-        return str(error)
-
-
 def _sift(
-    offered: list[str] | str, task: Task, component: Component, taken: set[str], wanted: int
+    offered: list[str], task: Task, component: Component, taken: set[str], wanted: int
 ) -> tuple[list[str], Counter[str]]:
     """The first ``wanted`` sentences that pass the gate, noted in ``taken``, and why others before them did not."""
-    if isinstance(offered, str):
-        return [], Counter([offered])
+    if not offered:
+        raise UnusableError("an answer without a list")
     accepted: list[str] = []
     reasons: Counter[str] = Counter()
     for text in map(tidy, offered):
