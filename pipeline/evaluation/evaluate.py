@@ -70,17 +70,16 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     wanted = select(selection, evaluation.archive)
     check_settings(selection, wanted, settings)
     evaluation.check(wanted)
-    faults: list[str] = []
+    faults: dict[EvaluationTask, str] = {}
     if missing := [task for task in wanted if evaluation.result(task) is None]:
         device = gl.choose().device
         jobs = [EvaluationJob(evaluation, tasks, device) for tasks in _jobs(missing, workers)]
         work = Expendable(EvaluationJob.__call__, EvaluationJob.limit_s, EvaluationJob.lost, EvaluationJob.episodes)
-        faults = [fault for of_job in run(work, jobs, "evaluate, episodes") for fault in of_job]
+        faults = {task: what for of_job in run(work, jobs, "evaluate, episodes") for task, what in of_job.items()}
     results = {task: evaluation.result(task) for task in wanted}
     rows = [row for row in results.values() if row is not None]
-    left = [f"({task})" for task, row in results.items() if row is None]
-    unsaid = [task for task in left if not any(fault.endswith(task) for fault in faults)]
-    faults += [f"the plan or the archive changed while it ran {task}" for task in unsaid]
+    left = [task for task, row in results.items() if row is None]
+    faults |= {task: "the plan or the archive changed while it ran" for task in left if task not in faults}
     found = summary(rows) | {
         "policy": {"name": policy.name(evaluation.identity), "identity": evaluation.identity},
         "selection": selection.model_dump(mode="json"),
@@ -88,7 +87,7 @@ def evaluate(evaluation: Evaluation, selection: Selection, run: Workers, workers
     }
     write_json(evaluation.folder / "summary.json", found)
     if faults:
-        raise _without_result(faults)
+        raise _without_result([*faults.items()])
     return found
 
 
@@ -167,7 +166,7 @@ class EvaluationJob:
     tasks: tuple[EvaluationTask, ...]
     device: str
 
-    def __call__(self) -> list[str]:
+    def __call__(self) -> dict[EvaluationTask, str]:
         """Run the episodes, and write each one's file when it is over.
 
         Returns:
@@ -185,14 +184,14 @@ class EvaluationJob:
         settings, archive = self.evaluation.settings, self.evaluation.archive
         environment = _environment(settings, archive)
         policy = _policy(self.evaluation.policy, self.evaluation.identity, settings.look_every)
-        faults = []
+        faults = {}
         # A worker that was lost may have left some.
         for task in self._missing():
             try:
                 self._run(task, environment, policy)
             except PolicyError as error:
-                faults.append(f"{error.what} ({task})")
-                _failures.append(faults[-1])
+                faults[task] = error.what
+                _failures.append((task, error.what))
                 if len(_failures) == FAILURES_IN_A_ROW:
                     stopped = _without_result(_failures)
                     _failures.clear()
@@ -209,9 +208,9 @@ class EvaluationJob:
         step_s = max(STEP_S, self.evaluation.policy.timeout_s)
         return sum(SCENE_S + step_s * self.evaluation.settings.step_limit(task.suite) for task in self.tasks)
 
-    def lost(self) -> list[str]:
+    def lost(self) -> dict[EvaluationTask, str]:
         """What to say of its episodes where no worker survives it."""
-        return [f"{LOST} ({task})" for task in self._missing()]
+        return dict.fromkeys(self._missing(), LOST)
 
     def _missing(self) -> list[EvaluationTask]:
         return [task for task in self.tasks if self.evaluation.result(task) is None]
@@ -259,13 +258,14 @@ def _policy(config: PolicyConfig, identity: str, look_every: int) -> Policy:
     return policy
 
 
-_failures: list[str] = []
+_failures: list[tuple[EvaluationTask, str]] = []
 """Of this process's policy, since the last episode that it finished."""
 
 
-def _without_result(faults: Sequence[str]) -> PipelineError:
+def _without_result(faults: Sequence[tuple[EvaluationTask, str]]) -> PipelineError:
+    named = [f"{what} ({task})" for task, what in faults[:FAULTS_NAMED]]
     more = [f"{len(faults) - FAULTS_NAMED} more"] if len(faults) > FAULTS_NAMED else []
     return PipelineError(
-        f"{len(faults)} episodes have no result: {'; '.join([*faults[:FAULTS_NAMED], *more])}",
+        f"{len(faults)} episodes have no result: {'; '.join([*named, *more])}",
         remedy="mend the policy and run the same command again: finished episodes are kept",
     )

@@ -224,10 +224,10 @@ def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:
     job = EvaluationJob(replayed, tasks, "")
     assert job.episodes() == 2
     assert job.limit_s() > 3600
-    assert job.lost() == [f"worker_lost ({task})" for task in tasks]
+    assert job.lost() == dict.fromkeys(tasks, "worker_lost")
     episode, versions = replayed.episode(tasks[0]), replayed.versions(tasks[0])
     EpisodeFiles(tmp_path).save(result(tasks[0], episode=episode, versions=versions))
-    assert job.lost() == [f"worker_lost ({tasks[1]})"]
+    assert job.lost() == {tasks[1]: "worker_lost"}
 
 
 def test_a_perturbation_that_is_drawn_otherwise_now_is_run_again(
