@@ -212,6 +212,7 @@ def distance(text: str, other: str) -> float:
     return int(_edits(one, two)) / max(len(one), len(two), 1)
 
 
+@cache
 def _characters(text: str) -> NDArray[np.uint8]:
     return np.frombuffer(normalise(text).encode(), np.uint8)
 
@@ -231,13 +232,7 @@ def _edits(one: NDArray[np.uint8], two: NDArray[np.uint8]) -> int:
 
 @cache
 def _distances(text: str, test: TestSet, task: Task) -> list[float]:
-    own, wordings = _characters(text), _test_wordings(test, task)
-    return [int(_edits(own, wording)) / max(len(own), len(wording), 1) for wording in wordings]
-
-
-@cache
-def _test_wordings(test: TestSet, task: Task) -> tuple[NDArray[np.uint8], ...]:
-    return tuple(_characters(str(tested.parameters["text"])) for tested in test.on(task, "language"))
+    return [distance(text, str(tested.parameters["text"])) for tested in test.on(task, "language")]
 
 
 @cache
