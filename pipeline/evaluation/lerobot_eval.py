@@ -4,7 +4,6 @@ One vector environment a suite runs all episodes that are selected of it, shared
 environments: ``--eval.n_episodes`` is their number, which is printed.
 """
 
-from collections import defaultdict
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -93,7 +92,7 @@ class PerturbedLibero(EnvConfig):  # type: ignore[misc]
         archive = None if self.assets is None else Path(self.assets)
         evaluation = self._evaluation(settings, archive)
         size_px = self.observation_height, self.observation_width
-        tasks: dict[str, list[EvaluationTask]] = defaultdict(list)
+        tasks: dict[str, list[EvaluationTask]] = {}
         for suite in (self.task or "").split(","):
             # Those of one scene after the other, so that it is built once.
             named = ("source", "axes", "components", "levels", "tasks", "episodes", "subset", "seed")
