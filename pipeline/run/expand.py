@@ -197,14 +197,13 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
     """
     compiled = CompiledScene(Scene(trajectory.model_xml, trajectory.states[0]))
     robot, state, joints = [], [], []
-    for number, flattened in enumerate(trajectory.states):
+    for flattened in trajectory.states[1:]:
         compiled.restore(flattened)
         hand, arm = proprioception(compiled.data)
         w, *xyz = compiled.data.body("robot0_right_hand").xquat
-        if number:
-            robot.append([*hand[6:], *hand[:3], *xyz, w])
-            state.append(hand)
-            joints.append(arm)
+        robot.append([*hand[6:], *hand[:3], *xyz, w])
+        state.append(hand)
+        joints.append(arm)
     seen = np.array(state, np.float64)
     return hdf5.Recording(
         actions=trajectory.actions,
