@@ -22,8 +22,7 @@ def product(a: Floats, b: Floats) -> Floats:
 
 def rotate(quat: Floats, vector: Floats) -> Floats:
     """``vector`` (3,) turned by the unit quaternion ``quat`` (w, x, y, z)."""
-    turned: Floats = vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector)
-    return turned
+    return np.asarray(vector + 2 * np.cross(quat[1:], np.cross(quat[1:], vector) + quat[0] * vector))
 
 
 def axis_angle(w: float, xyz: Floats) -> Floats:

@@ -103,8 +103,7 @@ class CameraPerturbation(RenderPerturbation):
         sphere = _angle_deg(cameras.rays @ own.rays[0])
         turn = 2 * _angle_deg(np.abs(cameras.turns @ own.turns[0]))
         dolly = np.rad2deg(np.abs(cameras.log_scales - own.log_scales[0]))
-        largest: Floats = np.maximum(np.maximum(sphere, turn), dolly)
-        return largest
+        return np.asarray(np.maximum(np.maximum(sphere, turn), dolly))
 
     def _parameters(self) -> tuple[float, ...]:
         return tuple(getattr(self, name) for name in PARAMETERS)
@@ -131,8 +130,7 @@ def _embed(parameters: Floats) -> _Cameras:
 
 
 def _angle_deg(cosine: Floats) -> Floats:
-    angle: Floats = np.rad2deg(np.arccos(cosine.clip(-1, 1)))
-    return angle
+    return np.asarray(np.rad2deg(np.arccos(cosine.clip(-1, 1))))
 
 
 @lru_cache(maxsize=4)

@@ -33,8 +33,7 @@ def _gaussian_blur(image: Floats, sigma_px: float) -> Floats:
     """(H, W, 3) blurred per channel by a Gaussian cut at 4 sigma, edges repeated."""
     from scipy.ndimage import gaussian_filter  # takes long, and every process of a run imports the axes
 
-    blurred: Floats = gaussian_filter(image, (sigma_px, sigma_px, 0), mode="nearest", truncate=4)
-    return blurred
+    return np.asarray(gaussian_filter(image, (sigma_px, sigma_px, 0), mode="nearest", truncate=4))
 
 
 class Motion(Frozen):

@@ -106,8 +106,7 @@ class PosePerturbation(PhysicsPerturbation):
 
     def _apart_m(self, moves_m: ArrayLike) -> Floats:
         """(N,) from moves (N, 2) of the same object."""
-        distances_m: Floats = np.linalg.norm(np.subtract(moves_m, (self.dx_m, self.dy_m)), axis=1)
-        return distances_m
+        return np.asarray(np.linalg.norm(np.subtract(moves_m, (self.dx_m, self.dy_m)), axis=1))
 
 
 NOWHERE = (math.nan, math.nan)
@@ -179,8 +178,7 @@ class ScenePerturbation(PhysicsPerturbation):
     def _apart_m(self, moves_m: Callable[[str], ArrayLike]) -> Floats:
         """(N,) from the moves (N, 2) of each thing by its name."""
         offsets_m = [np.subtract(moves_m(one.name), (one.dx_m, one.dy_m)) for one in self.moves]
-        distances_m: Floats = np.fmax.reduce([np.abs(offset_m).max(axis=1) for offset_m in offsets_m])
-        return distances_m
+        return np.asarray(np.fmax.reduce([np.abs(offset_m).max(axis=1) for offset_m in offsets_m]))
 
 
 def displacements(parameters: Mapping[str, object]) -> Shifts:

@@ -104,8 +104,7 @@ class RobotPerturbation(PhysicsPerturbation):
 
     def _apart_rad(self, offsets_rad: ArrayLike) -> Floats:
         """(N,) from offsets (N, 7)."""
-        distances_rad: Floats = np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1)
-        return distances_rad
+        return np.asarray(np.linalg.norm(np.subtract(offsets_rad, self.joint_offsets_rad), axis=1))
 
 
 @cache
@@ -117,8 +116,7 @@ def benchmark_offsets_rad() -> Floats:
     """
     directions = np.random.RandomState(42).randn(500, 7)
     norms = np.repeat([0.1, 0.2, 0.3, 0.4, 0.5], 100)
-    offsets: Floats = directions * (norms / np.linalg.norm(directions, axis=1))[:, None]
-    return offsets
+    return np.asarray(directions * (norms / np.linalg.norm(directions, axis=1))[:, None])
 
 
 class RobotAxis(Axis):

@@ -231,8 +231,7 @@ class Checkpoint:
             else:
                 actions = self._policy.predict_action_chunk(batch)[0, : self._chunk]
             actions = self._after(actions)
-        taken: Floats = np.asarray(actions.cpu().numpy(), np.float64)
-        return taken
+        return np.asarray(actions.cpu().numpy(), np.float64)
 
     def end(self, success: bool) -> None: ...
 

@@ -79,8 +79,7 @@ def _displacements(model: mujoco.MjModel, qpos: Floats, named: Set[str]) -> Floa
     free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     others = [joint for joint in free if model.joint(joint).name.removesuffix("_joint0") not in named]
     places = qpos[:, model.jnt_qposadr[others, None] + np.arange(3)]
-    distances: Floats = np.linalg.norm(places - places[0], axis=2)
-    return distances
+    return np.asarray(np.linalg.norm(places - places[0], axis=2))
 
 
 def _single(value: float, least: float = -np.inf) -> float:
@@ -98,5 +97,4 @@ def _idle(steps_m: Floats, turns: Rotation, qpos: Floats, model: mujoco.MjModel)
     """(K,) whether a step moves neither hand nor fingers."""
     turned = np.rad2deg((turns[1:] * turns[:-1].inv()).magnitude())
     fingers = np.diff(qpos[:, [int(model.joint(name).qposadr[0]) for name in FINGERS]], axis=0)
-    still: Floats = (steps_m < IDLE_M) & (turned < IDLE_DEG) & (np.abs(fingers) < IDLE_M).all(axis=1)
-    return still
+    return np.asarray((steps_m < IDLE_M) & (turned < IDLE_DEG) & (np.abs(fingers) < IDLE_M).all(axis=1))

@@ -149,8 +149,7 @@ def first_look(scene: Scene, task: Task, config: ReplayConfig) -> Floats:
     Raises:
         RefusedError: ``simulation_unstable``.
     """
-    state: Floats = _states_from(scene, task, np.empty(0), config)[0]
-    return state
+    return np.asarray(_states_from(scene, task, np.empty(0), config)[0])
 
 
 def _states_from(scene: Scene, task: Task, actions: Floats, config: ReplayConfig) -> Floats:

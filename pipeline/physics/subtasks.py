@@ -148,8 +148,7 @@ class _Seen:
 
 
 def _far(one: Floats, other: Floats) -> Floats:
-    away: Floats = np.linalg.norm(one - other, axis=1)
-    return away
+    return np.asarray(np.linalg.norm(one - other, axis=1))
 
 
 def _runs(mask: Mask) -> list[tuple[int, int]]:

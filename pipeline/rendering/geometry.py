@@ -125,5 +125,4 @@ def _pose(rotation: Floats, position_m: Floats) -> Floats:
 def _in_units(depth_m: NDArray[np.float32]) -> NDArray[Any]:
     """Depth (H, W) as whole numbers of the schema's unit, the largest number for all that is further away."""
     furthest = np.iinfo(SCHEMA.depth.dtype).max
-    units: NDArray[Any] = np.minimum(np.rint(depth_m / SCHEMA.depth.unit_m), furthest).astype(SCHEMA.depth.dtype)
-    return units
+    return np.asarray(np.minimum(np.rint(depth_m / SCHEMA.depth.unit_m), furthest).astype(SCHEMA.depth.dtype))

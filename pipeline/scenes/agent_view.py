@@ -57,8 +57,7 @@ class AgentView:
         """(N, 2) columns and rows of points (N, 3) of the world; far outside for those behind the camera."""
         camera = self._data.cam("agentview")
         x, y, z = ((points_m - camera.xpos) @ camera.xmat.reshape(3, 3)).T
-        at_px: Floats = (np.column_stack([x, -y]) / (np.maximum(-z, 1e-3) * self._slope)[:, None] + 1) * _HALF_PX
-        return at_px
+        return np.asarray((np.column_stack([x, -y]) / (np.maximum(-z, 1e-3) * self._slope)[:, None] + 1) * _HALF_PX)
 
     def _between(self, low: Floats, high: Floats) -> Pixels:
         first, last = (np.clip(bound, 0, 2 * _HALF_PX).astype(int) for bound in (low, high))

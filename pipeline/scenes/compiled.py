@@ -68,8 +68,7 @@ class CompiledScene:
 
     def xy_m(self, name: str) -> Floats:
         """(2,) where a movable object stands, by its name in the BDDL file."""
-        position: Floats = self.data.body(f"{name}_main").xpos[:2]
-        return position
+        return np.asarray(self.data.body(f"{name}_main").xpos[:2])
 
     def pose_in(self, state: Floats, name: str) -> Floats:
         """(7,) the part of a flattened state (S,) that is a movable object's pose: position in m, rotation wxyz."""
