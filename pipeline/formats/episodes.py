@@ -87,22 +87,17 @@ class Episodes:
                 remedy="`python -m pipeline status` says what reached its goal; else widen export.where, or filter",
             )
         if not validation:
-            return {"train": list(self.ids)}
-        by_task: dict[str, set[str]] = {}
-        for episode_id in self.ids:
-            demo = self.known[episode_id].demo
-            by_task.setdefault(demo.rpartition("/")[0], set()).add(demo)
+            return {"train": self.ids}
+        every = {known.demo for known in self.known.values()}
         chosen = {
             demo
-            for demos in by_task.values()
+            for demos in grouped((demo.rpartition("/")[0], demo) for demo in every).values()
             for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: validating(validation, len(demos))]
         }
         if not chosen:
             raise too_few(validation, "export.<format>.validation")
-        splits: dict[str, list[str]] = {"train": [], "val": []}
-        for episode_id in self.ids:
-            splits["val" if self.known[episode_id].demo in chosen else "train"].append(episode_id)
-        return splits
+        splits = grouped(("val" if known.demo in chosen else "train", one) for one, known in self.known.items())
+        return {split: splits[split] for split in ("train", "val")}
 
 
 def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:
