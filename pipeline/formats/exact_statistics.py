@@ -53,8 +53,8 @@ def openvla(episodes: Sequence[Motion]) -> dict[str, Any]:
     actions, states = (np.concatenate(column) for column in zip(*episodes, strict=True))
     mask = [not name.startswith("gripper") for name in SCHEMA.action.names]
     return {
-        "action": _listed(describe(open_is_one(actions), BOUNDS)) | {"mask": mask},
-        "proprio": _listed(describe(states, BOUNDS)),
+        "action": listed(describe(open_is_one(actions), BOUNDS)) | {"mask": mask},
+        "proprio": listed(describe(states, BOUNDS)),
         "num_transitions": len(actions),
         "num_trajectories": len(episodes),
     }
@@ -63,11 +63,12 @@ def openvla(episodes: Sequence[Motion]) -> dict[str, Any]:
 def openpi(actions: NDArray[np.float32], states: NDArray[np.float32]) -> dict[str, Any]:
     """The content of openpi's ``norm_stats.json`` for actions (N, 7), gripper as LIBERO has it, and states (N, 8)."""
     wanted = ("mean", "std", "q01", "q99")
-    figures = {name: _listed(describe(values, BOUNDS)) for name, values in (("actions", actions), ("state", states))}
+    figures = {name: listed(describe(values, BOUNDS)) for name, values in (("actions", actions), ("state", states))}
     return {"norm_stats": {name: {key: found[key] for key in wanted} for name, found in figures.items()}}
 
 
-def _listed(figures: Mapping[str, Floats]) -> dict[str, list[float]]:
+def listed(figures: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
+    """Statistics by name, as JSON has them."""
     return {name: figure.tolist() for name, figure in figures.items()}
 
 

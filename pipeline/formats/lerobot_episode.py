@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA, check, named, provenance_of
 from pipeline.errors import PipelineError
 from pipeline.formats.episodes import Load, Piece
-from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, of_levels, open_is_one
+from pipeline.formats.exact_statistics import QUANTILES, Counts, count, describe, listed, of_levels, open_is_one
 from pipeline.formats.lerobot_columns import (
     EPISODE_ID,
     INSTANCES,
@@ -275,11 +275,6 @@ def write_modality(root: Path, convention: Convention) -> None:
         "annotation": {"human.action.task_description": {"original_key": "task_index"}},
     }
     write_json(root / "meta" / "modality.json", content)
-
-
-def listed(found: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    """Statistics by name, as JSON has them."""
-    return {name: values.tolist() for name, values in found.items()}
 
 
 def link(made: Path, place: Path) -> None:

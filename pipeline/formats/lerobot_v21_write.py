@@ -15,9 +15,9 @@ import pyarrow.parquet as pq
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats import lerobot_episode as of_episode
 from pipeline.formats.episodes import Load, Piece
-from pipeline.formats.exact_statistics import Counts
+from pipeline.formats.exact_statistics import Counts, listed
 from pipeline.formats.lerobot_columns import Convention
-from pipeline.formats.lerobot_episode import link, listed, write_json
+from pipeline.formats.lerobot_episode import link, write_json
 from pipeline.formats.lerobot_video import Video
 from pipeline.types import Episode, Extra
 
