@@ -110,6 +110,7 @@ def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str
     tasks: dict[str, int] = {}
     for path, (split_name, ids) in slices.items():
         before = pieces[-1] if pieces else Piece("", ())
+        texts = [known[one].instruction for one in ids]
         pieces.append(
             Piece(
                 path,
@@ -119,10 +120,7 @@ def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str
                 before.first_episode + len(before.ids),
                 before.first_step + before.steps,
                 sum(known[one].steps for one in ids),
-                {
-                    text: tasks.setdefault(text, len(tasks))
-                    for text in dict.fromkeys(known[one].instruction for one in ids)
-                },
+                {text: tasks.setdefault(text, len(tasks)) for text in texts},
             )
         )
     return pieces

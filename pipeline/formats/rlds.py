@@ -38,9 +38,8 @@ class Rlds(Format[RldsConfig]):
 
     def pieces(self, episodes: Episodes) -> list[Piece]:
         pieces = []
-        shards = self.options.shards or ceil(
-            sum(known.steps for known in episodes.known.values()) / self._shard_steps()
-        )
+        steps = sum(known.steps for known in episodes.known.values())
+        shards = self.options.shards or ceil(steps / self._shard_steps())
         for split_name, members in episodes.by_split(self.options.validation).items():
             suites = {episode_id: episodes.known[episode_id].suite for episode_id in members}
             for name, ids in by_suite(suites, self.options.name).items():

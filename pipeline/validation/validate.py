@@ -159,10 +159,9 @@ def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[F
     Those to render anew come by trajectory and task, as those have a scene in common; the others as they lie in the
     datasets.
     """
-    by_trajectory: dict[str, list[Row]] = defaultdict(list)
-    others: list[Row] = []
-    for episode_id, row in sorted(kept.items(), key=lambda item: (item[1]["suite"], item[1]["task"])):
-        (by_trajectory[row["trajectory_id"]] if episode_id in again else others).append(row)
+    rows = sorted(kept.values(), key=lambda row: (row["suite"], row["task"]))
+    by_trajectory = grouped((row["trajectory_id"], row) for row in rows if row["episode_id"] in again)
+    others = [row for row in rows if row["episode_id"] not in again]
     columns = [column.name for one in formats for column in one.columns]
     others.sort(key=lambda row: [str(row[column]) for column in columns])
     return [*by_trajectory.values(), *(others[start : start + SLICE] for start in range(0, len(others), SLICE))]
