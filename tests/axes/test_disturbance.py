@@ -57,6 +57,9 @@ def test_draws_are_keyed_and_as_strong_as_their_level_says() -> None:
         assert np.linalg.norm(one.wrench[:3]) * one.steps * 0.05 == pytest.approx(1 + 3 * one.level, abs=1e-3)
         assert abs(one.wrench[2]) <= np.linalg.norm(one.wrench[:3]) / 2 + 1e-3
         assert DisturbancePerturbation.model_validate_json(one.model_dump_json()) == one
+    pushes = np.array([one.wrench[:3] for one in drawn])
+    directions = pushes / np.linalg.norm(pushes, axis=1, keepdims=True)
+    assert np.abs(directions.mean(axis=0)).max() < 0.1, "from no side more often"
 
 
 def refusal(change: DisturbancePerturbation) -> str | None:
