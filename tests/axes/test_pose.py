@@ -83,6 +83,7 @@ def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
     for p in drawn:
         assert 0.016 * (p.level - 1) - 1e-4 <= math.hypot(p.dx_m, p.dy_m) <= 0.016 * p.level + 1e-4
         assert p.moved == "plate_1"
+    assert np.abs(np.mean([(p.dx_m, p.dy_m) / np.hypot(p.dx_m, p.dy_m) for p in drawn], axis=0)).max() < 0.1
     for level in (1, 5):
         turns_deg = np.array([p.dyaw_deg for p in drawn if p.level == level])
         assert -20 <= turns_deg.min() < -15, "as far at level 1 as at level 5"
