@@ -231,6 +231,13 @@ def test_a_scene_moves_everything_within_the_benchmarks_disks(task: Task) -> Non
                 assert off_m <= step_m * level + 1e-4
 
 
+def test_a_scenes_moves_are_uniform_over_the_disk() -> None:
+    drawn = scene_draws(MILK, 200, 1)
+    moves_m = np.array([(move.dx_m, move.dy_m) for one in drawn for move in one.moves if move.name == "milk_1"])
+    assert np.abs(moves_m.mean(axis=0)).max() < 0.004
+    assert np.mean(np.linalg.norm(moves_m, axis=1) < 0.015) == pytest.approx(1 / 4, abs=0.08), "of a radius of 0.03"
+
+
 def test_the_goal_suites_bowl_goes_where_the_benchmark_has_it_unless_the_hand_needs_it() -> None:
     def mean(task: Task, name: str) -> list[float]:
         moves = [move for one in scene_draws(task, 100, 1) for move in one.moves if move.name == name]
