@@ -134,8 +134,11 @@ def test_intervals_are_wilsons() -> None:
         for axis in ("camera", "noise")
         for level in (1, 2)
     ]
-    found = summary(rows)
-    assert found["all"]["episodes"] == 4
+    found = summary(
+        [*rows, result(EvaluationTask("own", "libero_goal", "b", "n", "robot", "c", 1, 0), reason="refused")]
+    )
+    assert (found["all"]["episodes"], found["refused"]) == (4, 1)
+    assert found["by_axis"].keys() == {"camera", "noise"}, "no policy acted in what was refused"
     assert found["by_axis_and_level"].keys() == {"camera/1", "camera/2", "noise/1", "noise/2"}
     assert sum(group["successes"] for group in found["by_axis"].values()) == found["all"]["successes"]
 
