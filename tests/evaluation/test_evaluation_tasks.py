@@ -77,6 +77,8 @@ def test_held_out_draws_are_none_of_a_plan() -> None:
     assert draw(task, 0) == draw(task, 0) != draw(task, 1)
     assert draw(task, 0).level == task.level == 3
     assert draw(task, 0, attempt=1) != draw(task, 0)
+    others = select(Selection(source="own", axes=("camera",), levels=(3,)))
+    assert len({draw(other, 0) for other in others}) == len(others) == 40, "each task has its own"
     with pytest.raises(PipelineError, match="language"):
         select(Selection(source="own", axes=("language",)))
 
