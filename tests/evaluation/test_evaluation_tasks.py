@@ -148,9 +148,9 @@ def test_intervals_are_wilsons() -> None:
 def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
     (test, *_) = select(Selection(source="libero_plus", suites=("libero_goal",)))
     assert EvaluationTask.of_harness(test.for_harness()) == test
-    (clean,) = select(Selection(suites=("libero_goal",), tasks=("turn_on_the_stove",)))
-    own_class = {"name": "turn on the stove", "suite": "libero_goal", "task_id": 7, "episode_idx": 0}
-    assert EvaluationTask.of_harness(own_class) == clean
+    clean = select(Selection(suites=("libero_goal",), tasks=("turn_on_the_stove",), episodes=4))
+    own_class = {"name": "turn on the stove", "suite": "libero_goal", "task_id": 7}
+    assert [EvaluationTask.of_harness({**own_class, "episode_idx": number}) for number in range(4)] == clean
 
 
 @pytest.mark.parametrize(
