@@ -19,8 +19,9 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
 from pipeline.evaluation.libero_plus import moved_state, saved_array
 from pipeline.evaluation.own_draws import draw
+from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.statistics import summary, wilson
+from pipeline.evaluation.statistics import grade, summary, wilson
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
 from pipeline.libero.starts import HOME_RAD
 from pipeline.testset import benchmark
@@ -143,6 +144,14 @@ def test_intervals_are_wilsons() -> None:
     assert found["by_axis"].keys() == {"camera", "noise"}, "no policy acted in what was refused"
     assert found["by_axis_and_level"].keys() == {"camera/1", "camera/2", "noise/1", "noise/2"}
     assert sum(group["successes"] for group in found["by_axis"].values()) == found["all"]["successes"]
+
+
+def test_a_task_whose_scene_a_model_was_refused_is_not_graded(tmp_path: Path) -> None:
+    acted, refused = select(Selection(suites=(STOVE.suite,)))[:2]
+    files = EpisodeFiles(tmp_path)
+    one = [(result(acted, True), files), (result(refused, reason="refused"), files)]
+    graded = grade([one, [(result(task, True), files) for task in (acted, refused)]])
+    assert [(task["name"], task["solved"]) for task in graded] == [(acted.name, 2)]
 
 
 def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
