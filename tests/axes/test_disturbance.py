@@ -13,6 +13,8 @@ from pipeline.axes.disturbance import DisturbanceAxis, DisturbancePerturbation
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment
@@ -166,7 +168,7 @@ def test_liberos_own_environment_does_the_same_under_the_same_wrench(
 
 
 @pytest.mark.slow
-def test_held_out_draws_push_a_policy_once() -> None:
+def test_held_out_draws_push_a_policy_once_and_the_result_says_how(tmp_path: Path) -> None:
     chosen = Selection(source="own", suites=(BOWL.suite,), tasks=(BOWL.name,), axes=("disturbance",), levels=(5,))
     (task, *_) = select(chosen)
     evaluated = EpisodeEnvironment()
@@ -177,7 +179,12 @@ def test_held_out_draws_push_a_policy_once() -> None:
     for _ in range(push.first_step + push.steps + 5):
         evaluated.step([0.0] * 6 + [-1.0])
         positions.append(evaluated.simulator.observed.state[:3])
+    policy = PolicyConfig(kind="open_loop")
+    evaluation = Evaluation(evaluated.settings, policy, policy.identity(), tmp_path)
+    evaluation.save(evaluated, Wanted())
     evaluated.close()
+    (row,) = evaluation.files.rows()
+    assert row.perturbations == [push.model_dump(mode="json")]
     away_m = np.linalg.norm(np.array(positions) - positions[push.first_step - 1], axis=1)
     assert away_m[: push.first_step].max() < 0.003, "at rest"
     assert away_m.max() > 0.02
