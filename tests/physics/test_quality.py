@@ -117,9 +117,10 @@ def test_waiting_is_idle_and_shaking_is_jerk(replayed: tuple[Environment, Trajec
         State.of(shaken[step], nq).qpos[joint] += 0.01
     found = measure(replace(trajectory, states=shaken), environment.task)
     assert found.jerk_rms_m_s3 > 3 * smooth.jerk_rms_m_s3
-    bent = trajectory.states.copy()
-    State.of(bent[3], nq).qpos[joint] = 2.8973 - 0.01  # the Panda's first joint ends at 2.8973 rad
-    assert measure(replace(trajectory, states=bent), environment.task).joint_margin_rad <= 0.01 + 1e-9
+    for side in (1, -1):
+        bent = trajectory.states.copy()
+        State.of(bent[3], nq).qpos[joint] = side * (2.8973 - 0.01)  # the Panda's first joint ends at 2.8973 rad
+        assert measure(replace(trajectory, states=bent), environment.task).joint_margin_rad <= 0.01 + 1e-9
 
 
 @pytest.mark.parametrize(
