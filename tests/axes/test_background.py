@@ -116,6 +116,7 @@ def test_draws_are_keyed_recorded_and_from_all_sources() -> None:
     assert {name.partition(":")[0] for name in names} == {"libero", "robosuite", "procedural"}
     assert 0.2 < mean(not name.startswith("procedural:") for name in names) < 0.4
     assert {one.level for one in draws} == {1, 2, 3, 4, 5}
+    assert {covering.quarter_turns for one in draws for covering in one.coverings} == {0, 1, 2, 3}
 
 
 def family(covering: Covering) -> str:

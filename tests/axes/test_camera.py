@@ -147,6 +147,15 @@ def test_beside_its_component_a_draw_changes_one_thing_a_little() -> None:
         assert p.component == "orientation" or np.hypot(p.yaw_deg, p.pitch_deg) <= 8.001
 
 
+def test_no_side_is_preferred() -> None:
+    drawn = draws(CameraAxis())
+    for component, name in itertools.product(COMPONENTS, ("azimuth_deg", "yaw_deg", "pitch_deg")):
+        turns = [getattr(p, name) for p in drawn if p.component == component and getattr(p, name)]
+        assert abs(np.mean(np.sign(turns or [-1, 1]))) < 0.3, (component, name)
+    diagonal = [np.sign(p.yaw_deg * p.pitch_deg) for p in drawn if p.component == "orientation"]
+    assert abs(np.mean(diagonal)) < 0.2
+
+
 def test_levels_and_components_can_be_chosen() -> None:
     axis = CameraAxis(levels=(2, 5), distance=None, orientation=None)
     assert {(p.component, p.level) for p in draws(axis, 50)} == {("spherical", 2), ("spherical", 5)}

@@ -13,6 +13,8 @@ from pipeline.axes.disturbance import DisturbanceAxis, DisturbancePerturbation
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.evaluation.environment import EpisodeEnvironment
+from pipeline.evaluation.policies import Wanted
+from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.libero.starts import recorded_start
 from pipeline.physics.environment import Environment
@@ -57,6 +59,9 @@ def test_draws_are_keyed_and_as_strong_as_their_level_says() -> None:
         assert np.linalg.norm(one.wrench[:3]) * one.steps * 0.05 == pytest.approx(1 + 3 * one.level, abs=1e-3)
         assert abs(one.wrench[2]) <= np.linalg.norm(one.wrench[:3]) / 2 + 1e-3
         assert DisturbancePerturbation.model_validate_json(one.model_dump_json()) == one
+    pushes = np.array([one.wrench[:3] for one in drawn])
+    directions = pushes / np.linalg.norm(pushes, axis=1, keepdims=True)
+    assert np.abs(directions.mean(axis=0)).max() < 0.1, "from no side more often"
 
 
 def refusal(change: DisturbancePerturbation) -> str | None:
@@ -163,7 +168,7 @@ def test_liberos_own_environment_does_the_same_under_the_same_wrench(
 
 
 @pytest.mark.slow
-def test_held_out_draws_push_a_policy_once() -> None:
+def test_held_out_draws_push_a_policy_once_and_the_result_says_how(tmp_path: Path) -> None:
     chosen = Selection(source="own", suites=(BOWL.suite,), tasks=(BOWL.name,), axes=("disturbance",), levels=(5,))
     (task, *_) = select(chosen)
     evaluated = EpisodeEnvironment()
@@ -174,7 +179,12 @@ def test_held_out_draws_push_a_policy_once() -> None:
     for _ in range(push.first_step + push.steps + 5):
         evaluated.step([0.0] * 6 + [-1.0])
         positions.append(evaluated.simulator.observed.state[:3])
+    policy = PolicyConfig(kind="open_loop")
+    evaluation = Evaluation(evaluated.settings, policy, policy.identity(), tmp_path)
+    evaluation.save(evaluated, Wanted())
     evaluated.close()
+    (row,) = evaluation.files.rows()
+    assert row.perturbations == [push.model_dump(mode="json")]
     away_m = np.linalg.norm(np.array(positions) - positions[push.first_step - 1], axis=1)
     assert away_m[: push.first_step].max() < 0.003, "at rest"
     assert away_m.max() > 0.02

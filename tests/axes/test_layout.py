@@ -74,9 +74,14 @@ def test_the_same_draw_gives_the_same_scene(three: LayoutPerturbation, base: Sce
 
 
 def test_the_level_is_the_number_of_objects() -> None:
+    seeds = set()
     for level in (1, 2, 3, 4, 5):
         drawn = LayoutAxis(levels=(level,)).sample(seeding.rng(level), PLATE, 0)
+        seeds.add(drawn.seed)
         assert (drawn.level, len(drawn.objects)) == (level, level)
+        areas_m2 = [models(LayoutAxis().sources)[one.name].shape.footprint_m2 for one in drawn.objects]
+        assert max(areas_m2) <= 0.12 / level, "the more, the smaller"
+    assert len(seeds) == 5, "each has places of its own"
 
 
 def test_added_objects_are_among_what_a_rollout_met(changed: Scene) -> None:

@@ -81,6 +81,9 @@ def test_the_four_properties_mostly_change_together() -> None:
     assert sum(one.shadows for one in combined) == pytest.approx(len(combined) / 2, abs=50)
     for component in ("diffuse", "direction", "specular", "shadows"):
         assert sum(one.component == component for one in draws) == pytest.approx(100, abs=30)
+    tints = [one.diffuse_scale_rgb for one in draws if len({*one.diffuse_scale_rgb}) > 1]
+    for brightest in range(3):
+        assert sum(np.argmax(tint) == brightest for tint in tints) == pytest.approx(len(tints) / 3, abs=50)
 
 
 @pytest.mark.parametrize(

@@ -207,6 +207,16 @@ def test_training_grid_is_off_the_test_grid(component: str) -> None:
         assert not {effect.max_scale for effect in AXIS.zoom} & tested_scales
 
 
+def test_held_out_strengths_are_the_even_severities() -> None:
+    for component, tested in TEST_GRID.items():
+        held_out = [effect.model_dump() for effect in getattr(NoiseAxis.held_out(), component)]
+        if component == "zoom":
+            scales = [float(np.arange(1, *row)[-1]) for row in tested[1::2]]
+            assert [effect["max_scale"] for effect in held_out] == pytest.approx(scales)
+        else:
+            assert [tuple(effect.values()) for effect in held_out] == tested[1::2]
+
+
 def test_levels_lie_between_neighbouring_severities() -> None:
     scales: list[tuple[float, ...]] = [(float(np.arange(1, stop, step)[-1]),) for stop, step in TEST_GRID["zoom"]]
     for component, tested in (TEST_GRID | {"zoom": scales}).items():

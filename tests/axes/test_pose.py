@@ -83,6 +83,7 @@ def test_draws_are_keyed_and_as_large_as_their_level_says() -> None:
     for p in drawn:
         assert 0.016 * (p.level - 1) - 1e-4 <= math.hypot(p.dx_m, p.dy_m) <= 0.016 * p.level + 1e-4
         assert p.moved == "plate_1"
+    assert np.abs(np.mean([(p.dx_m, p.dy_m) / np.hypot(p.dx_m, p.dy_m) for p in drawn], axis=0)).max() < 0.1
     for level in (1, 5):
         turns_deg = np.array([p.dyaw_deg for p in drawn if p.level == level])
         assert -20 <= turns_deg.min() < -15, "as far at level 1 as at level 5"
@@ -228,6 +229,13 @@ def test_a_scene_moves_everything_within_the_benchmarks_disks(task: Task) -> Non
                 centres_m = [(0.0, 0.0), BASE_M.get(name, (0.0, 0.0)) if task.suite == "libero_goal" else (0.0, 0.0)]
                 off_m = min(math.dist(shift, centre_m) for centre_m in centres_m)
                 assert off_m <= step_m * level + 1e-4
+
+
+def test_a_scenes_moves_are_uniform_over_the_disk() -> None:
+    drawn = scene_draws(MILK, 200, 1)
+    moves_m = np.array([(move.dx_m, move.dy_m) for one in drawn for move in one.moves if move.name == "milk_1"])
+    assert np.abs(moves_m.mean(axis=0)).max() < 0.004
+    assert np.mean(np.linalg.norm(moves_m, axis=1) < 0.015) == pytest.approx(1 / 4, abs=0.08), "of a radius of 0.03"
 
 
 def test_the_goal_suites_bowl_goes_where_the_benchmark_has_it_unless_the_hand_needs_it() -> None:

@@ -101,11 +101,13 @@ def recorded_rad(scene: Scene) -> Floats:
 def test_what_cannot_be_is_refused(scene: Scene) -> None:
     demo = starter_demo(PLATE)
     start = recorded_rad(scene)
-    for reason, offsets in {
-        "joint_limit": (0, 0, 0, 0, 0, 0, 3.0),
-        "robot_in_collision": (0, 0.9, 0, 0, 0, 0, 0),
-        "test_posture": HOME_RAD + benchmark_offsets_rad()[99] - start,
-    }.items():
+    # The Panda's last joint ends at 2.8973 rad on both sides.
+    for reason, offsets in (
+        ("joint_limit", (0, 0, 0, 0, 0, 0, 2.8973 - 0.03 - start[6])),
+        ("joint_limit", (0, 0, 0, 0, 0, 0, -2.8973 + 0.03 - start[6])),
+        ("robot_in_collision", (0, 0.9, 0, 0, 0, 0, 0)),
+        ("test_posture", HOME_RAD + benchmark_offsets_rad()[99] - start),
+    ):
         with pytest.raises(RefusedError, match=reason):
             turned(*offsets).apply(scene, demo, roll_out)
 

@@ -170,7 +170,10 @@ def pairs_of(both: int, first: int, second: int, neither: int) -> list[tuple[Epi
 @pytest.mark.parametrize(("first", "second"), [(60, 40), (30, 30), (45, 20), (20, 30)])
 def test_p_is_close_to_mcnemars_where_many_episodes_tell_two_policies_apart(first: int, second: int) -> None:
     found = compare(pairs_of(200, first, second, 100))["all"]
-    assert found["difference"]["value"] == pytest.approx(found["second_rate"] - found["first_rate"])
+    episodes = 300 + first + second
+    assert (found["first_rate"], found["second_rate"]) == ((200 + first) / episodes, (200 + second) / episodes)
+    assert found["difference"]["value"] == pytest.approx((second - first) / episodes)
+    assert found["difference"]["low"] < found["difference"]["value"] < found["difference"]["high"]
     # The exact test counts all of the probability of what was seen, a bootstrap about half of it.
     assert -0.06 < found["difference"]["p_value"] - mcnemar(first, second) < 0.01
 

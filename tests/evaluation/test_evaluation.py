@@ -23,6 +23,7 @@ gl.choose()
 import robosuite.utils.transform_utils as transform  # noqa: E402
 from libero.libero.envs import OffScreenRenderEnv  # noqa: E402
 from model_server import replaying  # noqa: E402
+from vla_eval.rotation import quat_to_axisangle  # noqa: E402
 
 from pipeline.__main__ import main  # noqa: E402
 from pipeline.axes.camera import CameraPerturbation  # noqa: E402
@@ -81,19 +82,24 @@ def some_test_task(axis: str, component: str) -> EvaluationTask:
 def test_episodes_are_liberos_bit_for_bit(
     libero: list[tuple[Any, dict[str, Any]]], evaluated: EpisodeEnvironment
 ) -> None:
+    turned_over = 0
     for _ in range(2):  # the second from what the first left behind
         evaluated.reset(FIRST)
         for step, (state, theirs) in enumerate(libero):
             if step:
                 evaluated.step(ACTIONS[step - 1])
             assert np.array_equal(evaluated.simulator.state, state), f"state at step {step}"
-            ours = evaluated.observation(Wanted())
             quat_xyzw = theirs["robot0_eef_quat"].copy()
+            shortest = evaluated.observation(Wanted(images=False, shortest_rotation=True))["states"][3:6]
+            np.testing.assert_allclose(shortest, quat_to_axisangle(quat_xyzw), atol=1e-5)
+            turned_over += quat_xyzw[3] < 0
+            ours = evaluated.observation(Wanted())
             expected = [theirs["robot0_eef_pos"], transform.quat2axisangle(quat_xyzw), theirs["robot0_gripper_qpos"]]
             assert np.array_equal(ours["states"], np.concatenate(expected).astype(np.float32))
             assert np.array_equal(ours["images"]["agentview"], to_policy(theirs["agentview_image"])), step
             assert np.array_equal(ours["images"]["wrist"], to_policy(theirs["robot0_eye_in_hand_image"])), step
         assert ours["task_description"] == STOVE.instruction
+    assert turned_over, "the angle is above pi somewhere"
 
 
 @pytest.mark.slow

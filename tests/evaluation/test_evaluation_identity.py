@@ -200,11 +200,13 @@ def test_a_video_shows_what_the_policy_does_not_look_at(
 
 @pytest.mark.slow
 def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Path) -> None:
-    """So that an episode's result depends neither on those before it nor on the worker."""
+    """So that an episode's result depends neither on those before it nor on the worker. It sees what lerobot's datasets
+    hand out: the agent view at its own size, channels first, from 0 to 1."""
     policy = Checkpoint(checkpoints.save_random(tmp_path / "policy"))
     one, other = select(CHOSEN.model_copy(update={"episodes": 2}))
+    small = np.resize(np.arange(251, dtype=np.uint8), (64, 64, 3))
     shown = {
-        "images": {view: np.zeros((256, 256, 3), np.uint8) for view in ("agentview", "wrist")},
+        "images": {"agentview": small.repeat(4, axis=0).repeat(4, axis=1), "wrist": np.zeros((256, 256, 3), np.uint8)},
         "states": np.zeros(8, np.float32),
         "task_description": "",
     }
@@ -216,6 +218,12 @@ def test_a_policy_that_draws_random_numbers_draws_them_by_the_task(tmp_path: Pat
     first = actions(one)
     assert first != actions(other)
     assert actions(one) == first
+    seen: dict[str, Any] = {}
+    processed = policy._before
+    policy._before = lambda batch: processed(seen.setdefault("batch", batch))
+    actions(one)
+    image = seen["batch"]["observation.images.image"].numpy()
+    np.testing.assert_array_equal(image[0], small.transpose(2, 0, 1).astype(np.float32) / 255)
 
 
 def test_what_a_lost_worker_leaves_has_no_result(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation.actions import PolicyError, checked_actions
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment, evaluate
-from pipeline.evaluation.policies import Server
+from pipeline.evaluation.policies import Server, Wanted
 from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection
@@ -57,8 +57,10 @@ def test_a_server_of_other_actions_is_refused(monkeypatch: pytest.MonkeyPatch) -
         ):
             with pytest.raises(PipelineError, match=f"{told}(?s:.*)args.invert_gripper"):
                 Server(address(server))
-        with closing(Server(address(GR00TModelServer(invert_gripper=True)))) as taken:
-            assert taken.wanted.state
+        asked = {"send_wrist_image": True, "quat_no_antipodal": True}
+        for params, wanted in ((None, Wanted(wrist=False, shortest_rotation=True)), (asked, Wanted())):
+            with closing(Server(address(GR00TModelServer(invert_gripper=True, observation_params=params)))) as taken:
+                assert taken.wanted == wanted
         portal.call(portal.stop, True)
 
 

@@ -19,8 +19,9 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
 from pipeline.evaluation.libero_plus import moved_state, saved_array
 from pipeline.evaluation.own_draws import draw
+from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.selection import Selection, select
-from pipeline.evaluation.statistics import summary, wilson
+from pipeline.evaluation.statistics import grade, summary, wilson
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
 from pipeline.libero.starts import HOME_RAD
 from pipeline.testset import benchmark
@@ -77,6 +78,8 @@ def test_held_out_draws_are_none_of_a_plan() -> None:
     assert draw(task, 0) == draw(task, 0) != draw(task, 1)
     assert draw(task, 0).level == task.level == 3
     assert draw(task, 0, attempt=1) != draw(task, 0)
+    others = select(Selection(source="own", axes=("camera",), levels=(3,)))
+    assert len({draw(other, 0) for other in others}) == len(others) == 40, "each task has its own"
     with pytest.raises(PipelineError, match="language"):
         select(Selection(source="own", axes=("language",)))
 
@@ -134,18 +137,29 @@ def test_intervals_are_wilsons() -> None:
         for axis in ("camera", "noise")
         for level in (1, 2)
     ]
-    found = summary(rows)
-    assert found["all"]["episodes"] == 4
+    found = summary(
+        [*rows, result(EvaluationTask("own", "libero_goal", "b", "n", "robot", "c", 1, 0), reason="refused")]
+    )
+    assert (found["all"]["episodes"], found["refused"]) == (4, 1)
+    assert found["by_axis"].keys() == {"camera", "noise"}, "no policy acted in what was refused"
     assert found["by_axis_and_level"].keys() == {"camera/1", "camera/2", "noise/1", "noise/2"}
     assert sum(group["successes"] for group in found["by_axis"].values()) == found["all"]["successes"]
+
+
+def test_a_task_whose_scene_a_model_was_refused_is_not_graded(tmp_path: Path) -> None:
+    acted, refused = select(Selection(suites=(STOVE.suite,)))[:2]
+    files = EpisodeFiles(tmp_path)
+    one = [(result(acted, True), files), (result(refused, reason="refused"), files)]
+    graded = grade([one, [(result(task, True), files) for task in (acted, refused)]])
+    assert [(task["name"], task["solved"]) for task in graded] == [(acted.name, 2)]
 
 
 def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
     (test, *_) = select(Selection(source="libero_plus", suites=("libero_goal",)))
     assert EvaluationTask.of_harness(test.for_harness()) == test
-    (clean,) = select(Selection(suites=("libero_goal",), tasks=("turn_on_the_stove",)))
-    own_class = {"name": "turn on the stove", "suite": "libero_goal", "task_id": 7, "episode_idx": 0}
-    assert EvaluationTask.of_harness(own_class) == clean
+    clean = select(Selection(suites=("libero_goal",), tasks=("turn_on_the_stove",), episodes=4))
+    own_class = {"name": "turn on the stove", "suite": "libero_goal", "task_id": 7}
+    assert [EvaluationTask.of_harness({**own_class, "episode_idx": number}) for number in range(4)] == clean
 
 
 @pytest.mark.parametrize(

@@ -98,9 +98,16 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
     evaluation = Evaluation(settings, policy, policy.identity(), tmp_path / "rows")
     listed = select(Selection(suites=(STOVE.suite,), tasks=(STOVE.name,), episodes=3))
     sharing = [PerturbedLiberoEnv(listed, settings, first, 2, (32, 48), evaluation) for first in range(2)]
+    stoves_m = {}
     for _ in range(2):
         for env in sharing:
             seen, _ = env.reset()
+            simulator, number = env._environment.simulator, env._environment.task.number
+            bowl = 1 + simulator.model.joint("akita_black_bowl_1_joint0").qposadr[0]
+            np.testing.assert_allclose(
+                simulator.state[bowl:][:2], libero_states(STOVE)[number, bowl:][:2], atol=2e-3, err_msg=str(number)
+            )
+            stoves_m[number] = tuple(simulator.pose("flat_stove_1")[:2])
             assert seen["pixels"]["image2"].shape == (32, 48, 3)
             done = False
             while not done:
@@ -113,6 +120,7 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
     rows = {row.number: row for row, _ in stored([evaluation.folder])}
     assert [(row.steps, row.looks, row.reason) for row in rows.values()] == [(2, 3, "step_limit")] * 3
     assert sorted(rows) == [0, 1, 2]
+    assert len({*stoves_m.values()}) == 3, "LIBERO's reset of each number places fixtures of its own"
     assert rows[0].identity == evaluation.identity
     assert rows[0].versions["lerobot"] == version("lerobot")
     (read_back,) = read([evaluation.folder])

@@ -29,8 +29,11 @@ def test_openvla_measures_every_step_once(episodes: list[Motion]) -> None:
         assert found["action"]["mean"][dimension] == pytest.approx(sum(column) / 469, abs=1e-12)
         assert found["action"]["min"][dimension] == column[0]
         assert found["action"]["max"][dimension] == column[-1]
-        # Place 4.68 of 0 to 468, between its two neighbours.
-        assert found["action"]["q01"][dimension] == pytest.approx(column[4] + 0.68 * (column[5] - column[4]), abs=1e-12)
+        squares = sum((value - sum(column) / 469) ** 2 for value in column)
+        assert found["action"]["std"][dimension] == pytest.approx((squares / 469) ** 0.5, abs=1e-12)
+        # Places 4.68 and 463.32 of 0 to 468, between their two neighbours.
+        low, high = column[4] + 0.68 * (column[5] - column[4]), column[463] + 0.32 * (column[464] - column[463])
+        assert [found["action"][name][dimension] for name in ("q01", "q99")] == pytest.approx([low, high], abs=1e-12)
     means = np.mean([state.mean(0) for _, state in episodes], axis=0)
     assert np.abs(np.array(found["proprio"]["mean"]) - means).min() > 0.05, "not a mean of means"
 

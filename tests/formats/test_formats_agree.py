@@ -143,15 +143,18 @@ def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
 
 def test_modality_names_columns_that_are_there(written: Written, tmp_path: Path) -> None:
     """In both versions; starVLA's names, and GR00T's for the agent view."""
-    for root in (written.lerobot.root, write_lerobot_v21(tmp_path).folder / SET):
+    images = "observation.images"
+    for root, wrist in ((written.lerobot.root, "image2"), (write_lerobot_v21(tmp_path).folder / SET, "wrist_image")):
         modality = json.loads((root / "meta" / "modality.json").read_text())
         features = json.loads((root / "meta" / "info.json").read_text())["features"]
         assert list(modality["state"]) == ["x", "y", "z", "roll", "pitch", "yaw", "pad", "gripper"]
         assert list(modality["action"]) == ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
-        for kind, width in (("state", 8), ("action", 7)):
+        for kind, width, column in (("state", 8, "observation.state"), ("action", 7, "action")):
             spans = [(of["start"], of["end"]) for of in modality[kind].values()]
             assert spans == [(k, k + 1) for k in range(width)]
-            assert {of["original_key"] for of in modality[kind].values()} <= set(features)
-        assert set(modality["video"]) == {"primary_image", "image", "wrist_image"}
-        assert {of["original_key"] for of in modality["video"].values()} <= set(features)
+            assert {of["original_key"] for of in modality[kind].values()} == {column}
+        agent = f"{images}.image"
+        shown = {name: of["original_key"] for name, of in modality["video"].items()}
+        assert shown == {"primary_image": agent, "image": agent, "wrist_image": f"{images}.{wrist}"}
+        assert {"observation.state", "action", *shown.values()} <= set(features)
         assert modality["annotation"] == {"human.action.task_description": {"original_key": "task_index"}}

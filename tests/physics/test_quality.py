@@ -45,6 +45,11 @@ def test_path_and_contacts_are_robosuites(replayed: tuple[Environment, Trajector
     found = measure(trajectory, environment.task)
     assert found.touched_steps == touched
     assert found.path_m == pytest.approx(np.linalg.norm(np.diff(hand, axis=0), axis=1).sum(), abs=1e-6)
+    third = np.array([1.0, -3.0, 3.0, -1.0]) / 0.05**3
+    jerk = np.array([np.convolve(along, third, "valid") for along in np.transpose(hand)])
+    assert found.jerk_rms_m_s3 == pytest.approx(np.sqrt((jerk**2).sum(axis=0).mean()), rel=1e-5)
+    asked = env.robots[0].controller.output_max[:3] * trajectory.actions[:, :3]
+    assert found.lag_m == pytest.approx(np.linalg.norm(np.diff(hand, axis=0) - asked, axis=1).max(), rel=1e-5)
     velocity = np.gradient(np.array(hand), 0.05, axis=0)
     assert found.path_m == pytest.approx(np.linalg.norm(velocity, axis=1).sum() * 0.05, rel=0.1)
 
@@ -72,18 +77,21 @@ def test_an_object_that_is_pushed_counts_and_one_of_the_goal_does_not(
     named = of_goal(bddl.read(environment.task.bddl_file))
     before = measure(trajectory, environment.task)
     for name in bddl.read(environment.task.bddl_file).objects:
-        pushed = moved(environment, trajectory, name, (0.03, 0.04, 0.0))
-        found = measure(pushed, environment.task)
-        counted = (0.05, 0.0) if name not in named else (before.non_target_moved_m, before.non_target_left_m)
-        assert (found.non_target_moved_m, found.non_target_left_m) == pytest.approx(counted, abs=2e-3), name
+        for step, left_m in ((len(trajectory.actions) // 2, 0.0), (-1, 0.05)):
+            pushed = moved(environment, trajectory, name, (0.03, 0.04, 0.0), step)
+            found = measure(pushed, environment.task)
+            counted = (0.05, left_m) if name not in named else (before.non_target_moved_m, before.non_target_left_m)
+            assert (found.non_target_moved_m, found.non_target_left_m) == pytest.approx(counted, abs=2e-3), name
 
 
-def moved(environment: Environment, trajectory: Trajectory, name: str, shift_m: tuple[float, ...]) -> Trajectory:
+def moved(
+    environment: Environment, trajectory: Trajectory, name: str, shift_m: tuple[float, ...], step: int
+) -> Trajectory:
     """The trajectory with an object elsewhere at one step, and back after it."""
     model = environment.sim.model._model
     first = int(model.joint(f"{name}_joint0").qposadr[0])
     states = trajectory.states.copy()
-    State.of(states[len(states) // 2], model.nq).qpos[first : first + 3] += shift_m
+    State.of(states[step], model.nq).qpos[first : first + 3] += shift_m
     return replace(trajectory, states=states)
 
 
@@ -109,9 +117,10 @@ def test_waiting_is_idle_and_shaking_is_jerk(replayed: tuple[Environment, Trajec
         State.of(shaken[step], nq).qpos[joint] += 0.01
     found = measure(replace(trajectory, states=shaken), environment.task)
     assert found.jerk_rms_m_s3 > 3 * smooth.jerk_rms_m_s3
-    bent = trajectory.states.copy()
-    State.of(bent[3], nq).qpos[joint] = 2.8973 - 0.01  # the Panda's first joint ends at 2.8973 rad
-    assert measure(replace(trajectory, states=bent), environment.task).joint_margin_rad <= 0.01 + 1e-9
+    for side in (1, -1):
+        bent = trajectory.states.copy()
+        State.of(bent[3], nq).qpos[joint] = side * (2.8973 - 0.01)  # the Panda's first joint ends at 2.8973 rad
+        assert measure(replace(trajectory, states=bent), environment.task).joint_margin_rad <= 0.01 + 1e-9
 
 
 @pytest.mark.parametrize(

@@ -156,7 +156,7 @@ def test_perturbations_keep_clear_of_the_path_that_is_replayed(
     # Two pauses: at the start, where the gripper stays as it is, and on the way.
     actions[[0, 1, 5, 6], :6], actions[[0, 1, 5, 6], 6] = 0.0, actions[4, 6]
     demo = replace(demo, actions=actions)
-    trajectory = replay(shared(STOVE), demo, "t", ReplayConfig(noops=noops, settle_steps=0), (PathSeen(level=1),))
+    trajectory = replay(shared(STOVE), demo, "t", ReplayConfig(noops=noops, settle_steps=3), (PathSeen(level=1),))
     assert len(trajectory.actions) == {"drop": 8, "trim_ends": 10, "keep": 12}[noops]
     assert np.array_equal(json.loads(trajectory.resolved)["path"], trajectory.states)
 

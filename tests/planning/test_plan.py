@@ -272,6 +272,11 @@ def test_a_combination_fills_a_quota_of_its_own() -> None:
         entries(), config(axes=Axes(camera=CameraAxis()), episodes={"camera": 3}, reserve=0), REPLAY, NO_TESTS
     )
     assert {row.episode_id for row in alone} <= {row.episode_id for row in rows}
+    drawn = [
+        next(plan.Draws(name, (CameraAxis(),), 3, NO_TESTS).of("demo_0", TASKS[0]))
+        for name in ("camera", "camera+noise")
+    ]
+    assert drawn[0] != drawn[1], "it has draws of its own"
 
 
 def test_every_part_of_a_combination_keeps_clear_of_the_test_set() -> None:
