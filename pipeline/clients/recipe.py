@@ -61,11 +61,12 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
     if export.rlds is not None:
         suites = {row["suite"]: dataset_of(row) for row in kept}
         dataset["suites"] = sourced(suites, MANIFEST + ": the RLDS dataset that holds each suite")
+        validating = {dataset_of(row) for row in kept if split_of(Path(row["rlds_shard"])) == "val"}
+        often = "about equally often, as the steps of val count too" if validating else "equally often"
         dataset["mixtures"] = sourced(
             {export.rlds.name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
-            "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
+            f"OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn {often}",
         )
-        validating = {dataset_of(row) for row in kept if split_of(Path(row["rlds_shard"])) == "val"}
         # It asks every set for its split.
         oft_validates = bool(validating) and validating == {*suites.values()}
     if export.lerobot is not None:

@@ -4,11 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import yaml
 from synthetic import write_lerobot_v21
 
 from pipeline.clients.recipe import build
-from pipeline.export_config import ExportConfig
+from pipeline.export_config import ExportConfig, RldsConfig
 
 
 def recipe(folder: Path, export: ExportConfig, splits: tuple[str, ...] = ("train",)) -> dict[str, Any]:
@@ -46,3 +47,12 @@ def test_starvla_draws_every_step_equally_often(tmp_path: Path) -> None:
             of_episodes *= lengths
         drawn += list(share * of_episodes / of_episodes.sum() / lengths)
     np.testing.assert_allclose(drawn, 1 / 1000, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("splits", "about"), [(("train",), False), (("train", "val"), True)])
+def test_openvla_oft_counts_steps_that_it_does_not_train_on(splits: Any, about: bool, tmp_path: Path) -> None:
+    """Its statistics, by whose counts it weighs sets, are of the split ``all``."""
+    export = ExportConfig(rlds=RldsConfig(name="libero_mine"), lerobot=None)
+    source = recipe(tmp_path, export, splits)["dataset"]["mixtures"]["source"]
+    assert ("about equally often, as the steps of val count too" in source) == about
+    assert "equally often" in source
