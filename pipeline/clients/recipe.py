@@ -106,7 +106,8 @@ def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / "finetune.yaml").write_text(text)
-        shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
+        if export.rlds is not None:
+            shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
         if export.lerobot is not None and export.lerobot.validation:
             info = read_json(data / "lerobot" / export.lerobot.name / "meta" / "info.json")
             listed = [*range(int(info["splits"]["train"].partition(":")[2]))]
