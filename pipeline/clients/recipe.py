@@ -61,11 +61,12 @@ def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: Export
     if export.rlds is not None:
         suites = {row["suite"]: dataset_of(row) for row in kept}
         dataset["suites"] = sourced(suites, MANIFEST + ": the RLDS dataset that holds each suite")
+        validating = {dataset_of(row) for row in kept if split_of(Path(row["rlds_shard"])) == "val"}
+        often = "about equally often, as the steps of val count too" if validating else "equally often"
         dataset["mixtures"] = sourced(
             {export.rlds.name: dict.fromkeys(sorted(set(suites.values())), 1.0)},
-            "OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn equally often",
+            f"OpenVLA-OFT multiplies weights by the number of steps: with 1, every step is drawn {often}",
         )
-        validating = {dataset_of(row) for row in kept if split_of(Path(row["rlds_shard"])) == "val"}
         # It asks every set for its split.
         oft_validates = bool(validating) and validating == {*suites.values()}
     if export.lerobot is not None:
@@ -105,7 +106,8 @@ def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / "finetune.yaml").write_text(text)
-        shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
+        if export.rlds is not None:
+            shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
         if export.lerobot is not None and export.lerobot.validation:
             info = read_json(data / "lerobot" / export.lerobot.name / "meta" / "info.json")
             listed = [*range(int(info["splits"]["train"].partition(":")[2]))]

@@ -129,6 +129,10 @@ class Format(ABC, Generic[Options]):
     def pieces(self, episodes: Episodes) -> list[Piece]:
         """What each worker writes. Pieces below ``dataset/`` already lie where the finished dataset has them."""
 
+    def sets(self, pieces: Sequence[Piece]) -> set[str]:
+        """Names of the datasets that come of these pieces, each a folder of ``folder``."""
+        return {Path(piece.path).parts[1] for piece in pieces}
+
     @abstractmethod
     def write_piece(self, path: Path, piece: Piece, load: Load) -> None:
         """Write a file or a folder, in a worker; one episode at a time is in memory.

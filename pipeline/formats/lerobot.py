@@ -57,6 +57,9 @@ class LeRobot(Format[LeRobotConfig]):
                 slices[f"files/{len(slices):05d}"] = split_name, ids
         return in_a_row(slices, episodes.known)
 
+    def sets(self, pieces: Sequence[Piece]) -> set[str]:
+        return {self.options.name}
+
     def _steps_of_a_file(self) -> int:
         """So many steps make a file of ``FILE_MB`` at most; sizes as in ``benchmarks/disk.py``, rounded up."""
         views = len(SCHEMA.views)

@@ -1,11 +1,12 @@
-"""What a run's folder holds that can be made again: found with its sizes, and deleted."""
+"""What a run's folder holds that can be made again: found with its sizes, and deleted; and what of it is stale."""
 
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from pipeline.config import Config
 from pipeline.files import remove
-from pipeline.formats.registry import FAILURES
+from pipeline.formats.registry import FAILURES, failures_of, formats_of
 from pipeline.run.finished import FOLDER
 from pipeline.run.stage import locked
 
@@ -44,6 +45,17 @@ PARTS = {
     ),
 }
 """Least to make again first."""
+
+
+def say_stale(part: str, config: Config) -> None:
+    """Say which datasets of a part of ``PARTS`` are there though nothing asks for them now."""
+    asked = {one.folder for one in (*formats_of(config.data, config.export), *failures_of(config.data, config.export))}
+    for folder in (config.data / name for name in PARTS[part].names):
+        if folder.is_dir() and folder not in asked:
+            print(
+                f"{folder} is of an earlier run, and not asked for: `python -m pipeline clean --only {part} CONFIG` "
+                f"deletes all of {part}, and the next run makes again what is asked for"
+            )
 
 
 def found(data: Path, parts: Iterable[str]) -> dict[str, float]:

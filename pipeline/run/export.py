@@ -7,6 +7,7 @@ is whole. The finished dataset then takes the place of the one before in one ren
 import json
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from functools import cache, partial
 from importlib.metadata import version
@@ -53,6 +54,7 @@ def export_run(kind: type[AnyFormat], config: Config) -> None:
 
 
 def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> None:
+    refuse_foreign(target, episodes)
     if not episodes.ids and "outcome" in target.extras:
         remove(target.folder)
         target.record_file.unlink(missing_ok=True)
@@ -65,6 +67,25 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> 
     with runner(config.compute, config.data) as workers:
         export(target, episodes, workers)
     print(f"wrote {len(episodes.ids)} episodes to {target.folder}")
+
+
+def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
+    """Stop where the format's folder has an entry that is no set of its own, as what is written takes its place.
+
+    Raises:
+        PipelineError: when it is neither a set of the dataset there, nor one of the dataset to write.
+    """
+    own = target.sets(target.pieces(episodes)) if episodes.ids else set()
+    with suppress(PipelineError):  # There is none, or it has changed since.
+        own |= {name.partition("/")[0] for name in target.record().files}
+    foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in own)
+    if foreign:
+        raise PipelineError(
+            f"not of this run's {target.title}, and would be deleted ({len(foreign)} such)",
+            where=foreign[0],
+            expected=f"only {', '.join(sorted(own))}",
+            remedy=f"move it out of {target.folder}; to train on both, make a folder of links to them",
+        )
 
 
 def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Episodes:
@@ -138,8 +159,8 @@ def _made_with(target: AnyFormat) -> dict[str, str]:
 def is_current(target: AnyFormat, episodes: Episodes) -> bool:
     """Whether the dataset is there, whole and of these episodes.
 
-    Every file must be there and no younger than the record. What else lies in the folder, such as the statistics that
-    a client left, is removed then.
+    Every file must be there and no younger than the record. What else lies in its sets, such as the statistics that a
+    client left, is removed then.
     """
     if not untouched(target) or target.record().identity != identity(target, episodes):
         return False

@@ -17,6 +17,15 @@ Its action head, which OFT loads only with ``--resume``, gives actions in units 
 same outputs would be other movements. Warm-up and cosine go from STEP to the last step. Without ``--statistics``, the
 statistics are those of these datasets, and a resumed run goes on within its own cosine.
 
+To train on LIBERO's sets too, link both into one folder, and name each set with its weight, which OFT multiplies by the
+set's steps, as it does the 1 of these:
+
+    --data_root_dir MIX --mix libero_goal_no_noops=1 --mix libero_10_no_noops=0.5
+
+OFT's evaluation has one entry of statistics a suite, ``libero_goal``, and takes ``libero_goal_no_noops`` only without
+it. So all sets of a suite get the same: those of ``--statistics``, else of the first, which is of these datasets where
+they have the suite. LIBERO's sets have no split ``val``: leave out ``--use_val_set True``.
+
 What OFT has no flag for is done here: the datasets and their mixture are registered, AdamW gets the settings' weight
 decay (OFT leaves PyTorch's 0.01), a cosine with warm-up takes the place of OFT's step (whose own warm-up would undo
 any later decay), the statistics of a checkpoint are also named by suite, which is where OFT's evaluation looks, and
@@ -27,9 +36,10 @@ import argparse
 import importlib
 import json
 import math
+import re
 import runpy
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,15 +49,29 @@ SCRIPT = "vla-scripts/finetune.py"
 DATASETS = "prismatic.vla.datasets.rlds"
 
 
-def register(mixtures: Mapping[str, Mapping[str, float]]) -> None:
-    """Enter every dataset, and every mixture of them, where OFT looks datasets up by name."""
+def mixed(text: str) -> tuple[str, float]:
+    """One of LIBERO's sets and its weight, of a text such as ``libero_goal_no_noops=0.5``."""
+    match = re.fullmatch(r"(libero_\w+_no_noops)=(\d+\.?\d*|\.\d+)", text)
+    if match is None or not float(match[2]):
+        raise argparse.ArgumentTypeError(f"{text!r}, expected a set of LIBERO and a weight: libero_goal_no_noops=1")
+    return match[1], float(match[2])
+
+
+def register(mixtures: Mapping[str, Mapping[str, float]], added: Mapping[str, float]) -> None:
+    """Enter every dataset, and every mixture of them, where OFT looks datasets up by name.
+
+    Args:
+        mixtures: name of a mixture to its datasets, each with its weight.
+        added: LIBERO's sets, which come after the others in each mixture and beside each dataset.
+    """
     configs = importlib.import_module(f"{DATASETS}.oxe.configs")
     transforms = importlib.import_module(f"{DATASETS}.oxe.transforms")
     named = importlib.import_module(f"{DATASETS}.oxe.mixtures").OXE_NAMED_MIXTURES
     for mixture, weights in mixtures.items():
-        named[mixture] = list(weights.items())
+        named[mixture] = [*weights.items(), *added.items()]
         for dataset in weights:
-            named.setdefault(dataset, [(dataset, 1.0)])
+            named.setdefault(dataset, [(dataset, 1.0), *added.items()])
+        for dataset in (*weights, *added):
             transforms.OXE_STANDARDIZATION_TRANSFORMS[dataset] = transforms.libero_dataset_transform
             configs.OXE_DATASET_CONFIGS[dataset] = {
                 "image_obs_keys": {"primary": "image", "secondary": None, "wrist": "wrist_image"},
@@ -71,39 +95,47 @@ def name_statistics_by_suite(suites: Mapping[str, str]) -> None:
     module.save_dataset_statistics = save_with_suites
 
 
-def statistics_of(file: Path, suites: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Datasets to a checkpoint's statistics of actions and proprioception for their suites, as far as it has them."""
+def statistics_of(file: Path, suites: Collection[str]) -> dict[str, dict[str, Any]]:
+    """Suites to a checkpoint's statistics of actions and proprioception, as far as it has them."""
     stored = json.loads(file.read_text())
     former = {}
-    for suite, name in suites.items():
+    for suite in suites:
         # Published checkpoints name LIBERO's sets without no-ops.
         key = next((key for key in (f"{suite}_no_noops", suite) if key in stored), None)
         if key is not None:
-            former[name] = {part: stored[key][part] for part in ("action", "proprio")}
+            former[suite] = {part: stored[key][part] for part in ("action", "proprio")}
     if not former:
         sys.exit(f"error: {file} has no statistics for {' or '.join(suites)}\n  it has: {', '.join(stored)}")
     return former
 
 
-def keep_statistics_elsewhere(dataset_sha256: str, former: Mapping[str, Mapping[str, Any]]) -> None:
-    """Have OFT's loader write ``dataset_statistics_<hash>.json`` to its cache folder: it would change the dataset's.
+def set_statistics(dataset_sha256: str, suite_of: Mapping[str, str], former: Mapping[str, Mapping[str, Any]]) -> None:
+    """Have all datasets of a suite normalised alike, and OFT's loader write what it computes to its cache folder.
 
-    OFT takes the file for another run's where sizes and counts are the same, so the manifest's hash goes into its name.
-    ``former`` statistics of a dataset take the place of its own; its counts, by which OFT weighs it, stay.
+    ``dataset_statistics_<hash>.json`` would change the dataset's files. OFT takes it for another run's where sizes and
+    counts are the same, so the manifest's hash goes into its name.
+
+    Args:
+        suite_of: dataset to suite.
+        former: suite to the statistics that take the place of a dataset's own; its counts, by which OFT weighs it,
+            stay. Without any, the first dataset of a suite gives those of the others.
     """
     # The module that calls the function; it has imported it by name.
     module: Any = importlib.import_module(f"{DATASETS}.dataset")
     compute = module.get_dataset_statistics
     folder = Path.home() / ".cache" / "orca"  # where OFT itself writes when it may not write to the dataset
     folder.mkdir(parents=True, exist_ok=True)
+    shared = dict(former)
 
     def get_dataset_statistics(dataset: Any, hash_dependencies: tuple[str, ...], save_dir: object = None) -> Any:
         own = compute(dataset, (*hash_dependencies, dataset_sha256), save_dir=str(folder))
         # OFT passes the folder of the dataset's version.
         name = Path(str(save_dir)).parent.name
-        if former and name not in former:
-            sys.exit(f"error: the given statistics have none for {name}\n  they have: {', '.join(former)}")
-        return {**own, **former.get(name, {})}
+        suite = suite_of.get(name, name)
+        if former and suite not in former:
+            sys.exit(f"error: the given statistics have none for {suite}\n  they have: {', '.join(former)}")
+        counts = {part: number for part, number in own.items() if part.startswith("num_")}
+        return {**shared.setdefault(suite, own), **counts}
 
     module.get_dataset_statistics = get_dataset_statistics
 
@@ -212,19 +244,21 @@ def prepare() -> None:
     dataset, training = recipe["dataset"], recipe["training"]
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--statistics", type=Path)
+    parser.add_argument("--mix", type=mixed, action="append", default=[])
     own, given = parser.parse_known_args()
-    suites = dataset["suites"]["value"]
+    added, suites = dict(own.mix), dataset["suites"]["value"]
+    suite_of = {name: suite for suite, name in suites.items()}
+    suite_of |= {name: name.removesuffix("_no_noops") for name in added}
     schedule = read_schedule(
         given, training["steps"]["value"], training["warmup_steps"]["value"], anew=own.statistics is not None
     )
     # OFT takes its constants (chunk of 8, 7 actions, 8 of proprioception) from the word "libero" among the arguments.
     # Of two values the last counts; a warm-up of OFT's own would undo the cosine, so there is none.
     sys.argv = [SCRIPT, *arguments(recipe), *given, "--lr_warmup_steps", "0"]
-    register(dataset["mixtures"]["value"])
+    register(dataset["mixtures"]["value"], added)
     name_statistics_by_suite(suites)
-    keep_statistics_elsewhere(
-        dataset["sha256"]["value"], statistics_of(own.statistics, suites) if own.statistics else {}
-    )
+    former = statistics_of(own.statistics, dict.fromkeys(suite_of.values())) if own.statistics else {}
+    set_statistics(dataset["sha256"]["value"], suite_of, former)
     set_optimiser(training["weight_decay"]["value"], schedule)
 
 

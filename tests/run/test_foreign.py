@@ -1,0 +1,49 @@
+"""What lies beside a run's sets, and is none of them, is named and never deleted."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from synthetic import episodes, write_lerobot, write_lerobot_v21, write_rlds
+
+from pipeline.config import Config
+from pipeline.errors import PipelineError
+from pipeline.formats.rlds import Rlds
+from pipeline.run.export import _bring_up_to_date
+
+PLAN = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
+CONFIG = Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}})
+
+
+@pytest.mark.parametrize("content", ["first", "second"], ids=["nothing to do", "another dataset to write"])
+def test_liberos_sets_beside_ours_are_refused_and_stay(content: str, tmp_path: Path) -> None:
+    target, elsewhere = write_rlds(tmp_path / "run"), tmp_path / "elsewhere"
+    target.folder.joinpath("libero_goal_no_noops", "1.0.0").mkdir(parents=True)
+    elsewhere.mkdir()
+    target.folder.joinpath("libero_10_no_noops").symlink_to(elsewhere)
+    before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
+    with pytest.raises(PipelineError, match=re.escape("rlds/libero_10_no_noops: not of this run's RLDS")) as error:
+        _bring_up_to_date(target, episodes(content=content), CONFIG)
+    assert "(2 such)" in str(error.value)
+    assert f"move it out of {target.folder}" in str(error.value)
+    assert {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("write", [write_lerobot, write_lerobot_v21])
+def test_another_lerobot_set_is_refused(write: Any, tmp_path: Path) -> None:
+    target = write(tmp_path)
+    (target.folder / "libero").mkdir()
+    with pytest.raises(PipelineError, match="not of this run's LeRobot"):
+        _bring_up_to_date(target, episodes(), CONFIG)
+    assert (target.folder / "libero").is_dir()
+
+
+def test_sets_of_the_run_are_no_foreign_ones(tmp_path: Path) -> None:
+    """Not those under a former name, nor where a damaged file has cost the record."""
+    target = write_rlds(tmp_path)
+    renamed = Rlds(tmp_path, target.options.model_copy(update={"name": "other"}))
+    _bring_up_to_date(renamed, episodes(), CONFIG)
+    renamed.record_file.unlink()
+    _bring_up_to_date(renamed, episodes(), CONFIG)
+    assert [path.name for path in renamed.folder.iterdir()] == ["other_spatial"]

@@ -1,0 +1,33 @@
+"""Datasets that were asked for once are named where the export leaves them as they are."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.config import Config
+from pipeline.run.cleaning import say_stale
+
+
+def said(data: Path, export: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> dict[str, list[str]]:
+    """Folder to the words that are said of it, by the stages of both parts."""
+    plan = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
+    config = Config.model_validate({"name": data.name, "folder": data.parent, "plan": plan, "export": export})
+    for part in ("rlds", "lerobot"):
+        say_stale(part, config)
+    words = [line.split() for line in capsys.readouterr().out.splitlines()]
+    return {str(Path(line[0]).relative_to(data)): line for line in words}
+
+
+def test_what_is_no_longer_asked_for_is_named_with_its_remedy(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = tmp_path / "mine"
+    for name in ("rlds", "lerobot", "lerobot_v21", "failures/rlds", "failures/lerobot"):
+        (data / name).mkdir(parents=True)
+    everything = {"lerobot_v21": {"convention": "ipec"}, "failures": True}
+    assert said(data, everything, capsys) == {}
+    assert said(data, {}, capsys).keys() == {"lerobot_v21", "failures/rlds", "failures/lerobot"}
+    found = said(data, everything | {"rlds": None}, capsys)
+    assert found.keys() == {"rlds", "failures/rlds"}
+    assert "clean --only rlds CONFIG" in " ".join(found["rlds"])
