@@ -8,14 +8,21 @@ import yaml
 class _EachKeyOnce(yaml.constructor.SafeConstructor):
     """Refuses a mapping with a repeated key, of which YAML's own constructor takes the last value."""
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        names = [key.value for key, _ in node.value]
-        for place, (key, _) in enumerate(node.value):
-            if key.value in names[:place]:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key.value!r} is given twice", key.start_mark
-                )
-        return super().construct_mapping(node, deep)
+    def construct_document(self, node: yaml.Node) -> Any:
+        # Before anything is constructed: a merge key (<<) then copies pairs from one mapping into another.
+        nodes, known = [node], {node}
+        for one in nodes:
+            pairs = one.value if isinstance(one, yaml.MappingNode) else []
+            names = [key.value for key, _ in pairs]
+            for place, (key, _) in enumerate(pairs):
+                if key.value in names[:place]:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"the key {key.value!r} is given twice", key.start_mark
+                    )
+            parts = one.value if isinstance(one, yaml.SequenceNode) else [part for pair in pairs for part in pair]
+            nodes += [part for part in dict.fromkeys(parts) if part not in known]
+            known.update(parts)
+        return super().construct_document(node)
 
 
 class StrictLoader(_EachKeyOnce, yaml.SafeLoader):
