@@ -1,5 +1,6 @@
 """YAML that a person wrote: plain values, and each key of a mapping once."""
 
+import re
 from typing import Any
 
 import yaml
@@ -26,8 +27,26 @@ class _EachKeyOnce(yaml.constructor.SafeConstructor):
 
 
 class StrictLoader(_EachKeyOnce, yaml.SafeLoader):
-    """What reads a person's YAML: plain values, and each key of a mapping once."""
+    """What reads a person's YAML: plain values, and each key of a mapping once.
+
+    Unlike YAML 1.1, ``yes``, ``off``, ``0123`` (octal 83) and ``1:30`` (90 in base 60) are text.
+    """
+
+
+StrictLoader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("bool", "true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("int", "[-+]?(0|[1-9][0-9]*)", "-+0123456789"),
+    (
+        "float",
+        r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
+    ("null", "~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("merge", "<<", "<"),
+):
+    StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"({_pattern})$"), list(_first))
 
 
 class FastStrictLoader(_EachKeyOnce, yaml.CSafeLoader):
-    """The same in C, for long files; what is nested thousands deep ends the process."""
+    """Each key once too, in C, for long files; what is nested thousands deep ends the process."""
