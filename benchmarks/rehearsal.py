@@ -75,7 +75,8 @@ def _recordings(task: Task, starter: StarterSource) -> Iterator[hdf5.Recording]:
     demo = starter.of(task)
     model_xml = demo.model_xml or shared(task).place_fixtures(0)
     for number in range(PUBLISHED):
-        actions = np.clip(demo.actions[:STEPS] + seeding.rng("rehearsal", number).normal(0, 0.01, (STEPS, 7)), -1, 1)
+        noise = seeding.rng("rehearsal", number).normal(0, [*[0.01] * 6, 0], (STEPS, 7))  # None on the gripper.
+        actions = np.clip(demo.actions[:STEPS] + noise, -1, 1)
         states = np.repeat(demo.init_state[None], STEPS, axis=0)
         yield hdf5.Recording(actions, states, np.zeros((STEPS, 9)), model_xml, {})
 

@@ -98,6 +98,10 @@ class GripperSpec(Frozen):
     open: float
     close: float
 
+    def others(self, commands: NDArray[np.floating]) -> set[float]:
+        """Those of some commands (T,) that, as datasets have them, are neither."""
+        return set(np.unique(commands.astype(np.float32)).tolist()) - {self.open, self.close}
+
 
 class ActionSpec(VectorSpec):
     """Controller input; ``unit_m`` and ``unit_rad`` are what an entry of 1 asks for."""

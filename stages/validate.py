@@ -1,7 +1,7 @@
 """Stage validate: reopen the datasets and the manifest, and stop where anything is off."""
 
 from pipeline.config import Config
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import write_json
 from pipeline.run import finished
 from pipeline.run.stage import main
@@ -27,7 +27,7 @@ def run(config: Config) -> None:
             f"{first['what']}; findings in all: {', '.join(f'{check} {len(found)}' for check, found in off.items())}",
             where=f"{first['dataset']} {first['episode'] or ''}".strip(),
             expected=first["expected"],
-            remedy=f"read {file}, correct the cause, and run `dvc repro` again",
+            remedy=f"read {file}, correct the cause, and run `{MAKE_AGAIN}` again",
         )
     finished.of_validate(config).keep()
     print(f"{len(report)} checks found nothing off, see {file}")

@@ -145,6 +145,15 @@ class Axis(Frozen):
         """
         raise NotImplementedError
 
+    def refuse_tested(self, test: TestSet, task: Task) -> None:
+        """Refuse a level of which no draw keeps clear of the test tasks, where the ranges tell.
+
+        Others would fill its place in a plan, and nothing would say so.
+
+        Raises:
+            PipelineError: naming component and level.
+        """
+
     def draw_level(self, rng: np.random.Generator) -> Level:
         return pick(rng, self.levels)
 

@@ -4,6 +4,7 @@ import re
 from typing import Literal, get_args
 
 from pipeline.axes.language_goal import changed_goal
+from pipeline.libero.tasks import debris
 from pipeline.types import Task
 
 Component = Literal["distraction", "common_sense", "reasoning_chain", "paraphrase"]
@@ -33,7 +34,6 @@ _PREAMBLE = re.compile(
     r"|\b(variation|variant|rewrite|rephrasing|paraphrase)s? (of|for)\b",
     re.IGNORECASE,
 )
-_DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|benchmark|hdf)\b", re.IGNORECASE)
 _MARK = re.compile(r"[^a-z ]")
 _WELL_FORMED = re.compile(r"[a-z]+(?:[,.?!;:]? [a-z]+|['-][a-z]+)*")
 
@@ -55,7 +55,7 @@ def lint(text: str, task: Task, component: Component) -> str | None:
         return "empty"
     if _PREAMBLE.search(text):
         return "preamble of a language model"
-    if _DEBRIS.search(text):
+    if debris(text):
         return "file-name debris"
     if not _WELL_FORMED.fullmatch(text):
         return "characters, spacing or punctuation other than of a lower-case sentence without its final full stop"

@@ -14,6 +14,7 @@ from pydantic import model_validator
 from pipeline import seeding
 from pipeline.axes.base import LEVELS, Axis, ByLevel, PixelPerturbation, pick
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
+from pipeline.errors import PipelineError
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.testset.definitions import Value
@@ -119,12 +120,37 @@ class NoiseAxis(Axis):
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
         """A component and a level, each with equal chance, whatever the task and the place."""
-        grids: tuple[ByLevel[Effect], ...] = (self.motion, self.gaussian, self.zoom, self.fog, self.glass)
-        grid = pick(rng, grids)
+        grid = pick(rng, self._grids)
         level = self.draw_level(rng)
         effect = grid[level - 1]
         seed = int(rng.integers(2**53))  # what every JSON reader keeps exactly
         return NoisePerturbation(component=effect.component, effect=effect, level=level, seed=seed)
+
+    @property
+    def _grids(self) -> tuple[ByLevel[Effect], ...]:
+        return self.motion, self.gaussian, self.zoom, self.fog, self.glass
+
+    def refuse_tested(self, test: TestSet, task: Task) -> None:
+        """Refuse a row that is too near to a severity of the benchmark: a level has no other draw.
+
+        Raises:
+            PipelineError: naming component and levels.
+        """
+        for grid in self._grids:
+            rows = [
+                NoisePerturbation(component=grid[level - 1].component, effect=grid[level - 1], level=level, seed=0)
+                for level in sorted({*self.levels})
+            ]
+            near = [row.level for row in rows if row.nearest(test, task).distance < row.clearance]
+            if near:
+                component, (name, _) = grid[0].component, grid[0].strength
+                tested = ", ".join(f"{value:g}" for value in _tested(test, component, name)[0])
+                raise PipelineError(
+                    f"{component} has test tasks as strong as the level {', '.join(map(str, near))}",
+                    where=f"plan.axes.noise.{component}",
+                    expected=f"{name} at least a quarter of the way from each of {tested}",
+                    remedy="change these rows, or leave these levels out of plan.axes.noise.levels",
+                )
 
     @classmethod
     def held_out(cls) -> NoiseAxis:

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import yaml
 
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.assets import REINSTALL, package_folder, relocate
@@ -266,6 +267,14 @@ class _Recorded(NamedTuple):
         if fault:
             expected = f"actions (T, 7) in [-1, 1] and states (T, S), all finite and none beyond {LARGEST_STATE:.0e}"
             raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.DOWNLOAD_AGAIN)
+        told = SCHEMA.action.gripper
+        if other := told.others(actions[:, 6]):
+            raise PipelineError(
+                f"the gripper is told {min(other):g}",
+                where=where,
+                expected=f"{told.open:g} (open) or {told.close:g} (close) as the last number of each action",
+                remedy="set each to the nearer of the two, or delete the demonstration",
+            )
         # Hash the model as recorded: relocated, it would differ from machine to machine.
         content = hashlib.sha256()
         for array in (actions, states):

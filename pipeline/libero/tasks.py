@@ -19,6 +19,10 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero
 Same = Literal["task", "scene"]
 """What two changes may have in common: the LIBERO task, or the scene that their tasks begin in."""
 
+_OF_FILES = ("scene", "suite", "libero", "bddl", "benchmark", "hdf", "demo")
+_DEBRIS = re.compile(rf"[_\d/\\]|\b({'|'.join(_OF_FILES)})\b", re.IGNORECASE)
+WITHOUT_DEBRIS = f"an instruction without digits, _, /, \\ and the words {', '.join(_OF_FILES)}, as of a file's name"
+
 OWN = Path("tasks")
 """Tasks of one's own: ``<suite>/<task>.bddl`` below this folder of the one that a run is started in, as workers are."""
 
@@ -48,14 +52,29 @@ def tasks(suite: str) -> tuple[Task, ...]:
     """A suite's tasks, in the order of LIBERO's list; those of one's own by name, with the instruction of their file.
 
     Raises:
-        PipelineError: when there is no such suite.
+        PipelineError: when there is no such suite, or one of one's own has an instruction that cannot be used.
     """
     if suite in SUITES:
         return _listed(suite)
     if suite not in suites():
         raise PipelineError(f"unknown suite {suite!r}", expected=" or ".join(suites()))
     files = sorted((OWN / suite).absolute().glob("*.bddl"))
-    return tuple(Task(suite, file.stem, bddl.read(file).language, file) for file in files)
+    own = tuple(Task(suite, file.stem, bddl.read(file).language, file) for file in files)
+    for task in own:
+        if found := debris(task.instruction):
+            raise PipelineError(
+                f"the instruction {task.instruction!r} has {found!r}",
+                where=task.bddl_file,
+                expected=WITHOUT_DEBRIS,
+                remedy="write numbers as words, and others in place of these, in (:language ...)",
+            )
+    return own
+
+
+def debris(instruction: str) -> str | None:
+    """What an instruction has only when it was made from a file's name; None where there is nothing."""
+    found = _DEBRIS.search(instruction)
+    return found and found[0]
 
 
 @cache

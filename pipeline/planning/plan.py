@@ -67,7 +67,7 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     perturbs one axis at a time, but so must each part of a combination keep clear.
 
     Raises:
-        PipelineError: when there is nothing to plan from for an axis.
+        PipelineError: when there is nothing to plan from for an axis, or a level of it has no draw that keeps clear.
     """
     by_task = grouped((demo.task, demo) for demo in demos)
     rows = [row for group in by_task.values() for row in twins(group, plan.seed, replay)]
@@ -80,6 +80,8 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
                 where=f"plan.episodes.{name}",
                 remedy="widen demos.tasks, or take it out of plan.episodes",
             )
+        for axis in draws.axes:
+            axis.refuse_tested(test, groups[0][0].task)
         # In an order of its own: or small numbers of all axes would come to the same tasks and demonstrations.
         order = sorted(groups, key=lambda group: digest(plan.seed, name, group[0].task.suite, group[0].task.name))
         more = order[: episodes % len(groups)]

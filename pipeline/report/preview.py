@@ -146,11 +146,12 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
     """Draws of the plan's that cover the axis's components, and within each component its levels.
 
     Raises:
-        PipelineError: when the axis has nothing to change in the task.
+        PipelineError: when the axis has nothing to change in the task, or a level has no draw that keeps clear.
     """
     if not axis.applies(demo.task):
         what = f"the axis {name} has nothing to change in {demo.task}"
         raise PipelineError(what, remedy="choose another task or another axis")
+    axis.refuse_tested(test, demo.task)
     draws = Draws(name, (axis,), seed, test).of(demo.demo_id, demo.task)
     left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
     chosen: list[Perturbation] = []

@@ -1,6 +1,5 @@
 """What must hold of an episode wherever it lies: small functions, each with a name, that yield what is off."""
 
-import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -12,7 +11,7 @@ from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
 from pipeline.formats.read_back import Copy, Fault, sampled
-from pipeline.libero.tasks import find_task
+from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.types import Frame
 from pipeline.validation.case import Case
@@ -38,9 +37,6 @@ BLANK_LEVELS = 5.0
 AGAINST_M = 0.03
 """How far the fingers may move, in sum, against the command: pressed on the stove's knob, they moved 0.015 m; the other
 way round, 49 episodes moved 0.05 m and more with it."""
-
-DEBRIS = re.compile(r"[_\d/\\]|\b(scene|suite|libero|bddl|demo)", re.IGNORECASE)
-"""What an instruction has only when it was made from a file's name."""
 
 
 def _grey_psnr_db(one: Frame, other: Frame) -> float:
@@ -124,8 +120,8 @@ def wording(case: Case) -> Iterator[Fault]:
             yield case.finding("manifest", f"rewrite {drawn.text!r} is not in the bank", f"one for {task.name}")
     if text != expected:
         yield case.finding("manifest", f"instruction {text!r}", repr(expected))
-    if debris := DEBRIS.search(text):
-        yield case.finding("manifest", f"instruction {text!r}", f"a sentence without {debris[0]!r}")
+    if found := debris(text):
+        yield case.finding("manifest", f"instruction {text!r} has {found!r}", WITHOUT_DEBRIS)
 
 
 def provenance(case: Case) -> Iterator[Fault]:
@@ -208,7 +204,7 @@ def gripper(case: Case) -> Iterator[Fault]:
     told = SCHEMA.action.gripper
     for copy in case.whole:
         command, state = copy.episode.action[:, 6], copy.episode.state
-        if other := set(np.unique(command).tolist()) - {told.open, told.close}:
+        if other := told.others(command):
             yield case.finding(copy.dataset, f"gripper command {min(other)}", f"{told.open} or {told.close}")
         gap = state[:, 6] - state[:, 7]
         opened = float((np.sign(command[:-1] * told.open) * np.diff(gap)).sum())

@@ -77,7 +77,8 @@ def _task_of(file: Path, root: Path) -> Task:
     try:
         return find_task(suite, name[0].removesuffix("_demo.hdf5"))
     except PipelineError as error:
-        raise PipelineError(error.what, where=file, expected=error.expected, remedy="move or rename it") from error
+        remedy = error.remedy or "move or rename it"
+        raise PipelineError(error.what, where=error.where or file, expected=error.expected, remedy=remedy) from error
 
 
 _Result = tuple[Sequence[DemoEntry], Found]

@@ -93,7 +93,7 @@ def good() -> hdf5.Recording:
 def root(good: hdf5.Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One task's file: the first and the last demonstration are good, the others are those of ``BAD``."""
     root = tmp_path_factory.mktemp("bad")
-    last = replace(good, actions=good.actions * 0.99)
+    last = replace(good, actions=good.actions * [*[0.99] * 6, 1.0])
     recordings = [good, *(spoil(good) for spoil, _, _ in BAD.values()), last]
     hdf5.write(root / STOVE.suite / f"{STOVE.name}_demo.hdf5", STOVE, recordings)
     return root
