@@ -6,11 +6,11 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict
 
 if TYPE_CHECKING:
     import mujoco
@@ -24,32 +24,10 @@ Extra = Literal[RenderedExtra, "outcome"]
 """What a dataset has beside the frames; ``outcome``, that of failures says of each episode why it is one."""
 
 
-def _has_boolean(value: Any) -> bool:
-    """Whether it is a boolean, or a list with one in it at any depth."""
-    parts, known = [value], set()
-    for part in parts:
-        # YAML's aliases can make one list occur without end: it is looked into once.
-        if isinstance(part, list | tuple) and id(part) not in known:
-            known.add(id(part))
-            parts += part
-    return any(isinstance(part, bool) for part in parts)
-
-
 class Frozen(BaseModel):
-    """A record that cannot change, and refuses unknown fields, numbers that are not finite and booleans as numbers."""
+    """A record that cannot change and refuses fields it does not know, and numbers that are not finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _no_boolean_as_number(cls, raw: Any) -> Any:
-        for name, known in cls.model_fields.items() if isinstance(raw, Mapping) else ():
-            value = raw.get(name)
-            if get_origin(known.annotation) is dict and isinstance(value, Mapping):
-                value = [*value.values()]
-            if known.annotation is not bool and _has_boolean(value):
-                raise ValueError(f"{name}: expected no boolean")
-        return raw
 
 
 Place = Annotated[Path, AfterValidator(Path.expanduser)]
