@@ -1,6 +1,5 @@
 """Table and plot of the results: success by axis and arm, paired differences, and which goals instructions reach."""
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from itertools import chain, combinations
@@ -11,11 +10,11 @@ from results import PolicyResults, read
 
 from pipeline.evaluation.results import EpisodeResult, Trial
 from pipeline.evaluation.statistics import Pair, compare, paired, success_rate, wilson
-from pipeline.files import replaced
+from pipeline.files import replaced, write
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
-SECTION = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end of the table -->)", re.DOTALL)
-"""The part of docs/effect.md that ``publish`` writes."""
+FURTHER = Path(__file__).with_name("further") / "results"
+"""A folder of results for each further experiment."""
 
 LINES = {"clean": "LIBERO's own", "robot": "robot", "language": "language", "pose": "pose", "camera": "camera, noise"}
 LINE_OF = {axis: axis for axis in LINES} | {"noise": "camera"}
@@ -187,11 +186,22 @@ def plot(results: Sequence[PolicyResults], file: Path) -> None:
 
 
 def publish(folder: Path, docs: Path = DOCS) -> str:
-    """Write the table of a folder's results into docs/effect.md, and the plot beside it; returns the table."""
+    """Write the table of a folder's results into docs/effect.md, and the plot beside it; returns the table.
+
+    Those of the further experiments go into docs/decisions.md.
+    """
     results = read(folder)
     text = markdown(results) + "\n![success by tests and arm](effect.svg)\n"
     plot(results, docs / "effect.svg")
-    page = docs / "effect.md"
-    with replaced(page) as temporary:
-        temporary.write_text(SECTION.sub(lambda _: text, page.read_text()))
+    _write(docs / "effect.md", "table", text)
+    for further in sorted(FURTHER.iterdir()):
+        _write(docs / "decisions.md", further.name, markdown(read(further)))
     return text
+
+
+def _write(page: Path, name: str, text: str) -> None:
+    """Replace what stands between two marks of a page."""
+    before, _, rest = page.read_text().partition(f"<!-- {name} -->\n")
+    _, end, after = rest.partition(f"<!-- end of {name} -->")
+    assert end, f"{page} has no marks of {name}"
+    write(page, f"{before}<!-- {name} -->\n{text}{end}{after}")
