@@ -74,14 +74,12 @@ def test_the_same_draw_gives_the_same_scene(three: LayoutPerturbation, base: Sce
 
 
 def test_the_level_is_the_number_of_objects() -> None:
-    seeds = set()
     for level in (1, 2, 3, 4, 5):
-        drawn = LayoutAxis(levels=(level,)).sample(seeding.rng(level), PLATE, 0)
-        seeds.add(drawn.seed)
-        assert (drawn.level, len(drawn.objects)) == (level, level)
-        areas_m2 = [models(LayoutAxis().sources)[one.name].shape.footprint_m2 for one in drawn.objects]
-        assert max(areas_m2) <= 0.12 / level, "the more, the smaller"
-    assert len(seeds) == 5, "each has places of its own"
+        drawn = [LayoutAxis(levels=(level,)).sample(seeding.rng(level, key), PLATE, 0) for key in range(20)]
+        assert {(one.level, len(one.objects)) for one in drawn} == {(level, level)}
+        assert len({one.seed for one in drawn}) == 20, "each has places of its own"
+        models_of = [models(LayoutAxis().sources)[added.name] for one in drawn for added in one.objects]
+        assert max(model.shape.footprint_m2 for model in models_of) <= 0.12 / level, "the more, the smaller"
 
 
 def test_added_objects_are_among_what_a_rollout_met(changed: Scene) -> None:
