@@ -60,13 +60,13 @@ def test_the_further_round_changes_the_policy_alone(shipped: Experiment) -> None
     assert not further["no_state"].training.proprioception
     for name, experiment in further.items():
         kept = results.read(EFFECT / "further" / "results" / name)
-        assert [(one.arm, one.seed, len(one.rows), len(one.black)) for one in kept] == [
+        assert [(made.arm, made.seed, len(made.rows), len(made.black)) for made in kept] == [
             ("clean", 0, 244, 60),
             ("ours", 0, 244, 60),
         ]
-        for one in kept:
-            assert one.settings["policy"] == experiment.policy
-            assert one.settings["training"].get("proprioception", True) == experiment.training.proprioception
+        for made in kept:
+            assert made.settings["policy"] == experiment.policy
+            assert made.settings["training"].get("proprioception", True) == experiment.training.proprioception
 
 
 def test_the_arms_for_gpus_are_those_of_the_experiment(shipped: Experiment) -> None:
