@@ -234,12 +234,12 @@ def _strongest(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
         try:
             (frame,) = stage.frames(["image"], perturbation)
         except RefusedError as refused:
-            tile = _refused(refused, caption)
+            last = refused, caption
         else:
             for text in of_layer((perturbation,), TextPerturbation):
                 caption += f": {text.apply(stage.demo.task.instruction)}"
             return Tile(Image.fromarray(frame), caption)
-    return tile
+    return _refused(*last)
 
 
 def _refused(why: RefusedError, caption: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:

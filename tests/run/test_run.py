@@ -219,15 +219,15 @@ def test_a_full_disk_leaves_what_a_stage_wrote_before(
     stage: str, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clone = Path(shutil.copytree(finished.parent.parent, tmp_path / "clone", symlinks=True))
-    report, write = json.loads((finished / "validation.json").read_text()), Path.write_text
+    report, write = json.loads((finished / "validation.json").read_text()), Path.write_bytes
 
-    def half(file: Path, text: str) -> None:
-        write(file, text[: len(text) // 2])
+    def half(file: Path, content: bytes) -> None:
+        write(file, content[: len(content) // 2])
         raise OSError(errno.ENOSPC, "No space left on device", str(file))
 
     shutil.rmtree(clone / "data" / "tiny" / FOLDER)  # Or validate would have nothing to do.
     monkeypatch.chdir(clone)
-    monkeypatch.setattr(Path, "write_text", half)
+    monkeypatch.setattr(Path, "write_bytes", half)
     # How long it takes is no subject here.
     monkeypatch.setattr("pipeline.validation.validate.validate", lambda *_: report)
     run = runpy.run_path(str(REPOSITORY / "stages" / f"{stage}.py"))["run"]
