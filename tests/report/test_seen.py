@@ -1,8 +1,10 @@
 """What a policy sees in a run beside the benchmark's test tasks: no kind of test is missing, and the figures are so."""
 
 import json
+import math
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 from conftest import MILK, REPOSITORY
@@ -79,6 +81,34 @@ def test_a_thing_of_a_pose_test_is_as_far_as_its_nearest_place() -> None:
     assert [cm for _, cm in seen.to_nearest_test(test)] == pytest.approx([between_cm.min(), 0, 2, 0, 2, 0])
 
 
+def test_what_a_test_shows_is_measured_in_its_own_scene() -> None:
+    """0.3 m along x is on the camera's side, from 0.19 m on; the camera stands 0.36 m further, and 0.71 m above."""
+    places = {"positions": "0.3,0;-0.1,0.2", "category": "ketchup,ketchup", "arena": "tabletop"}
+    added = [*seen._of_test(TestTask(MILK.suite, MILK.name, "a", "layout", "objects", places))]
+    assert [shown for what, shown in added if what == "layout: object on the camera's side"] == [True, False]
+    away_m = [shown for what, shown in added if what == "layout: object to camera (m)"]
+    assert away_m == pytest.approx([math.hypot(0.36, 0.71), math.hypot(0.76, 0.2, 0.71)])
+    moved = {"moves": "milk_1:0.03,-0.04;basket_1:1,1", "level": 2}
+    (shift,) = seen._of_test(TestTask(MILK.suite, MILK.name, "b", "pose", "pose", moved))
+    assert shift == ("pose: target of libero_object moved, level 2 (cm)", pytest.approx(5))
+
+
+def test_a_look_has_the_speeds_of_the_hand_and_of_the_fastest_object() -> None:
+    """The hand slides at 0.3 m/s and turns about itself, a finger is 4 cm from the other, one of two things moves."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody>
+        <body><joint type="slide" axis="0 0 1"/><joint axis="1 0 0"/><geom size="0.1"/><site name="gripper0_grip_site"/>
+        <body><joint name="gripper0_finger_joint1" type="slide"/><geom size="0.1"/></body>
+        <body><joint name="gripper0_finger_joint2" type="slide"/><geom size="0.1"/></body></body>
+        <body pos="1 0 0"><freejoint/><geom size="0.1"/></body><body pos="2 0 0"><freejoint/><geom size="0.1"/></body>
+        </worldbody></mujoco>"""
+    )
+    at, moving = model.qpos0.copy(), np.zeros(model.nv)
+    at[2:4], moving[:2], moving[-6:] = (0.03, -0.01), (0.3, 2.0), (0.3, 0.4, 0, 5, 5, 5)
+    measured = seen.Look.of(model, np.hstack([0.0, at, moving])).measures()
+    assert [*measured.values()] == pytest.approx([40, 30, 50])
+
+
 def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(finished.parents[1])
     config = load(Path("configs/tiny.yaml"))
@@ -99,6 +129,8 @@ def test_a_finished_run_is_measured(finished: Path, test: TestSet, monkeypatch: 
     assert 77 < gripper.tested.middle < 78
     noisy = {row["component"] for row in rows if row["axis"] == "noise"}
     assert {what.split()[0] for (axis, what), one in measures.items() if axis == "noise" and one.ours} == noisy
+    grey = [one.ours for (axis, _), one in measures.items() if axis == "noise" and isinstance(one.ours, seen.Spread)]
+    assert all(one.low > 1 for one in grey), "the wrist view is as it was"
     words = measures["language", "words"]
     assert words.ours is not None
     assert words.ours.number == sum(row["axis"] == "language" for row in rows)

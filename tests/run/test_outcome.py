@@ -1,0 +1,75 @@
+"""The manifest's row of an episode says what its own replay and frames came to, and not what another's did."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from conftest import BOWL
+
+from pipeline.axes import Axes
+from pipeline.axes.noise import NoiseAxis
+from pipeline.axes.robot import RobotAxis
+from pipeline.config import PlanConfig, ReplayConfig
+from pipeline.export_config import Where
+from pipeline.libero.demonstrations import DemoEntry
+from pipeline.planning import plan
+from pipeline.planning.streams import streams_of
+from pipeline.run import manifest
+from pipeline.run.outcome import Outcome
+from pipeline.stores.frame_store import Shown
+from pipeline.testset.benchmark import TestSet
+from pipeline.types import Verdict
+
+
+@pytest.fixture(scope="module")
+def run() -> Outcome:
+    """A twin, and noise on its frames and another start of the robot, whose frames were rejected; each with one in
+    reserve."""
+    wanted = PlanConfig(
+        seed=0, axes=Axes(noise=NoiseAxis(), robot=RobotAxis()), episodes={"noise": 1, "robot": 1}, reserve=1.0
+    )
+    rows = plan.make([DemoEntry(BOWL, "demo_0", "", "human", "0", steps=100)], wanted, ReplayConfig(), TestSet(()))
+    twin, noise, _, robot, _ = rows
+    told = {"mode": "open_loop", "steps": 90, "resolved": "{}", "path_m": 0.5}
+    shown = {one.stream_id for row in (twin, noise) for one in streams_of(row.perturbations).values()}
+    return Outcome(
+        rows,
+        {twin.trajectory_id: told, robot.trajectory_id: told | {"mode": "tracked", "steps": 120, "path_m": 0.75}},
+        {
+            twin.trajectory_id: Shown("", "a GPU", "open_loop", shown),
+            robot.trajectory_id: Shown("", "a GPU", "tracked", rejected={"a stream": "too_dark"}),
+        },
+        {row.episode_id: Verdict(row.wanted, "kept" if row.wanted else "reserve_not_needed") for row in rows}
+        | {robot.episode_id: Verdict(False, "too_dark")},
+    )
+
+
+def table(run: Outcome, where: Where | None = None) -> list[Mapping[str, Any]]:
+    rows: list[Mapping[str, Any]] = manifest.build(run, {}, [], where).to_pylist()
+    return rows
+
+
+def test_each_row_has_what_its_own_trajectory_and_frames_came_to(run: Outcome) -> None:
+    names = ("axis", "replay_mode", "steps", "path_ratio", "gl_device")
+    nothing = [None] * 4
+    assert [[row[name] for name in names] for row in table(run)] == [
+        ["clean", "open_loop", 90, 1.0, "a GPU"],
+        ["noise", "open_loop", 90, 1.0, "a GPU"],
+        ["noise", *nothing],
+        ["robot", "tracked", 120, 1.5, None],
+        ["robot", *nothing],
+    ]
+
+
+def test_only_what_the_export_names_counts_as_chosen(run: Outcome) -> None:
+    assert all(row["chosen"] for row in table(run))
+    assert {row["axis"] for row in table(run, Where(axis=("robot",))) if row["chosen"]} == {"robot"}
+
+
+@pytest.mark.parametrize("change", [{"device": "another"}, {"made_by": "another"}, {"replay_mode": "tracked"}])
+def test_other_frames_are_another_content(run: Outcome, change: dict[str, str]) -> None:
+    """By which a dataset is made anew."""
+    noise = run.rows[1]
+    frames = {name: replace(shown, **change) for name, shown in run.frames.items()}  # type: ignore[arg-type]
+    assert replace(run, frames=frames).content(noise.episode_id) != run.content(noise.episode_id)
