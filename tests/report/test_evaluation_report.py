@@ -21,6 +21,7 @@ from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.images.mp4 import mp4
 from pipeline.report import evaluation_report
 from pipeline.report.evaluation_findings import FAILURES, paper_table
+from pipeline.testset import benchmark
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +59,18 @@ def test_all_tasks_of_a_column_weigh_the_same() -> None:
     assert line["cells"]["camera"]["rate"] == pytest.approx(133 / 1599)
     assert line["cells"]["camera"]["effective"] == pytest.approx(1599)
     assert line["cells"]["camera"]["absent"] == ""
+
+
+def test_a_total_weighs_each_column_by_its_tasks() -> None:
+    """Of each kind and level one test: all with another camera are solved, and nothing else is."""
+    tests = {(one.axis, one.component, one.level): one for one in benchmark.load().tasks}.values()
+    tasks = [
+        EvaluationTask("libero_plus", one.suite, one.base, one.name, one.axis, one.component, one.level, 0)
+        for one in tests
+    ]
+    (line,) = paper_table({"mine": [result(task, task.axis == "camera", "mine") for task in tasks]})["evaluated"]
+    assert line["total"]["rate"] == pytest.approx(1599 / 10_030)
+    assert line["total"] == line["shared"]
 
 
 def test_a_column_says_what_it_does_not_rest_on() -> None:
@@ -249,6 +262,7 @@ def test_policies_of_different_episodes_are_said_to_be(subset: list[EvaluationTa
     evaluation_report.write(read([one, other]), tmp_path / "report.html")
     words = " ".join(Page((tmp_path / "report.html").read_text()).text.split())
     assert "The policies did not run the same episodes" in words[: words.index("Beside published models")]
+    assert "15 are common to all" in words
 
 
 @pytest.mark.slow  # as setup.sh installs the browser for all tests only

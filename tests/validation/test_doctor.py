@@ -160,6 +160,8 @@ def test_memory_is_counted_for_the_workers_that_are_asked_for(
     for workers, warned in ((4, False), (5, True)):
         run_doctor("starter", monkeypatch, free_gb=1, compute=ComputeConfig(workers=workers))
         assert ("warn  machine" in capsys.readouterr().err) == warned
+    # 15 GB are four times 3.5 GB.
+    assert doctor._machine(ComputeConfig(workers=5)).remedy == "set compute.workers to 4"
 
 
 def test_the_configuration_that_params_name_is_looked_at(

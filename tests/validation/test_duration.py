@@ -46,6 +46,17 @@ def test_maps_are_rendered_where_something_else_is_seen_and_only_what_is_exporte
     assert needed_mb(some)["frames"] == needed_mb(config)["frames"]
 
 
+def test_room_is_asked_for_reserves_too() -> None:
+    """Each that is replayed is another trajectory: as many again as the episodes that are wanted."""
+
+    def trajectories_mb(robot: int, reserve: float) -> float:
+        config = planned(noise=1, robot=robot)
+        plan = config.plan.model_copy(update={"reserve": reserve})
+        return needed_mb(config.model_copy(update={"plan": plan}))["trajectories"]
+
+    assert trajectories_mb(100, 1.0) == pytest.approx(trajectories_mb(200, 0.0))
+
+
 def test_it_follows_the_machine() -> None:
     here = needed_s(STARTER, REFERENCE)
     gpu = needed_s(STARTER, Speed(REFERENCE.step_s, 0.0015, gpus=1))
