@@ -4,6 +4,7 @@ import hashlib
 from itertools import product
 from statistics import mean, mode
 
+import cv2
 import mujoco
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from pipeline.axes.background import PARTS, BackgroundAxis, BackgroundPerturbati
 from pipeline.axes.base import Level
 from pipeline.catalogue import procedural
 from pipeline.catalogue.data_maps import DATA_MAPS
-from pipeline.catalogue.textures import IN_TEST_SET, catalogue
+from pipeline.catalogue.textures import IN_TEST_SET, catalogue, pixels
 from pipeline.errors import PipelineError
 from pipeline.libero.assets import package_folder
 from pipeline.rendering.renderer import Renderer
@@ -157,6 +158,25 @@ def test_what_is_in_its_own_colours_is_the_image_as_it_is() -> None:
         else:
             assert 39 < model.tex_data.mean() < 206
             assert np.corrcoef(model.tex_data, image.ravel())[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(("material", "repeats"), [("table_texture", 1), ("living_room_table", 2), ("desk", 4)])
+def test_a_modelled_table_has_the_image_more_often_as_its_top_is_a_small_piece_of_its_skin(
+    material: str, repeats: int
+) -> None:
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><asset><texture name="t" type="2d" builtin="flat" width="512" height="512"/>
+        <material name="{material}" texture="t"/></asset>
+        <worldbody><geom type="plane" size="1 1 1" material="{material}"/></worldbody></mujoco>"""
+    )
+    wood = catalogue(("robosuite",))["robosuite:wood-tiles.png"]
+    covering = Covering(part="surface", texture=wood.name, licence=wood.licence, sha256=wood.sha256)
+    BackgroundPerturbation(component="surface", level=5, coverings=(covering,), colour_scale=1).apply(model)
+    side = 512 // repeats
+    resized = cv2.resize(pixels(wood.name, wood.sha256), (side, side), interpolation=cv2.INTER_AREA)
+    image = np.asarray(resized, float).ravel()
+    for tile in model.tex_data.reshape(repeats, side, repeats, side, 3).swapaxes(1, 2).reshape(-1, image.size):
+        assert np.corrcoef(tile, image)[0, 1] > 0.99
 
 
 def test_only_what_procedural_offers_is_a_data_map() -> None:

@@ -84,6 +84,8 @@ def test_the_four_properties_mostly_change_together() -> None:
     tints = [one.diffuse_scale_rgb for one in draws if len({*one.diffuse_scale_rgb}) > 1]
     for brightest in range(3):
         assert sum(np.argmax(tint) == brightest for tint in tints) == pytest.approx(len(tints) / 3, abs=50)
+    azimuths_deg = [one.tilt_azimuth_deg for one in draws if one.tilt_deg]
+    assert np.percentile(azimuths_deg, [10, 50, 90]) == pytest.approx([148.5, 202.5, 256.5], abs=5)
 
 
 @pytest.mark.parametrize(
@@ -128,6 +130,16 @@ def test_no_recorded_brightness_is_lost_in_shadows() -> None:
     scales = sorted(shown)
     assert len(scales) > 30
     assert all(shown[low] < shown[high] for low, high in pairwise(scales))
+
+
+@pytest.mark.parametrize(("directional", "left"), [("false", 0.8), ("true", 0.4)])
+def test_a_third_lamp_dims_the_others_where_it_lights_the_whole_room(directional: str, left: float) -> None:
+    """Spot lamps light a part each, and at 0.8 stay; a directional one adds its 0.8 to that of each: 1.6, of which half
+    is 0.8."""
+    third = f'<light directional="{directional}" diffuse=".8 .8 .8"/></worldbody>'
+    model = mujoco.MjModel.from_xml_string(LAMPS.replace("</worldbody>", third))
+    NEUTRAL.apply(model)
+    assert model.light_diffuse == pytest.approx(np.full((3, 3), left))
 
 
 @pytest.mark.slow
