@@ -37,6 +37,8 @@ def test_v21_has_the_conventions_names_and_gripper(convention: str, tmp_path: Pa
     tasks = {line["task_index"]: line["task"] for line in lines["tasks"]}
     assert (info["codebase_version"], info["fps"], info["total_episodes"]) == ("v2.1", 20, len(IDS))
     assert info["total_frames"] == sum(len(episode(one)) for one in IDS)
+    videos = {"ipec": 2 * len(IDS), "openpi": 0}
+    assert (info["total_chunks"], info["total_videos"]) == (1, videos[convention])
     before = 0
     for index, source in enumerate(map(episode, IDS)):
         place = {"episode_chunk": 0, "episode_index": index}

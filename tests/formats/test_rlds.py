@@ -1,6 +1,7 @@
 """RLDS has OpenVLA's features and the very bytes of every frame, as TensorFlow and TFDS read it."""
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -114,6 +115,19 @@ def test_rlds_holds_the_episodes(written: Written) -> None:
         len(record) for shard in stored.values() for record in shard
     )
     assert "tensorflow" not in sys.modules
+
+
+def test_a_set_with_an_episode_too_many_or_a_foreign_shard_is_found(tmp_path: Path) -> None:
+    target = write_rlds(tmp_path)
+    places = target.record().places
+    assert list(target.check(places, tmp_path)) == []
+    ((check, fault),) = target.check({one: places[one] for one in IDS[1:]}, tmp_path)
+    assert (check, fault.what) == ("ids", "has 6 episodes, foreign ones or some twice")
+    (shard, *_) = sorted(target.folder.rglob("*.tfrecord-*"))
+    shutil.copy(shard, shard.with_name(f"{SET}-train.tfrecord-00003-of-00003"))
+    assert ("format", True) in [
+        (check, "00003-of-00003" in fault.what) for check, fault in target.check(places, tmp_path)
+    ]
 
 
 @pytest.mark.slow
