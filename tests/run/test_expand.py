@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import STOVE, link_testset, starter_demo
 from machine_paths import told
+from scipy.spatial.transform import Rotation
 
 from pipeline.__main__ import main
 from pipeline.compute.pool import loop, runner
@@ -51,6 +52,8 @@ def test_as_many_as_asked_for_in_liberos_layout(expanded: tuple[Path, Expansion]
             robot, seen = np.array(demo["robot_states"]), demo["obs"]
             np.testing.assert_array_equal(robot[:, :2], seen["gripper_states"])
             np.testing.assert_array_equal(robot[:, 2:5], seen["ee_pos"])
+            turned = Rotation.from_quat(robot[:, 5:]) * Rotation.from_rotvec(seen["ee_ori"]).inv()
+            np.testing.assert_allclose(turned.magnitude(), 0, atol=1e-3)
 
 
 def test_the_command_tells_what_is_short_and_fails_where_nothing_was_made(
@@ -178,6 +181,17 @@ def test_a_reserve_takes_the_place_of_one_that_starts_like_another(
     shutil.copytree(at_resets.parents[1] / ".replays", tmp_path / ".replays")
     made = expand(tmp_path, TASKS, resets(TASKS, 2, 1), 2, loop)
     assert (made.written, made.dropped) == (1, {"duplicate": 2})
+
+
+def test_what_is_rougher_than_the_human_is_dropped(
+    at_resets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here whatever takes longer than a tenth of the human's steps."""
+    monkeypatch.setattr("pipeline.run.expand.ROUGH", {"steps": 0.1})
+    monkeypatch.setattr("pipeline.run.expand.RESERVE", 0.0)
+    shutil.copytree(at_resets.parents[1] / ".replays", tmp_path / ".replays")
+    made = expand(tmp_path, TASKS, resets(TASKS, 2, 1), 2, loop)
+    assert (made.written, made.dropped) == (0, {"not_smooth": 2})
 
 
 @pytest.mark.parametrize("attrs", [{}, {hdf5.EXPANDED_FROM: "libero_goal/turn_on_the_stove/demo_0"}])
