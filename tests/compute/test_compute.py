@@ -1,6 +1,7 @@
 """Work spread over processes: the same results in the same order, and a worker's error as it was raised."""
 
 import os
+import re
 import resource
 import socket
 import subprocess
@@ -18,6 +19,7 @@ from distributed import Nanny
 
 from pipeline import gl
 from pipeline.compute.pool import TRIES, Expendable, loop, runner
+from pipeline.compute.progress import progress_of
 from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 
@@ -207,3 +209,13 @@ def test_only_replay_and_render_load_the_simulator() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_a_log_says_how_long_what_is_left_takes(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress_of("frames", 10) as advance:
+        time.sleep(0.6)
+        advance(9)
+    # At nine in 0.6 s, the tenth takes 0.07 s; all ten would take 0.7.
+    told = re.fullmatch(r"frames: 9/10, (\d+\.\d\d)/s, 0 s left\n", capsys.readouterr().err)
+    assert told
+    assert float(told[1]) <= 15
