@@ -88,9 +88,10 @@ def test_what_a_test_shows_is_measured_in_its_own_scene() -> None:
     assert [shown for what, shown in added if what == "layout: object on the camera's side"] == [True, False]
     away_m = [shown for what, shown in added if what == "layout: object to camera (m)"]
     assert away_m == pytest.approx([math.hypot(0.36, 0.71), math.hypot(0.76, 0.2, 0.71)])
-    moved = {"moves": "milk_1:0.03,-0.04;basket_1:1,1", "level": 2}
-    (shift,) = seen._of_test(TestTask(MILK.suite, MILK.name, "b", "pose", "pose", moved))
-    assert shift == ("pose: target of libero_object moved, level 2 (cm)", pytest.approx(5))
+    moved: dict[str, str | int] = {"moves": "milk_1:0.03,-0.04;basket_1:1,1", "level": 2}
+    ((what, shift_cm),) = seen._of_test(TestTask(MILK.suite, MILK.name, "b", "pose", "pose", moved))
+    assert what == "pose: target of libero_object moved, level 2 (cm)"
+    assert shift_cm == pytest.approx(5)
 
 
 def test_a_look_has_the_speeds_of_the_hand_and_of_the_fastest_object() -> None:
