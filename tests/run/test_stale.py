@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from pipeline.config import Config
-from pipeline.run.cleaning import say_stale
+from pipeline.run.cleaning import found, say_stale
 
 
 def said(data: Path, export: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> dict[str, list[str]]:
@@ -28,6 +28,14 @@ def test_what_is_no_longer_asked_for_is_named_with_its_remedy(
     everything = {"lerobot_v21": {"convention": "ipec"}, "failures": True}
     assert said(data, everything, capsys) == {}
     assert said(data, {}, capsys).keys() == {"lerobot_v21", "failures/rlds", "failures/lerobot"}
-    found = said(data, everything | {"rlds": None}, capsys)
-    assert found.keys() == {"rlds", "failures/rlds"}
-    assert "clean --only rlds CONFIG" in " ".join(found["rlds"])
+    stale = said(data, everything | {"rlds": None}, capsys)
+    assert stale.keys() == {"rlds", "failures/rlds"}
+    assert "clean --only rlds CONFIG" in " ".join(stale["rlds"])
+
+
+def test_parts_that_are_there_have_their_megabytes(tmp_path: Path) -> None:
+    for name, size in (("frames/one/file.h5", 2_500_000), ("frames/two/file.h5", 500_000), ("plan.parquet", 1000)):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(size)
+    assert found(tmp_path, ("rlds", "frames", "tables")) == {"frames": 3.0, "tables": 0.001}

@@ -1,6 +1,7 @@
 """The test set is read whole and right from the pinned wheel, and from no other file."""
 
 import math
+import re
 import shutil
 import zipfile
 from collections import Counter
@@ -152,6 +153,11 @@ def test_parameters_are_those_the_benchmark_was_measured_to_have(test: TestSet) 
             "libero_goal", "open_the_middle_drawer_of_the_cabinet", "_light_1", "light", "unknown",
             {"prefix": "tabletop", "number": 187},
         ),
+        (
+            "libero_spatial", "pick_up_the_black_bowl_between_the_plate_and_the_ramekin_and_place_it_on_the_plate",
+            "_add_5", "layout", "objects",
+            {"arena": "tabletop", "count": 1, "category": "can_of_soda__1", "positions": "0.25,0"},
+        ),
     ],
 )  # fmt: skip
 def test_known_tasks(
@@ -162,6 +168,21 @@ def test_known_tasks(
     assert task.parameters == parameters
     assert task in test.of(axis)
     assert task in test.on(find_task(suite, base), axis)
+
+
+def test_a_thing_moves_from_its_place_in_liberos_file_to_that_in_the_benchmarks(test: TestSet) -> None:
+    def centre_m(text: str) -> tuple[float, float]:
+        (ranges,) = re.findall(r"\(plate_region\s+\(:target main_table\)\s+\(:ranges \(\s+\(([^)]*)\)", text)
+        low_x, low_y, high_x, high_y = map(float, ranges.split())
+        return (low_x + high_x) / 2, (low_y + high_y) / 2
+
+    moved = next(task for task in test.of("pose") if task.suite == "libero_spatial")
+    with zipfile.ZipFile(FOLDER / benchmark.WHEEL) as archive:
+        theirs = archive.read(f"liberoplus/liberoplus/bddl_files/{moved.suite}/{moved.name}.bddl").decode()
+    (x_m, y_m), (new_x_m, new_y_m) = map(centre_m, (find_task(moved.suite, moved.base).bddl_file.read_text(), theirs))
+    moves = dict(pair.split(":") for pair in str(moved.parameters["moves"]).split(";"))
+    assert [float(n) for n in moves["plate_1"].split(",")] == pytest.approx([new_x_m - x_m, new_y_m - y_m], abs=1e-6)
+    assert math.hypot(new_x_m - x_m, new_y_m - y_m) > 0.001
 
 
 def test_zoom_is_told_by_its_last_magnification_and_their_number(test: TestSet) -> None:
