@@ -11,12 +11,12 @@ from pipeline.axes import Axes
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.config import PlanConfig, ReplayConfig
-from pipeline.export_config import Where
+from pipeline.export_config import ExportConfig, Where
 from pipeline.libero.demonstrations import DemoEntry
 from pipeline.planning import plan
 from pipeline.planning.streams import streams_of
 from pipeline.run import manifest
-from pipeline.run.outcome import Outcome
+from pipeline.run.outcome import Outcome, missed
 from pipeline.stores.frame_store import Shown
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Verdict
@@ -73,3 +73,15 @@ def test_other_frames_are_another_content(run: Outcome, change: dict[str, str]) 
     noise = run.rows[1]
     frames = {name: replace(shown, **change) for name, shown in run.frames.items()}  # type: ignore[arg-type]
     assert replace(run, frames=frames).content(noise.episode_id) != run.content(noise.episode_id)
+
+
+def test_failures_are_those_that_missed_their_goal_and_are_asked_for(run: Outcome) -> None:
+    reasons = ("kept", "goal_not_reached", "reserve_not_needed", "goal_lost", "too_dark")
+    judged = {row.episode_id: Verdict(False, reason) for row, reason in zip(run.rows, reasons, strict=True)}
+
+    def asked(**export: Any) -> list[str]:
+        return [row.axis for row in missed(run.rows, judged, ExportConfig(**export))]
+
+    assert asked() == []
+    assert asked(failures=True) == ["noise", "robot"]
+    assert asked(failures=True, where=Where(axis=("robot",))) == ["robot"]
