@@ -118,9 +118,9 @@ def planned(experiment: Experiment, arm: str, demos: Sequence[DemoEntry]) -> tup
         group = [demo for task in experiment.tasks for demo in by_task[task][begin:end]]
         rows += plan.make(group, config, experiment.run.replay, benchmark.load())
         begin = end
-    needed = experiment.demonstrations - begin
+    # After the twins that perturbed episodes follow, all of which are needed.
     clean = [
-        replace(row, wanted=row.rank < needed)
+        replace(row, rank=begin + row.rank, wanted=begin + row.rank < experiment.demonstrations)
         for task in experiment.tasks
         for row in plan.twins(by_task[task][begin:], wanted.seed, experiment.run.replay)
     ]
