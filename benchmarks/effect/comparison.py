@@ -16,6 +16,9 @@ DOCS = Path(__file__).resolve().parents[2] / "docs"
 FURTHER = Path(__file__).with_name("further") / "results"
 """A folder of results for each further experiment."""
 
+BESIDE = {"starts": "no_state"}
+"""A further experiment to the one whose arms stand beside its own: the same policies, tests and demonstrations."""
+
 LINES = {"clean": "LIBERO's own", "robot": "robot", "language": "language", "pose": "pose", "camera": "camera, noise"}
 LINE_OF = {axis: axis for axis in LINES} | {"noise": "camera"}
 COLOURS = ("#6b7d94", "#e59a00", "#1f9e82", "#9467d6")
@@ -195,7 +198,8 @@ def publish(folder: Path, docs: Path = DOCS) -> str:
     plot(results, docs / "effect.svg")
     _write(docs / "effect.md", "table", text)
     for further in sorted(FURTHER.iterdir()):
-        _write(docs / "decisions.md", further.name, markdown(read(further)))
+        beside = read(FURTHER / BESIDE[further.name]) if further.name in BESIDE else []
+        _write(docs / "decisions.md", further.name, markdown([*beside, *read(further)]))
     return text
 
 

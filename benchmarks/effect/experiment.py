@@ -156,7 +156,7 @@ def read(path: Path) -> Experiment:
         settings = yaml.safe_load(path.read_text())
         if isinstance(settings, dict) and (base := settings.pop("base", None)):
             of_base = yaml.safe_load((path.parent / base).read_text())
-            parts = {name: of_base.get(name, {}) | part for name, part in settings.items() if isinstance(part, dict)}
+            parts = {name: of_base[name] | settings[name] for name in ("policy", "training") if name in settings}
             settings = of_base | settings | parts
         return Experiment.model_validate(settings)
     except (OSError, yaml.YAMLError) as error:
