@@ -73,7 +73,7 @@ def test_disk_is_asked_for_as_the_configuration_needs_it(
     assert "fail  disk" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("name", "gb"), [("full", 440), ("paper", 350), ("small", 30)])
+@pytest.mark.parametrize(("name", "gb"), [("full", 440), ("paper", 350), ("joint", 94), ("small", 30)])
 def test_the_room_that_configurations_name_is_what_doctor_asks_for(name: str, gb: int) -> None:
     file = REPOSITORY / "configs" / f"{name}.yaml"
     assert f"room for about {gb} GB" in file.read_text()
