@@ -29,6 +29,7 @@ from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
 from pipeline.libero.tasks import find_task
+from pipeline.planning.selection import pending
 
 EFFECT = REPOSITORY / "benchmarks" / "effect"
 sys.path.append(str(EFFECT))
@@ -49,22 +50,30 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
     return read(SHIPPED)
 
 
-def test_the_further_round_changes_the_policy_alone(shipped: Experiment) -> None:
-    further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
-    assert further.keys() == {"pre_norm", "no_state"}
+def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
+    further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml") if file.stem != "data_starts"}
+    assert further.keys() == {"pre_norm", "no_state", "starts"}
     for one in further.values():
         assert one.policy == {**shipped.policy, "pre_norm": True}
-        assert one == shipped.model_copy(update={"policy": one.policy, "training": one.training})
-    steps = [one.training.model_dump(exclude={"proprioception"}) for one in (shipped, *further.values())]
-    assert steps[0] == steps[1] == steps[2]
-    assert not further["no_state"].training.proprioception
+        fields = {name: getattr(one, name) for name in ("policy", "training", "data", "arms")}
+        assert one == shipped.model_copy(update=fields)
+        proprioception = {"proprioception": one.training.proprioception}
+        assert one.training == shipped.training.model_copy(update=proprioception)
+    assert [name for name, one in further.items() if one.training.proprioception] == ["pre_norm"]
+    for name in ("pre_norm", "no_state"):
+        assert (further[name].data, further[name].arms) == (shipped.data, shipped.arms)
+    same = {"plan": {"episodes", "reserve", "axes"}}
+    assert further["starts"].run.model_dump(exclude=same) == shipped.run.model_dump(exclude=same)
+    trained = {
+        "pre_norm": [("clean", 0), ("ours", 0)],
+        "no_state": [("clean", 0), ("clean", 1), ("ours", 0), ("ours", 1)],
+        "starts": [("robots", 0), ("robots", 1), ("poses", 1)],
+    }
     for name, experiment in further.items():
         kept = results.read(EFFECT / "further" / "results" / name)
-        assert [(made.arm, made.seed, len(made.rows), len(made.black)) for made in kept] == [
-            ("clean", 0, 244, 60),
-            ("ours", 0, 244, 60),
-        ]
+        assert [(made.arm, made.seed) for made in kept] == trained[name]
         for made in kept:
+            assert (len(made.rows), len(made.black)) == (244, 60)
             assert made.settings["policy"] == experiment.policy
             assert made.settings["training"].get("proprioception", True) == experiment.training.proprioception
 
@@ -155,15 +164,18 @@ def demonstrations(experiment: Experiment, number: int) -> list[DemoEntry]:
     ]
 
 
-@pytest.mark.parametrize("arm", ["clean", "released", "ours"])
+@pytest.mark.parametrize("arm", ["clean", "released", "ours", "robots", "poses"])
 def test_each_demonstration_gives_an_arm_one_episode(arm: str, shipped: Experiment) -> None:
-    rows, chosen = episodes.planned(shipped, arm, demonstrations(shipped, 54))
+    experiment = shipped if arm in shipped.arms else read(EFFECT / "further" / "starts.yaml")
+    rows, chosen = episodes.planned(experiment, arm, demonstrations(experiment, 54))
     shown = [row for row in chosen if row.wanted]
     assert len(shown) == len({row.demo_id for row in shown}) == 200
-    assert sum(row.role == "twin" for row in shown) == (200 if arm == "clean" else 72)
-    twins = {row.demo_id for row in rows if row.role == "twin" and row.wanted}
-    assert twins == {row.demo_id for row in shown}, "tracking needs them"
-    planned = {name: shipped.run.plan.episodes[name] for name in shipped.arms[arm]}
+    perturbed = {"clean": 0, "released": 128, "ours": 128, "robots": 128, "poses": 128}
+    assert sum(row.role == "twin" for row in shown) == 200 - perturbed[arm]
+    twins = [row for row in rows if row.role == "twin"]
+    first = set(pending(twins, {}))
+    assert {row.demo_id for row in twins if row.trajectory_id in first} == {row.demo_id for row in shown}, "followed"
+    planned = {name: experiment.run.plan.episodes[name] for name in experiment.arms[arm]}
     assert {name: sum(row.axis == name for row in shown) for name in planned} == planned
 
 
