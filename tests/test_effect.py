@@ -1,6 +1,5 @@
-"""The experiment that shows what the data is worth: its settings, what an arm holds, training, and what tables say."""
+"""The experiment that shows what the data is worth: its settings, what an arm holds, and training, to the results."""
 
-import json
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,8 +14,6 @@ import numpy as np
 import pytest
 import yaml
 from conftest import REPOSITORY, STOVE, link_testset, tiny_config
-from episode_results import result
-from scipy.stats import permutation_test
 
 from pipeline.__main__ import main
 from pipeline.compute_config import ComputeConfig
@@ -25,8 +22,6 @@ from pipeline.errors import PipelineError
 from pipeline.evaluation import environment
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment
-from pipeline.evaluation.results import EpisodeResult
-from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.planning.selection import pending
@@ -34,7 +29,6 @@ from pipeline.planning.selection import pending
 EFFECT = REPOSITORY / "benchmarks" / "effect"
 sys.path.append(str(EFFECT))
 
-import comparison  # noqa: E402
 import episodes  # noqa: E402
 import evaluation  # noqa: E402
 import results  # noqa: E402
@@ -51,7 +45,7 @@ def shipped(monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 
 def test_the_further_rounds_change_what_they_say_alone(shipped: Experiment) -> None:
-    further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml") if file.stem != "data_starts"}
+    further = {file.stem: read(file) for file in (EFFECT / "further").glob("*.yaml")}
     assert further.keys() == {"pre_norm", "no_state", "starts"}
     for one in further.values():
         assert one.policy == {**shipped.policy, "pre_norm": True}
@@ -306,88 +300,3 @@ def test_from_demonstrations_to_the_results(
     ]
     assert found.black == [{"task": STOVE.name, "state": 0, "success": False}]
     assert found.made["episodes_by_axis"] == {"clean": 1}
-
-
-def row(axis: str, number: int, success: bool, policy: str) -> EpisodeResult:
-    source = "libero" if axis == "clean" else "libero_plus"
-    task = EvaluationTask(source, "libero_goal", "stove", f"{axis} {number}", axis, axis, 1, number)  # type: ignore[arg-type]
-    return result(task, success, policy)
-
-
-def of_policy(arm: str, seed: int, solved: int) -> results.PolicyResults:
-    """Of ten tasks of each axis the first ``solved`` are solved; of two instructions the first is followed."""
-    rows = [row(axis, number, number < solved, f"{arm}{seed}") for axis in comparison.LINE_OF for number in range(10)]
-    told = [("turn on the stove", "stove"), ("put the bowl on the plate", None), ("", "stove")]
-    reading = [{"state": 0, "instruction": text, "reached": goal, "steps": 9} for text, goal in told]
-    settings = {
-        "arms": {"clean": [], "ours": ["robot"]},
-        "run": {"demos": {"tasks": ["libero_goal/stove", "libero_goal/put_the_bowl_on_the_plate"]}},
-    }
-    black = [{"task": "stove", "state": number, "success": number < solved // 4} for number in range(10)]
-    return results.PolicyResults(arm, seed, settings, {}, rows, reading, black)
-
-
-def test_results_are_read_as_they_were_written(tmp_path: Path) -> None:
-    written = [of_policy("clean", 0, 4), of_policy("ours", 1, 9)]
-    for one in written:
-        one.write(tmp_path)
-    assert results.read(tmp_path) == written
-    others: dict[str, dict[str, Any]] = {
-        "settings": {"settings": {"frame_px": 32}},
-        "packages": {"made": {"packages": {"torch": "1.0"}}},
-    }
-    for what, changed in others.items():
-        replace(written[0], arm="other", **changed).write(tmp_path)
-        with pytest.raises(PipelineError, match=f"made by other {what}"):
-            results.read(tmp_path)
-
-
-def test_the_table_pairs_episodes_seed_by_seed() -> None:
-    found = [of_policy("clean", 0, 4), of_policy("clean", 1, 2), of_policy("ours", 0, 9), of_policy("ours", 1, 9)]
-    robot = next(one for one in comparison.differences(found) if one["line"] == "robot")
-    assert robot["value"] == pytest.approx((18 - 6) / 20)
-    assert robot["resampled"] == "10 trials", "both seeds act in the same ten"
-    assert robot["holm"] == pytest.approx(4 * robot["p_value"]), "camera and noise have more trials"
-    text = comparison.markdown(found)
-    assert "| robot | 10 | 30 % (40, 20) | 90 % (90, 90) |" in text
-    assert "| camera, noise | 20 | 30 % (40, 20) | 90 % (90, 90) |" in text
-    assert "| LIBERO's own, views black | 10 | 5 % (10, 0) | 20 % (20, 20) |" in text
-    assert "| robot | +60 (" in text
-    assert "| turn on the stove | stove 2 of 2 | stove 2 of 2 |" in text, "of these rows, another goal's name"
-    assert "| put the bowl on the plate | 0 of 2 | 0 of 2 |" in text
-    assert "| nothing | stove 2 of 2 | stove 2 of 2 |" in text
-
-
-def test_holms_correction() -> None:
-    """By hand: 0.01 x 4, then 0.02 x 3, then 0.03 x 2, no less than the one before; 0.9 and more stay."""
-    assert comparison.holm([0.03, 0.01, 1.0, 0.02]) == pytest.approx([0.06, 0.04, 1.0, 0.06])
-
-
-def test_p_is_exact_where_few_tests_differ() -> None:
-    """Of five tests that all favour one arm, two of the 2^5 signs say as much. SciPy permutes the arms of each test."""
-    clean = [of_policy("clean", seed, 4) for seed in (0, 1)]
-    found = comparison.differences([*clean, *(of_policy("ours", seed, 9) for seed in (0, 1))])
-    assert next(one for one in found if one["line"] == "robot")["p_value"] == 2 / 2**5
-    for first, second in ((1, 8), (9, 3), (4, 4)):
-        ours = [of_policy("ours", 0, first), of_policy("ours", 1, second)]
-        solved = [np.sum([[one.success for one in each.rows[:10]] for each in arm], axis=0) for arm in (clean, ours)]
-        exact = permutation_test(solved, lambda a, b: (a - b).sum(), permutation_type="samples", n_resamples=2**10)
-        pairs = [pair for a, b in zip(clean, ours, strict=True) for pair in zip(a.rows[:10], b.rows[:10], strict=True)]
-        assert comparison.sign_flip(pairs) == pytest.approx(exact.pvalue)
-
-
-def test_the_page_shows_what_the_committed_rows_say(tmp_path: Path) -> None:
-    docs = REPOSITORY / "docs"
-    for name in ("effect.md", "decisions.md"):
-        (tmp_path / name).write_text((docs / name).read_text())
-    comparison.publish(EFFECT / "results", tmp_path)
-    for name in ("effect.md", "effect.svg", "decisions.md"):
-        assert (tmp_path / name).read_bytes() == (docs / name).read_bytes(), "python benchmarks/effect table"
-
-
-def test_the_plot_of_the_page_is_the_same_each_time(tmp_path: Path) -> None:
-    found = [of_policy("clean", 0, 4), of_policy("ours", 0, 9)]
-    for name in ("one.svg", "two.svg"):
-        comparison.plot(found, tmp_path / name)
-    assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
-    assert json.dumps("LIBERO's own")[1:-1] in (tmp_path / "one.svg").read_text()

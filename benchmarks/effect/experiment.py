@@ -149,6 +149,8 @@ class Experiment(Frozen):
 def read(path: Path) -> Experiment:
     """Read and validate the experiment. One with a ``base``, another file, gives only what differs from it.
 
+    Sections are joined with those of the base, but for ``arms``, which take their place.
+
     Raises:
         PipelineError: naming the file and every field that is wrong.
     """
@@ -156,7 +158,8 @@ def read(path: Path) -> Experiment:
         settings = yaml.safe_load(path.read_text())
         if isinstance(settings, dict) and (base := settings.pop("base", None)):
             of_base = yaml.safe_load((path.parent / base).read_text())
-            parts = {name: of_base[name] | settings[name] for name in ("policy", "training") if name in settings}
+            parts = {name: part for name, part in settings.items() if isinstance(part, dict) and name != "arms"}
+            parts = {name: of_base.get(name, {}) | part for name, part in parts.items()}
             settings = of_base | settings | parts
         return Experiment.model_validate(settings)
     except (OSError, yaml.YAMLError) as error:
