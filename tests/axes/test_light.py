@@ -84,6 +84,7 @@ def test_the_four_properties_mostly_change_together() -> None:
     tints = [one.diffuse_scale_rgb for one in draws if len({*one.diffuse_scale_rgb}) > 1]
     for brightest in range(3):
         assert sum(np.argmax(tint) == brightest for tint in tints) == pytest.approx(len(tints) / 3, abs=50)
+    # Uniform from 135 to 270 degrees.
     azimuths_deg = [one.tilt_azimuth_deg for one in draws if one.tilt_deg]
     assert np.percentile(azimuths_deg, [10, 50, 90]) == pytest.approx([148.5, 202.5, 256.5], abs=5)
 
