@@ -59,7 +59,7 @@ def replay(
         states=states,
         actions=actions,
         site_alpha=np.zeros((STEPS + 1, model_xml.count("<site ")), np.float32),
-        verdict=Verdict(kept, "" if kept else "goal_not_reached"),
+        verdict=Verdict(kept, "kept" if kept else "goal_not_reached"),
     )
 
 
