@@ -17,8 +17,9 @@ from pipeline.files import checksum
 from pipeline.libero.assets import installed, name_of
 
 _OBJECTS, _HASH = "objects/", "#sha256="
-# As ElementTree writes attributes; besides file, a cube texture has fileright, fileleft and so on.
-_FILE = re.compile(r'(?<=\s)(file\w*)="([^"]*)"')
+# As ElementTree writes attributes; besides file, a cube texture has fileright, fileleft and so on. That it begins with
+# letters has a model searched in a tenth of the time.
+_FILE = re.compile(r'(file(?<=\sfile)\w*)="([^"]*)"')
 
 
 def portable(model_xml: str) -> str:
