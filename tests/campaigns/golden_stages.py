@@ -16,7 +16,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
-from pipeline.formats.lerobot_video import planes
+from pipeline.formats.lerobot_video import ENCODER, OPTIONS, planes
 from pipeline.formats.read_back import Copy, sampled
 from pipeline.images.jpeg import decode
 from pipeline.report import figures
@@ -36,7 +36,7 @@ def rlds() -> str:
 
 
 def lerobot() -> str:
-    """All files of two sets, and what videos are of; their encoder may choose its code by the processor."""
+    """All files of two sets, what videos are of and how; their encoder may choose its code by the processor."""
     return digest(_written(write_lerobot), _written(partial(write_lerobot, frames="images")), _encoded())[:16]
 
 
@@ -47,7 +47,8 @@ def lerobot_v21() -> str:
 
 
 def _encoded() -> str:
-    return hashlib.sha256(planes(decode(episode(IDS[0]).frames["image"][0])).tobytes()).hexdigest()
+    shown = planes(decode(episode(IDS[0]).frames["image"][0]))
+    return digest(hashlib.sha256(shown.tobytes()).hexdigest(), ENCODER, OPTIONS)
 
 
 def _written(write: Callable[[Path], Any]) -> str:
