@@ -37,7 +37,7 @@ def edition(path: Path) -> Edition:
         OSError: when it is not there.
     """
     status = path.stat()
-    return Edition(path.resolve(), status.st_ino, status.st_size, status.st_mtime_ns)
+    return Edition(path.absolute(), status.st_ino, status.st_size, status.st_mtime_ns)
 
 
 def checksum(file: Path) -> str:

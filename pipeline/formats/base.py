@@ -152,6 +152,14 @@ class Format(ABC, Generic[Options]):
     # Reading back, as clients do.
 
     @abstractmethod
+    def open(self) -> None:
+        """Read what the dataset says of itself, as far as its episodes are found by that.
+
+        Raises:
+            PipelineError: when it cannot be read.
+        """
+
+    @abstractmethod
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         """What is off with the dataset as a whole, each with ``format``, ``ids`` or ``readable`` as the check's name.
 

@@ -79,6 +79,12 @@ class LeRobot(Format[LeRobotConfig]):
         ids = [episode_id for piece in pieces for episode_id in piece.ids]
         return {episode_id: {"lerobot_episode_index": index} for index, episode_id in enumerate(ids)}
 
+    def open(self) -> None:
+        from pipeline.formats import lerobot_read
+
+        with lerobot_read.readable(self.root):
+            lerobot_read.rows(self.root)
+
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import lerobot_check
 

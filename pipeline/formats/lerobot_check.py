@@ -93,7 +93,7 @@ def _samples(root: Path, data: LeRobotDataset) -> Iterator[tuple[str, str]]:
             for view, spec in SCHEMA.views.items():
                 # lerobot hands out floats in [0, 1], channels first.
                 shown = item[spec.lerobot_key].numpy().transpose(1, 2, 0) * 255
-                if np.abs(shown - copy.decoded[view, step]).max() > SAME_LEVELS:
+                if np.abs(shown - copy.frame(view, step)).max() > SAME_LEVELS:
                     yield row[EPISODE_ID], spec.lerobot_key
             if item["task"] != copy.instructions[step]:
                 yield row[EPISODE_ID], "task"

@@ -19,7 +19,6 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, LANGUAGE, OBJECT_POSES, camera_column
 from pipeline.formats.read_back import Copy, sampled
-from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Extra, Frame, Geometry
 
 UNREADABLE = (
@@ -117,7 +116,7 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
         dataset="lerobot",
         episode=episode(table, row, instructions[0], extras),
         instructions=instructions,
-        decoded=decoded(table, videos),
+        decoded=decoded(table["timestamp"].to_pylist(), videos),
         marks={name: table[name].to_numpy() for name in MARKS},
         place={"lerobot_episode_index": index},
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
@@ -191,13 +190,20 @@ def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: t
 
 def _steps(path: Path, first: int, steps: int) -> pa.Table:
     """Rows of a data file, from the row groups that have them: where we wrote the file, that is one."""
-    with pq.ParquetFile(path) as file:
-        ends = np.cumsum([file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)])
+    footer, ends = _footer(edition(path))
+    with pq.ParquetFile(path, metadata=footer) as file:
         groups = range(
             int(np.searchsorted(ends, first, "right")), int(np.searchsorted(ends, first + steps - 1, "right")) + 1
         )
         before = int(ends[groups[0] - 1]) if groups[0] else 0
-        return file.read_row_groups(list(groups)).slice(first - before, steps)
+        return file.read_row_groups(list(groups), use_threads=False).slice(first - before, steps)
+
+
+@lru_cache(maxsize=4)
+def _footer(data_file: Edition) -> tuple[pq.FileMetaData, NDArray[np.int64]]:
+    """What a data file says of itself, and the rows at which its row groups end."""
+    footer = pq.read_metadata(data_file.path)
+    return footer, np.cumsum([footer.row_group(group).num_rows for group in range(footer.num_row_groups)])
 
 
 def _matrix(table: pa.Table, column: str) -> NDArray[Any]:
@@ -215,23 +221,19 @@ def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[
     return Geometry(**matrices, maps={name: list(map(base64.b64decode, files)) for name, files in texts.items()})
 
 
-def decoded(table: pa.Table, videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:
+def decoded(times_s: Sequence[float], videos: Mapping[str, tuple[Path, float]]) -> dict[tuple[str, int], Frame]:
     """The frames at the sampled steps.
 
     Args:
-        videos: view to its video, and the time (s) at which the episode begins there; views without one are images.
+        times_s: those that stand at the steps, by which lerobot finds a frame.
+        videos: view to its video, and the time (s) at which the episode begins there.
     """
-    frames: dict[tuple[str, int], Frame] = {}
-    steps = sampled(len(table))
-    for view, spec in SCHEMA.views.items():
-        if view in videos:
-            # By the times that stand at the steps, as lerobot does.
-            path, begins_s = videos[view]
-            shown = frames_at(path, [begins_s + table["timestamp"][step].as_py() for step in steps])
-        else:
-            shown = [decode(table[spec.lerobot_key][step]["bytes"].as_py()) for step in steps]
-        frames |= {(view, step): frame for step, frame in zip(steps, shown, strict=True)}
-    return frames
+    steps = sampled(len(times_s))
+    return {
+        (view, step): frame
+        for view, (path, begins_s) in videos.items()
+        for step, frame in zip(steps, frames_at(path, [begins_s + times_s[step] for step in steps]), strict=True)
+    }
 
 
 def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
@@ -240,15 +242,21 @@ def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
     Raises:
         ValueError: when there is none.
     """
-    frames = []
-    with av.open(str(path)) as video:
-        stream = video.streams.video[0]
-        stream.thread_count = 1  # Starting more takes longer than a few frames.
-        for at_s in times_s:
-            at = round(at_s / float(stream.time_base or 1))
-            video.seek(at, stream=stream)
-            found = next((frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at), None)
-            if found is None or found.pts != at:
-                raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
-            frames.append(np.asarray(found.to_ndarray(format="rgb24"), np.uint8))
+    video, frames = _video(edition(path)), []
+    stream = video.streams.video[0]
+    for at_s in times_s:
+        at = round(at_s / float(stream.time_base or 1))
+        video.seek(at, stream=stream)
+        found = next((frame for frame in video.decode(stream) if frame.pts is not None and frame.pts >= at), None)
+        if found is None or found.pts != at:
+            raise ValueError(f"{path.name} has no frame at {at_s:.3f} s")
+        frames.append(np.asarray(found.to_ndarray(format="rgb24"), np.uint8))
     return frames
+
+
+@lru_cache(maxsize=len(SCHEMA.views))
+def _video(file: Edition) -> av.container.InputContainer:
+    """A video that stays open, as its next frames are likely to be asked for."""
+    video = av.open(str(file.path))
+    video.streams.video[0].thread_count = 1  # Starting more takes longer than a few frames.
+    return video

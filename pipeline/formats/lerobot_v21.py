@@ -68,6 +68,11 @@ class LeRobotV21(Format[LeRobotV21Config]):
             lerobot_v21_write.finish(work, work / "dataset" / name, members, self.convention, self.extras)
         return {}
 
+    def open(self) -> None:
+        from pipeline.formats import lerobot_v21_read
+
+        lerobot_v21_read.open_all(self.folder)
+
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import lerobot_v21_read
 

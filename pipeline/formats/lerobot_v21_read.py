@@ -30,6 +30,17 @@ from pipeline.types import Extra
 NAME, VERSION = "lerobot_v21", "v2.1"
 
 
+def open_all(folder: Path) -> None:
+    """Read what every set says of itself.
+
+    Raises:
+        PipelineError: when that cannot be read.
+    """
+    for root in _sets(folder):
+        with readable(root, VERSION):
+            _opened(root, _modified_ns(root))
+
+
 def check(
     folder: Path, kept: Mapping[str, Row], convention: Convention, extras: tuple[Extra, ...]
 ) -> Iterator[tuple[str, Fault]]:
@@ -121,7 +132,7 @@ def _copy(
     keys = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
     videos = {view: (root / video_path(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"}
     marks = {name: table[name].to_numpy() for name in MARKS}
-    return Copy(NAME, made, instructions, decoded(table, videos), marks, {})
+    return Copy(NAME, made, instructions, decoded(table["timestamp"].to_pylist(), videos), marks, {})
 
 
 def _sets(folder: Path) -> list[Path]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import MAKE_AGAIN
 from pipeline.files import checksum
+from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Frame
 
 
@@ -35,7 +36,7 @@ class Copy:
         episode: the record that its writer was given, as far as the dataset has it: of whatever shapes and types stand
             there, with the instruction of the first step, and without frames where they are no image files.
         instructions: one for each step.
-        decoded: (view, step) to the frame, for ``sampled`` steps.
+        decoded: (view, step) to the frame, for ``sampled`` steps, where frames are a video.
         marks: what else stands at each step, by the dataset's own names, each (T,).
         place: where it lies, by the format's columns of the manifest.
         said: lerobot's language column, the entries of each step; None where the dataset has none.
@@ -53,6 +54,15 @@ class Copy:
 
     def __len__(self) -> int:
         return len(self.episode)
+
+    def frame(self, view: str, step: int) -> Frame:
+        """(H, W, 3) of a sampled step.
+
+        Raises:
+            ValueError: when it cannot be decoded.
+        """
+        files = self.episode.frames.get(view)
+        return decode(files[step]) if files else self.decoded[view, step]
 
 
 @dataclass(frozen=True)

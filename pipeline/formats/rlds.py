@@ -72,6 +72,11 @@ class Rlds(Format[RldsConfig]):
             for index, episode_id in enumerate(ids)
         }
 
+    def open(self) -> None:
+        from pipeline.formats import rlds_read
+
+        rlds_read.open_all(self.folder)
+
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import rlds_read
 

@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Iterator, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -102,14 +102,18 @@ def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:
     Raises:
         PipelineError: when the record lacks a feature.
     """
-    parser = tfds.core.example_parser.ExampleParserNp(features.get_serialized_info())
     try:
-        example = parser.parse_example(record)
+        example = _parser(features).parse_example(record)
     except KeyError as error:
         raise PipelineError(
             f"a record has no feature {error}", expected="what features.json names", remedy="write the dataset again"
         ) from error
     return dict(_flat(example["steps"])) | dict(_flat(example.get("episode_metadata", {}), METADATA))
+
+
+@lru_cache(maxsize=8)
+def _parser(features: Any) -> Any:
+    return tfds.core.example_parser.ExampleParserNp(features.get_serialized_info())
 
 
 def _flat(tree: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, NDArray[Any]]]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 from pipeline.config import RenderConfig
@@ -31,12 +31,15 @@ class EpisodeLoader:
     extras: tuple[Extra, ...] = ()
     rewrites: Mapping[str, Sequence[str]] | None = None
 
+    @cached_property
+    def _frames(self) -> FrameStore:
+        return FrameStore(self.data / "frames", self.config)
+
     def __call__(self, episode_id: str) -> Episode:
         row = _rows_by_id(edition(self.data / "plan.parquet"))[episode_id]
         shown = streams_of(row.perturbations)
         geometry = {view: stream.geometry.stream_id for view, stream in shown.items()}
-        store = FrameStore(self.data / "frames", self.config)
-        rendered = store.load(row.trajectory_id, [s.stream_id for s in shown.values()], set(geometry.values()))
+        rendered = self._frames.load(row.trajectory_id, [s.stream_id for s in shown.values()], set(geometry.values()))
         known = asdict(row) | {"replay_mode": rendered.replay_mode}
         known |= asdict(rendered.quality) if rendered.quality else {}
         known |= {f"{name}_version": version for name, version in versions().items()}

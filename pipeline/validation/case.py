@@ -6,10 +6,36 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from pipeline.episode_schema import MOTION
 from pipeline.formats.read_back import Copy, Fault, sampled
 from pipeline.images.jpeg import decode
 from pipeline.types import Episode, Frame, Trajectory
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A view of an episode.
+
+    Attributes:
+        frames: sampled step to its frame, (H, W, 3).
+        video: whether they are of a video.
+    """
+
+    dataset: str
+    view: str
+    frames: Mapping[int, Frame]
+    video: bool = False
+
+    @cached_property
+    def grey(self) -> dict[int, NDArray[np.uint8]]:
+        """The same frames, (H, W) each."""
+        return {
+            step: np.asarray(cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY), np.uint8) for step, frame in self.frames.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -30,14 +56,27 @@ class Case:
     bank: Path | None
 
     @cached_property
-    def shown(self) -> dict[int, dict[str, Frame]]:
-        """Sampled step to what the store has in every view there."""
+    def stored(self) -> dict[str, Seen]:
+        """View to what the store shows there."""
+        steps = sampled(len(self.made))
         return {
-            step: {view: decode(frames[step]) for view, frames in self.made.frames.items()}
-            for step in sampled(len(self.made))
+            view: Seen("frames", view, {step: decode(files[step]) for step in steps})
+            for view, files in self.made.frames.items()
         }
 
-    @property
+    @cached_property
+    def seen(self) -> list[Seen]:
+        """The views of the store, and those of the copies that are not the very files of the store."""
+        found = [*self.stored.values()]
+        for copy in self.whole:
+            for view, stored in self.stored.items():
+                files = copy.episode.frames.get(view)
+                if not files or any(files[step] != self.made.frames[view][step] for step in stored.frames):
+                    frames = {step: copy.frame(view, step) for step in stored.frames}
+                    found.append(Seen(copy.dataset, view, frames, video=not files))
+        return found
+
+    @cached_property
     def whole(self) -> list[Copy]:
         """The copies of the right shapes: what else is wrong with the others follows from that."""
         return [

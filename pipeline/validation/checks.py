@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
-from pipeline.formats.read_back import Copy, Fault, sampled
+from pipeline.formats.read_back import Copy, Fault
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
 from pipeline.run.manifest import OWN_VERSION
 from pipeline.types import Frame
@@ -39,15 +39,10 @@ AGAINST_M = 0.03
 way round, 49 episodes moved 0.05 m and more with it."""
 
 
-def _grey_psnr_db(one: Frame, other: Frame) -> float:
-    grey, other_grey = (cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in (one, other))
-    return float(cv2.PSNR(grey, other_grey))
-
-
 def _colours_off(one: Frame, stored: Frame) -> float:
     """The mean distance of Cb and Cr over 16 by 16 fields, as a share of the stored frame's from grey."""
     fields = (
-        cv2.resize(cv2.cvtColor(frame, cv2.COLOR_RGB2YCrCb), (16, 16), interpolation=cv2.INTER_AREA)[..., 1:]
+        cv2.cvtColor(cv2.resize(frame, (16, 16), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2YCrCb)[..., 1:]
         for frame in (one, stored)
     )
     found, wanted = (field.astype(float) - 128 for field in fields)
@@ -170,33 +165,33 @@ def geometry(case: Case) -> Iterator[Fault]:
 
 def video(case: Case) -> Iterator[Fault]:
     """Frames within ``VIDEO_PSNR_DB`` and ``COLOURS_OFF`` of the stored ones, where a dataset has no image files."""
-    for copy, view, step, shown in _shown(case):
-        if copy.episode.frames:
-            continue
-        frame, stored = copy.decoded[view, step], shown[view]
-        if (reached := _grey_psnr_db(frame, stored)) < VIDEO_PSNR_DB:
-            yield case.finding(copy.dataset, f"{view} of step {step} has {reached:.1f} dB", f"{VIDEO_PSNR_DB} or more")
-        elif (off := _colours_off(frame, stored)) > COLOURS_OFF:
-            yield case.finding(copy.dataset, f"{view} of step {step} has other colours ({off:.2f})", f"{COLOURS_OFF}")
+    for seen in case.seen:
+        stored, within = case.stored[seen.view], f"{VIDEO_PSNR_DB} or more"
+        for step, frame in seen.frames.items() if seen.video else ():
+            name = f"{seen.view} of step {step}"
+            if (reached := cv2.PSNR(seen.grey[step], stored.grey[step])) < VIDEO_PSNR_DB:
+                yield case.finding(seen.dataset, f"{name} has {reached:.1f} dB", within)
+            elif (off := _colours_off(frame, stored.frames[step])) > COLOURS_OFF:
+                yield case.finding(seen.dataset, f"{name} has other colours ({off:.2f})", f"{COLOURS_OFF}")
 
 
 def cameras(case: Case) -> Iterator[Fault]:
     """No view that shows what another camera saw."""
-    for copy, view, step, shown in _shown(case):
-        for other in shown.keys() - {view}:
-            if _grey_psnr_db(copy.decoded[view, step], shown[other]) > VIDEO_PSNR_DB:
-                yield case.finding(copy.dataset, f"{view} of step {step} shows {other}", "its own camera")
+    for seen in case.seen:
+        for step, frame in seen.grey.items():
+            for other in case.stored.keys() - {seen.view}:
+                if cv2.PSNR(frame, case.stored[other].grey[step]) > VIDEO_PSNR_DB:
+                    yield case.finding(seen.dataset, f"{seen.view} of step {step} shows {other}", "its own camera")
 
 
 def alive(case: Case) -> Iterator[Fault]:
     """No view that shows nothing, or the same all along."""
-    for copy in case.whole:
-        for view in SCHEMA.views:
-            frames = [copy.decoded[view, step] for step in sampled(len(copy))]
-            if min(cv2.meanStdDev(frame.reshape(-1))[1].item() for frame in frames) < BLANK_LEVELS:
-                yield case.finding(copy.dataset, f"{view} has a blank frame", f"more than {BLANK_LEVELS} grey levels")
-            elif max(cv2.norm(frame, frames[0], cv2.NORM_L1) / frame.size for frame in frames) < STILL_LEVELS:
-                yield case.finding(copy.dataset, f"{view} is constant", "a camera that sees the robot move")
+    for seen in case.seen:
+        first, *_ = frames = [*seen.frames.values()]
+        if min(cv2.meanStdDev(frame.reshape(-1))[1].item() for frame in frames) < BLANK_LEVELS:
+            yield case.finding(seen.dataset, f"{seen.view} has a blank frame", f"more than {BLANK_LEVELS} grey levels")
+        elif max(cv2.norm(frame, first, cv2.NORM_L1) / frame.size for frame in frames) < STILL_LEVELS:
+            yield case.finding(seen.dataset, f"{seen.view} is constant", "a camera that sees the robot move")
 
 
 def gripper(case: Case) -> Iterator[Fault]:
@@ -239,14 +234,6 @@ def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Itera
         for step in np.flatnonzero(~np.isclose(values, expected, rtol=0, atol=1e-4))[:1]:
             what = f"{name} of step {step} is {float(values[step]):g}"
             yield case.finding(copy.dataset, what, f"{float(expected[step]):g}")
-
-
-def _shown(case: Case) -> Iterator[tuple[Copy, str, int, Mapping[str, Frame]]]:
-    """Copy, view, step, and what the store has in every view there, for the sampled steps."""
-    for step, shown in case.shown.items():
-        for copy in case.whole:
-            for view in SCHEMA.views:
-                yield copy, view, step, shown
 
 
 def _same(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:

@@ -52,7 +52,7 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
             stored = case.made.frames[view][step]
             again = encode(_turned(fresh[view]), config)
             shown = [("frames", decode(stored))] if stored != again or not exact else []
-            for dataset, frame in [*shown, *((copy.dataset, copy.decoded[view, step]) for copy in case.whole)]:
+            for dataset, frame in [*shown, *((copy.dataset, copy.frame(view, step)) for copy in case.whole)]:
                 right = f"{name} turned by {SCHEMA.image_rotation_deg} degrees"
                 nearest, reached_db = _nearest(frame, right, view, fresh, former.get(view))
                 if nearest != right or reached_db < PSNR_DB:

@@ -6,7 +6,7 @@ The datasets are compared with the stores that they were made from; those in tur
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import rendered, witnesses
 
-SLICE = 4
+SLICE = 16
 """So many episodes are checked in one call, where no scene has to be opened for them."""
 
 
@@ -92,13 +92,6 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
                 total.add(_datasets(job, failed, workers), within=f"{registry.FAILURES}/")
         finally:
             scene_of_process().close()
-    damaged = {fault.dataset for check in ("readable", "checksums") for fault in total.findings[check]}
-    if config.export.rlds and "rlds" not in damaged:
-        # OFT's reader stops at what is damaged.
-        sets = oft.datasets(data / "rlds")
-        statistics = read_json(data / "dataset_statistics.json")
-        trained = workers(partial(_openvla_oft, statistics), sets, "read as OpenVLA-OFT")
-        total.note("openvla_oft", [finding for found in trained for finding in found], len(sets))
     return {
         check: {"checked": checked, "findings": [asdict(finding) for finding in total.findings[check]]}
         for check, checked in total.checked.items()
@@ -108,24 +101,35 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
 def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
     """The checks of some datasets, each as a whole, and of their episodes; ``job`` has all datasets."""
     total, opened = Results(), []
-    for one in job.formats:
-        for faults in workers(Written.faults, one.written(), f"{one.title} checksums"):
-            total.note("checksums", faults)
-        if any(fault.dataset == one.name for fault in total.findings["checksums"]):
-            # What damaged files seem to hold is of no interest, and may be anything.
-            continue
+    files = [file for one in job.formats for file in one.written()]
+    for faults in workers(Written.faults, files, "checksums"):
+        total.note("checksums", faults)
+    changed = {fault.dataset for fault in total.findings["checksums"]}
+    # What changed files seem to hold is of no interest, and may be anything.
+    for one in (one for one in job.formats if one.name not in changed):
         try:
-            # In a worker, which reads the episodes with the same packages later.
-            (found,) = workers(partial(_as_a_whole, episodes, job.cache), [one], f"{one.title} as a whole")
+            one.open()
+            opened.append(one)
         except PipelineError as error:
-            total.note("readable", [Fault(one.name, None, str(error), "a dataset that can be opened")])
-            continue
-        opened.append(one)
-        for check, checked in (("format", 1), ("ids", len(episodes)), ("readable", 0)):
-            total.note(check, [fault for named, fault in found if named == check], checked)
-    for results in workers(replace(job, formats=opened), _slices(episodes, job.witnesses, opened), "validate"):
+            total.note("readable", [_closed(one, error)], 0)
+    job = replace(job, formats=opened)
+    # Together, and what takes longest first: where one worker loads lerobot, the others go on with the episodes.
+    work: list[Callable[[], Results]] = [partial(_as_a_whole, one, episodes, job.cache) for one in reversed(opened)]
+    if "outcome" not in job.extras and any(one.name == "rlds" for one in opened):
+        statistics = read_json(job.data / "dataset_statistics.json")
+        work += [partial(_openvla_oft, statistics, folder) for folder in oft.datasets(job.data / "rlds")]
+    work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, opened)]
+    for results in workers(_done, work, "validate"):
         total.add(results)
     return total
+
+
+def _done(work: Callable[[], Results]) -> Results:
+    return work()
+
+
+def _closed(one: Format[Any], error: PipelineError) -> Fault:
+    return Fault(one.name, None, str(error), "a dataset that can be opened")
 
 
 def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
@@ -144,13 +148,28 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
         yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
 
 
-def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> list[Fault]:
-    found, name = oft.check(folder, statistics), folder.parent.name
-    return [Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in found["violations"]]
+def _as_a_whole(one: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:
+    results = Results()
+    try:
+        found = list(one.check(episodes, cache))
+    except PipelineError as error:
+        results.note("readable", [_closed(one, error)], 0)
+        return results
+    for check, checked in (("format", 1), ("ids", len(episodes)), ("readable", 0)):
+        results.note(check, [fault for named, fault in found if named == check], checked)
+    return results
 
 
-def _as_a_whole(kept: Mapping[str, Row], cache: Path, one: Format[Any]) -> list[tuple[str, Fault]]:
-    return list(one.check(kept, cache))
+def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> Results:
+    try:
+        wrong = oft.check(folder, statistics)["violations"]
+    except PipelineError as error:
+        wrong = [str(error)]  # It stops at what is damaged.
+    results, name = Results(), folder.parent.name
+    results.note(
+        "openvla_oft", (Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in wrong)
+    )
+    return results
 
 
 def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[Format[Any]]) -> list[list[Row]]:
@@ -162,8 +181,9 @@ def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[F
     rows = sorted(kept.values(), key=lambda row: (row["suite"], row["task"]))
     by_trajectory = grouped((row["trajectory_id"], row) for row in rows if row["episode_id"] in again)
     others = [row for row in rows if row["episode_id"] not in again]
-    columns = [column.name for one in formats for column in one.columns]
-    others.sort(key=lambda row: [str(row[column]) for column in columns])
+    # LeRobot's files last, as theirs are the largest: the next episode lies in those that are open.
+    columns = [column.name for one in reversed(formats) for column in one.columns]
+    others.sort(key=lambda row: [(row[column] is None, row[column]) for column in columns])
     return [*by_trajectory.values(), *(others[start : start + SLICE] for start in range(0, len(others), SLICE))]
 
 
@@ -186,12 +206,15 @@ class EpisodesJob:
     extras: tuple[Extra, ...] = ()
 
     def __call__(self, rows: Sequence[Row]) -> Results:
-        results = Results()
+        results, language, rewrites = Results(), self.config.plan.axes.language, None
+        if any(one.language for one in self.formats):
+            rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
+        load = EpisodeLoader(self.data, self.config.render, self.extras, rewrites)
         for row in rows:
-            self._check(row, results)
+            self._check(row, load, results)
         return results
 
-    def _check(self, row: Row, results: Results) -> None:
+    def _check(self, row: Row, load: EpisodeLoader, results: Results) -> None:
         episode_id = row["episode_id"]
         copies = []
         results.note("readable", [])
@@ -205,12 +228,8 @@ class EpisodesJob:
             except PipelineError as error:
                 unreadable = Fault(one.name, episode_id, str(error), "an episode that can be read")
                 results.note("readable", [unreadable], 0)
-        language = self.config.plan.axes.language
         try:
-            rewrites = None
-            if any(one.language for one in self.formats):
-                rewrites = {episode_id: wordings(language, row["suite"], row["task"], row["axis"])}
-            made = EpisodeLoader(self.data, self.config.render, self.extras, rewrites)(episode_id)
+            made = load(episode_id)
             trajectory = TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"])
         except PipelineError as error:
             results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])
@@ -219,6 +238,7 @@ class EpisodesJob:
         if "outcome" in self.extras:  # The manifest has figures of kept episodes alone.
             quality = measure(trajectory, find_task(row["suite"], row["task"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
+        language = self.config.plan.axes.language
         case = Case(row, made, trajectory, copies, language.bank if language else None)
         for name, check in CHECKS.items():
             results.note(name, check(case))
