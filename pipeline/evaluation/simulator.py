@@ -23,6 +23,15 @@ from pipeline.types import Floats, Frame, Scene, Task
 SETTLING_STEPS = 10
 """Control steps before the policy's first look, while objects fall into place (OpenVLA's and LIBERO-Plus's rule)."""
 
+OBSERVED = 24
+"""The substep, of the 25 of a control step, that robosuite 1.4.0 observes.
+
+An observable samples once in 50 ms, by a timer that counts every update. A reset and LIBERO's ``set_init_state`` force
+one update each, so the timer is two substeps ahead, and the 24th is observed, not the last: the policy sees the arm 2
+to 4 ms earlier than where it is (``Observable.update`` in ``robosuite/utils/observables.py``). Added up in floating
+point, as there, the timer observed the 24th in each of 20,000 control steps.
+"""
+
 _PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 
 
@@ -44,31 +53,6 @@ class Observed(NamedTuple):
     joint_state: NDArray[np.float32]
     hand_wxyz: Floats
     velocity: Floats
-
-
-class ObservationClock:
-    """Which substep of a control step robosuite 1.4.0 observes.
-
-    An observable samples once in 50 ms, by a timer that counts every update. A reset and LIBERO's ``set_init_state``
-    force one update each, so the timer is two substeps ahead, and a control step of 25 substeps is observed in its
-    24th, not after its last: the policy sees the arm 2 to 4 ms earlier than where it is
-    (``Observable.update`` in ``robosuite/utils/observables.py``).
-    """
-
-    def __init__(self, substep_s: float, sampling_s: float):
-        self._substep_s, self._sampling_s = substep_s, sampling_s
-        self._since_s = substep_s + substep_s
-        self._sampled = True
-
-    def tick(self) -> bool:
-        """Count one substep; whether it is the one that is observed."""
-        self._since_s += self._substep_s
-        samples = not self._sampled and self._since_s <= self._sampling_s
-        self._sampled |= samples
-        if self._since_s >= self._sampling_s:
-            self._since_s %= self._sampling_s
-            self._sampled = False
-        return samples
 
 
 class _Rewind(NamedTuple):
@@ -158,7 +142,6 @@ class Simulator(Environment):
     def _observe_from_here(self) -> None:
         env = self._env.env
         self._control_step = ControlStep(env)
-        self._clock = ObservationClock(env.model_timestep, 1 / env.control_freq)
         self.observed = self._observe(env.sim.data.qpos.copy())
 
     def step(self, action: Floats) -> None:
@@ -172,8 +155,8 @@ class Simulator(Environment):
         qpos = data.qpos.copy()
         self._act_from_outside()
         with self._stable():
-            for _ in self._control_step.substeps(action):
-                if self._clock.tick():
+            for number, _ in enumerate(self._control_step.substeps(action), start=1):
+                if number == OBSERVED:
                     self.observed = self._observe(qpos)
                 qpos = data.qpos.copy()
 
