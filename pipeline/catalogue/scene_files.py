@@ -17,8 +17,8 @@ from pipeline.files import checksum
 from pipeline.libero.assets import installed, name_of
 
 _OBJECTS, _HASH = "objects/", "#sha256="
-# As ElementTree writes attributes; besides file, a cube texture has fileright, fileleft and so on. That it begins with
-# letters has a model searched in a tenth of the time.
+# As ElementTree writes attributes; besides file, a cube texture has fileright, fileleft and so on. The pattern begins
+# with letters, so that searching takes a tenth of the time.
 _FILE = re.compile(r'(file(?<=\sfile)\w*)="([^"]*)"')
 
 

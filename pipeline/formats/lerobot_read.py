@@ -254,9 +254,15 @@ def frames_at(path: Path, times_s: Sequence[float]) -> list[Frame]:
     return frames
 
 
-@lru_cache(maxsize=len(SCHEMA.views))
+_VIDEOS: dict[Edition, av.container.InputContainer] = {}
+"""Those that are open, one of each view."""
+
+
 def _video(file: Edition) -> av.container.InputContainer:
-    """A video that stays open, as its next frames are likely to be asked for."""
-    video = av.open(str(file.path))
-    video.streams.video[0].thread_count = 1  # Starting more takes longer than a few frames.
-    return video
+    """A video that stays open for a while, as its next frames are likely to be asked for."""
+    if file not in _VIDEOS:
+        while len(_VIDEOS) >= len(SCHEMA.views):
+            _VIDEOS.pop(next(iter(_VIDEOS))).close()
+        _VIDEOS[file] = av.open(str(file.path))
+        _VIDEOS[file].streams.video[0].thread_count = 1  # Starting more takes longer than a few frames.
+    return _VIDEOS[file]

@@ -29,9 +29,11 @@ def open_all(root: Path) -> None:
     """Have TFDS open every set.
 
     Raises:
-        PipelineError: when it does not.
+        PipelineError: when it does not, or there is none.
     """
-    for file in root.glob("*/*/dataset_info.json"):
+    if not (files := sorted(root.glob("*/*/dataset_info.json"))):
+        raise PipelineError("no set", where=root, expected="NAME/1.0.0/dataset_info.json", remedy=MAKE_AGAIN)
+    for file in files:
         _info(file.parent)
 
 

@@ -83,7 +83,8 @@ class SealedFile:
 
     def length(self, name: str) -> int:
         """Of an array, which is not read."""
-        return len(self._file[name])
+        with _reading():
+            return len(self._file[name])
 
     def groups(self, name: str) -> list[str]:
         """Names of the groups in a group; BrokenSealError when they cannot be read."""
@@ -146,8 +147,10 @@ def _arrays(file: h5py.File) -> list[str]:
 
 
 def _seal_of(file: h5py.File, name: str) -> str:
-    seal = np.empty((), "S64")
-    h5py.h5a.open(file.id, SEAL.encode(), obj_name=name.encode()).read(seal)
+    stored, seal = h5py.h5a.open(file.id, SEAL.encode(), obj_name=name.encode()), np.zeros((), "S64")
+    if (stored.shape, stored.dtype) != (seal.shape, seal.dtype):  # HDF5 would write past the end.
+        raise BrokenSealError(f"the checksum of {name} is not what was written")
+    stored.read(seal)
     return bytes(seal[()]).decode(errors="replace")
 
 

@@ -1,6 +1,7 @@
 """One episode wherever it lies, which the checks look at."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -71,7 +72,10 @@ class Case:
         for copy in self.whole:
             for view, stored in self.stored.items():
                 files = copy.episode.frames.get(view)
-                if not files or any(files[step] != self.made.frames[view][step] for step in stored.frames):
+                if files and all(files[step] == self.made.frames[view][step] for step in stored.frames):
+                    continue
+                # Of what cannot be decoded, ``jpeg`` tells, and ``format`` where a view is not there.
+                with suppress(ValueError, TypeError, LookupError, cv2.error):
                     frames = {step: copy.frame(view, step) for step in stored.frames}
                     found.append(Seen(copy.dataset, view, frames, video=not files))
         return found

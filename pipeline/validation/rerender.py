@@ -15,7 +15,7 @@ from pipeline.axes import PixelPerturbation, RenderPerturbation, from_json, of_l
 from pipeline.config import RenderConfig
 from pipeline.episode_schema import SCHEMA
 from pipeline.formats.read_back import Fault
-from pipeline.images.jpeg import decode, encode
+from pipeline.images.jpeg import encode
 from pipeline.rendering.renderer import LastScene
 from pipeline.types import Frame
 from pipeline.validation.case import Case
@@ -51,8 +51,11 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
             name = f"{view} of step {step}"
             stored = case.made.frames[view][step]
             again = encode(_turned(fresh[view]), config)
-            shown = [("frames", decode(stored))] if stored != again or not exact else []
-            for dataset, frame in [*shown, *((copy.dataset, copy.frame(view, step)) for copy in case.whole)]:
+            same = exact and stored == again
+            for seen in case.seen:
+                if seen.view != view or (same and seen.dataset == "frames"):
+                    continue
+                dataset, frame = seen.dataset, seen.frames[step]
                 right = f"{name} turned by {SCHEMA.image_rotation_deg} degrees"
                 nearest, reached_db = _nearest(frame, right, view, fresh, former.get(view))
                 if nearest != right or reached_db < PSNR_DB:

@@ -9,6 +9,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from operator import call
 from pathlib import Path
 from typing import Any
 
@@ -100,35 +101,39 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
 
 def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -> Results:
     """The checks of some datasets, each as a whole, and of their episodes; ``job`` has all datasets."""
-    total, opened = Results(), []
+    total = Results()
     files = [file for one in job.formats for file in one.written()]
     for faults in workers(Written.faults, files, "checksums"):
         total.note("checksums", faults)
-    changed = {fault.dataset for fault in total.findings["checksums"]}
     # What changed files seem to hold is of no interest, and may be anything.
-    for one in (one for one in job.formats if one.name not in changed):
-        try:
-            one.open()
-            opened.append(one)
-        except PipelineError as error:
-            total.note("readable", [_closed(one, error)], 0)
-    job = replace(job, formats=opened)
-    # Together, and what takes longest first: where one worker loads lerobot, the others go on with the episodes.
-    work: list[Callable[[], Results]] = [partial(_as_a_whole, one, episodes, job.cache) for one in reversed(opened)]
-    if "outcome" not in job.extras and any(one.name == "rlds" for one in opened):
+    changed = {fault.dataset for fault in total.findings["checksums"]}
+    unchanged = [one for one in job.formats if one.name not in changed]
+    # In workers, which read the episodes with the same packages later.
+    closed = workers(_closed, unchanged, "open")
+    total.note("readable", [fault for fault in closed if fault], 0)
+    job = replace(job, formats=[one for one, fault in zip(unchanged, closed, strict=True) if not fault])
+    # Together, and lerobot, which takes longest, before RLDS: the other workers go on with the episodes.
+    work: list[Callable[[], Results]] = [
+        partial(_as_a_whole, one, episodes, job.cache) for one in reversed(job.formats)
+    ]
+    if "outcome" not in job.extras and any(one.name == "rlds" for one in job.formats):
         statistics = read_json(job.data / "dataset_statistics.json")
         work += [partial(_openvla_oft, statistics, folder) for folder in oft.datasets(job.data / "rlds")]
-    work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, opened)]
-    for results in workers(_done, work, "validate"):
+    work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
+    for results in workers(call, work, "validate"):
         total.add(results)
     return total
 
 
-def _done(work: Callable[[], Results]) -> Results:
-    return work()
+def _closed(one: Format[Any]) -> Fault | None:
+    try:
+        one.open()
+    except PipelineError as error:
+        return _unreadable(one, error)
+    return None
 
 
-def _closed(one: Format[Any], error: PipelineError) -> Fault:
+def _unreadable(one: Format[Any], error: PipelineError) -> Fault:
     return Fault(one.name, None, str(error), "a dataset that can be opened")
 
 
@@ -153,7 +158,7 @@ def _as_a_whole(one: Format[Any], episodes: Mapping[str, Row], cache: Path) -> R
     try:
         found = list(one.check(episodes, cache))
     except PipelineError as error:
-        results.note("readable", [_closed(one, error)], 0)
+        results.note("readable", [_unreadable(one, error)], 0)
         return results
     for check, checked in (("format", 1), ("ids", len(episodes)), ("readable", 0)):
         results.note(check, [fault for named, fault in found if named == check], checked)
@@ -164,7 +169,7 @@ def _openvla_oft(statistics: Mapping[str, Any], folder: Path) -> Results:
     try:
         wrong = oft.check(folder, statistics)["violations"]
     except PipelineError as error:
-        wrong = [str(error)]  # It stops at what is damaged.
+        wrong = [str(error)]  # The reader stops at what is damaged.
     results, name = Results(), folder.parent.name
     results.note(
         "openvla_oft", (Fault("rlds", None, f"{name}: {what}", "what OpenVLA-OFT trains on") for what in wrong)
@@ -181,7 +186,7 @@ def _slices(kept: Mapping[str, Row], again: Collection[str], formats: Sequence[F
     rows = sorted(kept.values(), key=lambda row: (row["suite"], row["task"]))
     by_trajectory = grouped((row["trajectory_id"], row) for row in rows if row["episode_id"] in again)
     others = [row for row in rows if row["episode_id"] not in again]
-    # LeRobot's files last, as theirs are the largest: the next episode lies in those that are open.
+    # By LeRobot's files first, as theirs are the largest: the next episode lies in those that are open.
     columns = [column.name for one in reversed(formats) for column in one.columns]
     others.sort(key=lambda row: [(row[column] is None, row[column]) for column in columns])
     return [*by_trajectory.values(), *(others[start : start + SLICE] for start in range(0, len(others), SLICE))]
@@ -206,8 +211,9 @@ class EpisodesJob:
     extras: tuple[Extra, ...] = ()
 
     def __call__(self, rows: Sequence[Row]) -> Results:
-        results, language, rewrites = Results(), self.config.plan.axes.language, None
+        results, rewrites = Results(), None
         if any(one.language for one in self.formats):
+            language = self.config.plan.axes.language
             rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
         load = EpisodeLoader(self.data, self.config.render, self.extras, rewrites)
         for row in rows:
