@@ -22,8 +22,8 @@ VIDEO_PSNR_DB = 32.0
 In colour it can be 20: a video holds colours at half the resolution, which a fine, colourful surface shows."""
 
 COLOURS_OFF = 0.5
-"""Share of a stored frame's colourfulness by which a video's colours may differ; the most of 3,843 frames was 0.14. Grey
-frames are off by 1, and those with red and blue exchanged by more."""
+"""Share of a stored frame's colourfulness by which a video's colours may differ; of 3,843 frames the most was 0.14.
+Grey frames are off by 1, and those with red and blue exchanged by more."""
 
 PALE_LEVELS = 4.0
 """Frames count as at least so colourful: the mean distance of Cb and Cr from grey, in levels, over 16 by 16 fields."""
