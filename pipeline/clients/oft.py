@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats import exact_statistics
+from pipeline.formats.rlds_layout import datasets
 from pipeline.formats.tfrecord import METADATA, columns, records
 
 CHUNK = 8
@@ -74,18 +75,6 @@ class Samples:
 
     def __len__(self) -> int:
         return len(self.actions)
-
-
-def datasets(root: Path) -> list[Path]:
-    """Version folders of the datasets below OFT's ``data_root_dir``.
-
-    Raises:
-        PipelineError: when there is none.
-    """
-    found = sorted(file.parent for file in root.glob("*/*/dataset_info.json"))
-    if not found:
-        raise PipelineError("no RLDS dataset", where=root, expected="NAME/1.0.0/dataset_info.json", remedy=MAKE_AGAIN)
-    return found
 
 
 def read(folder: Path) -> Iterator[Recorded]:

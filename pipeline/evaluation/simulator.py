@@ -28,8 +28,8 @@ OBSERVED = 24
 
 An observable samples once in 50 ms, by a timer that counts every update. A reset and LIBERO's ``set_init_state`` force
 one update each, so the timer is two substeps ahead, and the 24th is observed, not the last: the policy sees the arm 2
-to 4 ms earlier than where it is (``Observable.update`` in ``robosuite/utils/observables.py``). Added up in floating
-point, as there, the timer observed the 24th in each of 20,000 control steps.
+to 4 ms earlier than where it is (``Observable.update`` in ``robosuite/utils/observables.py``). An ``Observable`` that
+was updated twice observed the 24th in each of 20,000 control steps.
 """
 
 _PHYSICS = int(mujoco.mjtState.mjSTATE_INTEGRATION)

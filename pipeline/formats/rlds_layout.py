@@ -2,9 +2,22 @@
 
 from pathlib import Path
 
+from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.formats.base import Row
 
 VERSION = "1.0.0"
+
+
+def datasets(root: Path) -> list[Path]:
+    """Version folders of the sets below TFDS's ``data_dir``, OFT's ``data_root_dir``.
+
+    Raises:
+        PipelineError: when there is none.
+    """
+    found = sorted(file.parent for file in root.glob("*/*/dataset_info.json"))
+    if not found:
+        raise PipelineError("no RLDS dataset", where=root, expected="NAME/1.0.0/dataset_info.json", remedy=MAKE_AGAIN)
+    return found
 
 
 def shard_path(name: str, split_name: str, shard: int, shards: int) -> str:

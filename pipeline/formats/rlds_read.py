@@ -13,7 +13,7 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.read_back import Copy, Fault
-from pipeline.formats.rlds_layout import VERSION, dataset_of
+from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets
 from pipeline.formats.rlds_write import features
 from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans
 from pipeline.types import Episode, Extra, Geometry
@@ -31,10 +31,8 @@ def open_all(root: Path) -> None:
     Raises:
         PipelineError: when it does not, or there is none.
     """
-    if not (files := sorted(root.glob("*/*/dataset_info.json"))):
-        raise PipelineError("no set", where=root, expected="NAME/1.0.0/dataset_info.json", remedy=MAKE_AGAIN)
-    for file in files:
-        _info(file.parent)
+    for folder in datasets(root):
+        _info(folder)
 
 
 def check(root: Path, kept: Mapping[str, Row], extras: tuple[Extra, ...]) -> Iterator[tuple[str, Fault]]:

@@ -55,16 +55,15 @@ def rendered(case: Case, config: RenderConfig, opened: LastScene) -> Iterator[Fa
             for seen in case.seen:
                 if seen.view != view or (same and seen.dataset == "frames"):
                     continue
-                dataset, frame = seen.dataset, seen.frames[step]
                 right = f"{name} turned by {SCHEMA.image_rotation_deg} degrees"
-                nearest, reached_db = _nearest(frame, right, view, fresh, former.get(view))
+                nearest, reached_db = _nearest(seen.frames[step], right, view, fresh, former.get(view))
                 if nearest != right or reached_db < PSNR_DB:
                     what = f"{name} is nearest to {nearest}, {reached_db:.1f} dB"
-                    yield case.finding(dataset, what, right)
-                elif exact and dataset == "frames":
+                    yield case.finding(seen.dataset, what, right)
+                elif exact and seen.dataset == "frames":
                     what = f"{name} is another file than a fresh rendering, {reached_db:.1f} dB apart"
                     expected = f"the same file, as both were rendered by {case.row['gl_device']}"
-                    yield case.finding(dataset, what, expected)
+                    yield case.finding(seen.dataset, what, expected)
 
 
 def _nearest(

@@ -22,6 +22,7 @@ from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
 from pipeline.formats.registry import failures_of, formats_of
+from pipeline.formats.rlds_layout import datasets
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
@@ -118,7 +119,7 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
     ]
     if "outcome" not in job.extras and any(one.name == "rlds" for one in job.formats):
         statistics = read_json(job.data / "dataset_statistics.json")
-        work += [partial(_openvla_oft, statistics, folder) for folder in oft.datasets(job.data / "rlds")]
+        work += [partial(_openvla_oft, statistics, folder) for folder in datasets(job.data / "rlds")]
     work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
     for results in workers(call, work, "validate"):
         total.add(results)

@@ -22,6 +22,7 @@ from pipeline.export_config import RldsConfig
 from pipeline.formats import exact_statistics, rlds_write
 from pipeline.formats.episodes import Episodes, Known
 from pipeline.formats.rlds import Rlds
+from pipeline.formats.rlds_layout import datasets
 from pipeline.run.export import export
 from pipeline.types import Episode, Geometry
 
@@ -90,7 +91,7 @@ def statistics(data: Path) -> dict[str, Any]:
 
 
 def test_a_trajectory_becomes_whole_chunks(data: Path, statistics: dict[str, Any]) -> None:
-    (folder,) = oft.datasets(data / "rlds")
+    (folder,) = datasets(data / "rlds")
     read = list(oft.read(folder))
     assert [found.name for found in read] == list(LENGTHS)
     for found in read:
@@ -187,7 +188,7 @@ def test_check_catches_a_gripper_of_the_wrong_sign(tmp_path: Path) -> None:
 
 
 def test_check_catches_statistics_of_something_else(data: Path, statistics: dict[str, Any]) -> None:
-    (folder,) = oft.datasets(data / "rlds")
+    (folder,) = datasets(data / "rlds")
     off = json.loads(json.dumps(statistics))
     off["proprio"]["q99"][3] += 1e-6
     found = oft.check(folder, {NAME: off})
@@ -200,7 +201,7 @@ def test_check_catches_statistics_of_something_else(data: Path, statistics: dict
 
 def test_damage_is_found(data: Path, tmp_path: Path) -> None:
     write(tmp_path)
-    (folder,) = oft.datasets(tmp_path / "rlds")
+    (folder,) = datasets(tmp_path / "rlds")
     shard = sorted(folder.glob("*.tfrecord-*"))[1]
     whole = shard.read_bytes()
     for damaged in (whole[:-9], whole[:5], whole[:2] + b"\x01" + whole[3:], whole[:5000] + b"!" + whole[5001:]):
