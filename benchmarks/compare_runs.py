@@ -15,7 +15,6 @@ from pathlib import Path
 import pipeline  # noqa: F401 - before NumPy, whose machine code it fixes
 
 # isort: split
-import h5py
 import numpy as np
 from pythons import contents
 
@@ -24,13 +23,14 @@ from pipeline.images import jpeg
 
 def frames(data: Path) -> Iterator[tuple[str, bytes]]:
     """Trajectory, stream and step of each stored frame, and its JPEG file."""
-    for path in sorted((data / "frames").rglob("*.h5")):
-        with h5py.File(path) as file:
-            for name, stream in file["streams"].items():
-                packed, start = stream["bytes"][()].tobytes(), 0
-                for step, end in enumerate(stream["ends"][()]):
-                    yield f"{path.parent.name}/{name}/{step}", packed[start:end]
-                    start = int(end)
+    for path in sorted((data / "frames").rglob("*.npz")):
+        with np.load(path) as arrays:
+            streams = sorted({name.split("/")[1] for name in arrays.files if name.startswith("streams/")})
+            for stream in streams:
+                packed, start = arrays[f"streams/{stream}/bytes"].tobytes(), 0
+                for step, end in enumerate(arrays[f"streams/{stream}/ends"].tolist()):
+                    yield f"{path.parent.name}/{stream}/{step}", packed[start:end]
+                    start = end
 
 
 def pixels(one: bytes, other: bytes) -> tuple[int, int]:

@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from zipfile import ZipFile
 
 import h5py
 import numpy as np
@@ -39,7 +40,10 @@ def _contents(file: Path) -> Iterator[bytes]:
             yield json.dumps(table.to_pylist(), default=repr).encode()
             for metadata in (table.schema.metadata or {}, *(field.metadata or {} for field in table.schema)):
                 yield b" ".join((*metadata.keys(), *metadata.values()))
-        case ".h5" | ".hdf5":
+        case ".npz":
+            with ZipFile(file) as archive:
+                yield from map(archive.read, archive.namelist())
+        case ".hdf5":
             with h5py.File(file) as opened:
                 yield from _in_hdf5(opened)
         case ".html":

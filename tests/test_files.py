@@ -11,7 +11,7 @@ from pipeline.files import replaced
 
 def test_two_that_write_the_same_file_do_not_disturb_each_other(tmp_path: Path) -> None:
     """A job that a cluster gives out again, while its first worker still writes; both may have the same number."""
-    path = tmp_path / "0123.h5"
+    path = tmp_path / "0123.npz"
     with replaced(path) as first:
         first.write_text("first")
         with replaced(path) as second:

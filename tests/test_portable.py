@@ -47,6 +47,10 @@ def write_parquet_metadata(file: Path, text: bytes) -> None:
 
 
 def write_array(file: Path, text: bytes) -> None:
+    np.savez_compressed(file, a=np.frombuffer(text * 99, np.uint8))
+
+
+def write_recording(file: Path, text: bytes) -> None:
     with h5py.File(file, "w") as opened:
         opened.create_dataset("a/b", data=np.frombuffer(text * 99, np.uint8), compression="gzip")
 
@@ -68,7 +72,8 @@ def write_record(file: Path, text: bytes) -> None:
 WRITERS = {
     "text.parquet": write_parquet,
     "metadata.parquet": write_parquet_metadata,
-    "array.h5": write_array,
+    "array.npz": write_array,
+    "array.hdf5": write_recording,
     "attribute.hdf5": write_attribute,
     "page.html": write_page,
     "set.tfrecord-00000-of-00001": write_record,
@@ -87,7 +92,7 @@ def test_a_path_is_found_in_every_kind_of_file(name: str, tmp_path: Path) -> Non
 @pytest.mark.slow
 def test_no_file_of_a_run_tells_where_it_was_made(finished: Path) -> None:
     files = [file for file in finished.rglob("*") if file.is_file()]
-    assert {file.suffix for file in files} >= {".h5", ".parquet", ".json", ".html", ".md", ".png", ".mp4", ".yaml"}
+    assert {file.suffix for file in files} >= {".npz", ".parquet", ".json", ".html", ".md", ".png", ".mp4", ".yaml"}
     clone = str(finished.parent.parent)
     assert {str(file.relative_to(finished)): paths for file in files if (paths := told(file, [clone]))} == {}
 
@@ -221,7 +226,7 @@ def test_two_installations_make_the_same_file_and_read_each_other_s(tmp_path: Pa
         )
         assert done.returncode == 0, done.stderr
         frame, _, scene = done.stdout.partition("\n")
-        files.append((tmp_path / name / "made.h5").read_bytes())
+        files.append((tmp_path / name / "made.npz").read_bytes())
         frames.append(frame)
         scenes.append(re.findall(r'file="([^"]*)"', scene))
     assert files[0] == files[1]

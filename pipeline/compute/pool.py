@@ -120,6 +120,8 @@ def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Wo
     dask.config.set(
         {
             "distributed.worker.multiprocessing-method": "spawn",
+            # The profiler keeps the frames of the working thread, and with them open files and arrays, alive.
+            "distributed.worker.profile.enabled": False,
             "distributed.admin.tick.limit": "60s",
             # The rows of 28,000 episodes, which the checks are sent, have 33 MB.
             "distributed.admin.large-graph-warning-threshold": "1GB",

@@ -21,6 +21,7 @@ from pipeline.identity import fingerprint, made_with
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
 from pipeline.run.finished import FOLDER
+from pipeline.stores.store import SUFFIX
 
 FILE = "machine.json"
 """File of a run's folder that says what it began with, and what trials came to."""
@@ -126,7 +127,8 @@ def refuse_another(folder: Path, trial: Mapping[str, str]) -> None:
     recorded = trials(folder)
     for name, digest in _named(trial).items():
         stores = STORES[name.split(",")[0]]
-        if recorded.get(name, digest) != digest and any(next((folder / one).rglob("*.h5"), None) for one in stores):
+        files_exist = any(next((folder / store).rglob(f"*{SUFFIX}"), None) for store in stores)
+        if recorded.get(name, digest) != digest and files_exist:
             raise PipelineError(
                 f"the run was begun where {name} came to {recorded[name]}, here it is {digest}",
                 where=folder / FILE,

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-import h5py
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from pipeline.errors import PipelineError
 from pipeline.identity import MAPS_RECIPE
 from pipeline.seeding import digest
 from pipeline.stores.sealed_file import SealedFile
-from pipeline.stores.store import Store
+from pipeline.stores.store import SUFFIX, Store
 from pipeline.types import Geometry, Quality, Rendered
 
 _OF_THE_SCHEMA = {"views", "frame", *MATRICES, *MAPS, "object_poses"}
@@ -55,7 +54,7 @@ class FrameStore(Store):
     What was encoded otherwise than ``config`` says counts as missing.
     """
 
-    step, stage, pattern = "encoding", "render", "*/*.h5"
+    step, stage, pattern = "encoding", "render", f"*/*{SUFFIX}"
     columns: ClassVar = {
         "device": pa.string(),
         "replay_mode": pa.string(),
@@ -72,7 +71,7 @@ class FrameStore(Store):
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
         told = {name: file.attributes[name] for name in ("device", "replay_mode", "rejected")}
-        return {**told, "steps": file.length("action"), "streams": file.groups("streams")}
+        return {**told, "steps": len(file.array("action")), "streams": _members(file, "streams")}
 
     def folder(self, trajectory_id: str) -> Path:
         return self.root / trajectory_id
@@ -86,21 +85,21 @@ class FrameStore(Store):
             "rejected": json.dumps(dict(rendered.rejected), sort_keys=True),
             "quality": asdict(rendered.quality) if rendered.quality else None,
         }
-        with self.created(file_name(trajectory_id, {*rendered.streams, *rendered.rejected}), attributes) as file:
-            for name in ("state", "joint_state", "action"):
-                file[name] = getattr(rendered, name)
-            streams = file.create_group("streams")
-            for stream_id, frames in sorted(rendered.streams.items()):
-                _pack(streams.create_group(stream_id), frames)
-            views = file.create_group("geometry")
-            for geometry_id, geometry in sorted(rendered.geometry.items()):
-                view = views.create_group(geometry_id)
-                for name in MATRICES:
-                    view[name] = getattr(geometry, name)
-                for name, files in geometry.maps.items():
-                    _pack(view.create_group(name), files)
-            if rendered.object_poses is not None:
-                file["object_poses"] = rendered.object_poses
+        arrays: dict[str, NDArray[Any]] = {
+            "state": rendered.state,
+            "joint_state": rendered.joint_state,
+            "action": rendered.action,
+        }
+        for stream_id, frames in sorted(rendered.streams.items()):
+            arrays |= _packed(f"streams/{stream_id}", frames)
+        for geometry_id, geometry in sorted(rendered.geometry.items()):
+            view = f"geometry/{geometry_id}"
+            arrays |= {f"{view}/{name}": getattr(geometry, name) for name in MATRICES}
+            for extra, files in geometry.maps.items():
+                arrays |= _packed(f"{view}/{extra}", files)
+        if rendered.object_poses is not None:
+            arrays["object_poses"] = rendered.object_poses
+        self.write(file_name(trajectory_id, {*rendered.streams, *rendered.rejected}), arrays, attributes)
 
     def load(self, trajectory_id: str, streams: Collection[str], geometry: Collection[str] = ()) -> Rendered:
         """Read the named streams of a trajectory.
@@ -118,7 +117,7 @@ class FrameStore(Store):
             if not frames and not views:
                 break
             with self.opened(name) as file:
-                here = frames & set(file.groups("streams")), views & set(file.groups("geometry"))
+                here = frames & {*_members(file, "streams")}, views & {*_members(file, "geometry")}
                 if any(here):
                     parts.append(_rendered(file, *here))
             frames, views = frames - here[0], views - here[1]
@@ -131,32 +130,33 @@ class FrameStore(Store):
         return merged(parts)
 
     def stored(self, trajectory_id: str, streams: Mapping[str, str], device: str) -> list[Rendered]:
-        """What files hold of the named streams of a trajectory, each stream once; a damaged file counts as missing.
+        """Read what up-to-date files hold of the named streams of a trajectory, each stream once.
 
         Args:
             streams: id of a stream to the id of its geometry.
-            device: which must have rendered them.
+            device: OpenGL device that must have rendered them.
+
+        Raises:
+            PipelineError: when a file is damaged.
         """
         parts: list[Rendered] = []
         missing = set(streams)
         for name in self._files_of(trajectory_id):
-            try:
-                with self.opened(name) as file:
-                    row = self.describe(file)
-                    told = {*row["streams"], *json.loads(row["rejected"])}
-                    here = missing & told if row["device"] == device else set()
-                    if here:
-                        frames = here & set(row["streams"])
-                        part = _rendered(file, frames, {streams[stream] for stream in frames})
-                        parts.append(replace(part, rejected={s: why for s, why in part.rejected.items() if s in here}))
-            except PipelineError:
+            row = self.row(name)
+            if row is None or row["device"] != device:
                 continue
-            missing -= here
+            rendered = missing & set(row["streams"])
+            rejected = {stream: why for stream, why in json.loads(row["rejected"]).items() if stream in missing}
+            if rendered or rejected:
+                with self.opened(name) as file:
+                    part = _rendered(file, rendered, {streams[stream] for stream in rendered})
+                parts.append(replace(part, rejected=rejected))
+            missing -= {*rendered, *rejected}
         return parts
 
     def outdated_of(self, trajectories: Collection[str], device: str | None) -> Counter[str]:
-        """``outdated`` for all files of some trajectories; with a device, those of another are counted too."""
-        names = [name for name in self.names() if name.split("/")[0] in trajectories]
+        """Count by reason the outdated files of some trajectories; with a device, also the files of other devices."""
+        names = [name for name in self.names_of_all_versions() if name.split("/")[0] in trajectories]
         reasons = self.outdated(names)
         rows = self.rows()
         for name in names if device else ():
@@ -172,12 +172,12 @@ class FrameStore(Store):
         """
         for name in self._files_of(trajectory_id):
             with self.opened(name) as file:
-                if file.groups("streams"):
+                if _members(file, "streams"):
                     return file.array("action"), file.array("state")
         raise PipelineError("not rendered", where=self.folder(trajectory_id), remedy="run the render stage again")
 
     def _files_of(self, trajectory_id: str) -> list[str]:
-        return sorted(f"{trajectory_id}/{path.stem}" for path in self.folder(trajectory_id).glob("*.h5"))
+        return sorted(f"{trajectory_id}/{path.stem}" for path in self.folder(trajectory_id).glob(f"*{SUFFIX}"))
 
 
 def file_name(trajectory_id: str, streams: Iterable[str]) -> str:
@@ -220,20 +220,26 @@ def _rendered(file: SealedFile, streams: Collection[str], geometry: Collection[s
         streams={name: _frames(file, f"streams/{name}") for name in streams},
         rejected=json.loads(file.attributes["rejected"]),
         geometry={name: _geometry(file, f"geometry/{name}") for name in geometry},
-        object_poses=file.array("object_poses") if "object_poses" in file else None,
+        object_poses=file.array("object_poses") if "object_poses" in file.checksums else None,
         instances=file.attributes["instances"],
         quality=Quality(**quality) if (quality := file.attributes["quality"]) else None,
     )
 
 
-def _pack(group: h5py.Group, files: Sequence[bytes]) -> None:
-    group["bytes"] = np.frombuffer(b"".join(files), np.uint8)
-    group["ends"] = np.cumsum([len(one) for one in files])
+def _members(file: SealedFile, parent: str) -> list[str]:
+    """List the groups of arrays directly below ``parent``, such as the ids of the streams."""
+    return sorted({name.split("/")[1] for name in file.checksums if name.startswith(f"{parent}/")})
+
+
+def _packed(parent: str, files: Sequence[bytes]) -> dict[str, NDArray[Any]]:
+    """Join encoded images into one array of bytes and one of the offsets at which they end."""
+    ends = np.cumsum([len(content) for content in files], dtype=np.int64)
+    return {f"{parent}/bytes": np.frombuffer(b"".join(files), np.uint8), f"{parent}/ends": ends}
 
 
 def _geometry(file: SealedFile, view: str) -> Geometry:
     matrices = {name: file.array(f"{view}/{name}") for name in MATRICES}
-    maps = {name: _frames(file, f"{view}/{name}") for name in MAPS if f"{view}/{name}/bytes" in file}
+    maps = {name: _frames(file, f"{view}/{name}") for name in MAPS if f"{view}/{name}/bytes" in file.checksums}
     return Geometry(**matrices, maps=maps)
 
 

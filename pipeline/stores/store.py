@@ -1,11 +1,12 @@
-"""A folder of HDF5 files that one stage makes, and the table that says what is in them.
+"""Folder of files that one stage writes, and a table of their contents.
 
-A file is whole or not there, and named after what it holds, so that a changed plan never picks up a file that was made
-for something else, and still finds every file that it shares with the plan before it.
+A file is complete or absent, and is named after its content. A changed plan therefore never uses a file of another
+perturbation, and still finds every file that it shares with the earlier plan. Only a file that does not exist is
+missing: a file that cannot be read is an error, so no work is silently repeated.
 
-The table has a row for each file. It spares the stages from opening every file to learn a verdict or a length. It is
-rebuilt where it is missing or doubted: a row is believed while its file has the recorded size and is older than the
-table; any other file is opened and read. For people, the table's metadata says what fingerprints stand for.
+The table has a row for each file, so stages need not open every file to learn a verdict or a length. A row is valid
+while its file has the recorded size and is older than the table; any other file is opened and read. The metadata of the
+table says, for people, what fingerprints stand for.
 """
 
 import json
@@ -17,18 +18,23 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
 
-import h5py
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from pipeline.errors import PipelineError
 from pipeline.files import keep_below, replaced
 from pipeline.identity import Step, differences, fingerprint, made_with
 from pipeline.seeding import digest
-from pipeline.stores.sealed_file import BrokenSealError, SealedFile, sealed, unsealed
+from pipeline.stores.sealed_file import BrokenSealError, SealedFile, seal, unsealed
 from pipeline.tables import read_table, write_table
 
 TABLE = "index.parquet"
+
+SUFFIX = ".npz"
+
+EARLIER_SUFFIX = ".h5"
+"""Suffix of the HDF5 files of version 0.3 and earlier, which this version does not read."""
 
 _MADE_WITH = b"made_with"
 """The table's metadata that has, as JSON, a fingerprint to what files of it were made with."""
@@ -48,8 +54,8 @@ class Store(ABC):
     """Which stage makes them anew, for messages."""
     columns: ClassVar[Mapping[str, pa.DataType]]
     """Of the table, beside ``file``, ``made_by`` and ``bytes``."""
-    pattern: ClassVar[str] = "*.h5"
-    """How the files lie below ``root``."""
+    pattern: ClassVar[str] = f"*{SUFFIX}"
+    """Glob pattern of the files below ``root``."""
 
     def __init__(self, root: Path, settings: object = None, form: Mapping[str, object] = MappingProxyType({})):
         self.root = root
@@ -66,43 +72,64 @@ class Store(ABC):
         """A file's values of ``columns``."""
 
     def path(self, name: str) -> Path:
-        """Where a file lies; its name may have folders in it, and has no suffix."""
-        return self.root / f"{name}.h5"
+        """Path of a file; its name may contain folders, and has no suffix."""
+        return self.root / f"{name}{SUFFIX}"
 
     def names(self) -> list[str]:
-        """Of all files, current or not."""
+        """List all files, up to date or not."""
         return sorted(path.relative_to(self.root).with_suffix("").as_posix() for path in self.root.glob(self.pattern))
 
-    @contextmanager
-    def created(self, name: str, attributes: Mapping[str, Any]) -> Iterator[h5py.File]:
-        """A new file to fill with arrays, with ``attributes`` as JSON; it takes its place when the block ends."""
-        with (
-            replaced(self.path(name)) as temporary,
-            sealed(temporary, {**attributes, "made_by": self.made_by}) as file,
-        ):
-            yield file
+    def names_of_all_versions(self) -> list[str]:
+        """List all files, also those that this version does not read."""
+        earlier = self.root.glob(self.pattern.replace(SUFFIX, EARLIER_SUFFIX))
+        return sorted({*self.names(), *(path.relative_to(self.root).with_suffix("").as_posix() for path in earlier)})
+
+    def write(self, name: str, arrays: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+        """Write a file of arrays, with ``attributes`` as JSON; it is complete or absent."""
+        with replaced(self.path(name)) as temporary:
+            seal(temporary, arrays, {**attributes, "made_by": self.made_by})
 
     @contextmanager
     def opened(self, name: str) -> Iterator[SealedFile]:
-        """A file to read.
+        """Open a file for reading.
 
         Raises:
-            PipelineError: when it is missing, damaged, or not current.
+            PipelineError: when it is missing, damaged, or not up to date.
+            OSError: when the system does not open or read it.
         """
-        path, remedy = self.path(name), f"run the {self.stage} stage again"
+        with self._readable(name) as file:
+            if file.attributes["made_by"] != self.made_by:
+                raise PipelineError(
+                    "made by another version or with other settings",
+                    where=self.path(name),
+                    remedy=f"run the {self.stage} stage again",
+                )
+            yield file
+
+    @contextmanager
+    def _readable(self, name: str) -> Iterator[SealedFile]:
+        path = self.path(name)
         if not path.exists():
-            raise PipelineError("missing", where=path, remedy=remedy)
+            raise PipelineError("missing", where=path, remedy=f"run the {self.stage} stage again")
         try:
             with unsealed(path) as file:
-                if file.attributes.get("made_by") != self.made_by:
-                    raise PipelineError("made by another version or with other settings", where=path, remedy=remedy)
                 yield file
         except BrokenSealError as error:
-            # The stage believes its table, and does not read every file again.
-            raise PipelineError(f"damaged ({error})", where=path, remedy=f"delete the file and {remedy}") from error
+            raise PipelineError(
+                f"damaged ({error})",
+                where=path,
+                expected="the content that was written, checked by its SHA-256",
+                remedy=f"look for errors of the disk; then move the file away and run the {self.stage} stage again, "
+                "which generates it again",
+            ) from error
 
     def rows(self) -> dict[str, dict[str, Any]]:
-        """Name of a file to its row, for every current one that can be read."""
+        """Map the name of each up-to-date file to its row.
+
+        Raises:
+            PipelineError: when a file is damaged.
+            OSError: when the system does not open or read one.
+        """
         return self._rows()[0]
 
     def _rows(self) -> tuple[dict[str, dict[str, Any]], bool]:
@@ -128,12 +155,18 @@ class Store(ABC):
         return believed, told.keys() - believed.keys()
 
     def row(self, name: str) -> dict[str, Any] | None:
-        """One row, read from the file; None when that is missing, damaged or not current."""
-        try:
-            with self.opened(name) as file:
-                described = self.describe(file)
-        except PipelineError:
+        """Read one row from its file; ``None`` when the file is missing or not up to date.
+
+        Raises:
+            PipelineError: when the file is damaged.
+            OSError: when the system does not open or read it.
+        """
+        if not self.path(name).exists():
             return None
+        with self._readable(name) as file:
+            if file.attributes["made_by"] != self.made_by:
+                return None
+            described = self.describe(file)
         return {"file": name, "made_by": self.made_by, "bytes": self.path(name).stat().st_size, **described}
 
     def _table(self) -> tuple[dict[str, dict[str, Any]], int]:
@@ -183,20 +216,24 @@ class Store(ABC):
         return known
 
     def outdated(self, names: Iterable[str]) -> Counter[str]:
-        """Why finished files count as missing, to how many do for this reason.
+        """Count, by reason, the finished files that count as missing.
 
-        Those that are damaged are not counted, nor those with other settings: whoever changed these wants new files.
+        Files with other settings are not counted: a user who changed the settings wants new files.
+
+        Raises:
+            PipelineError: when a file is damaged.
         """
         current, known = self.rows(), self._known()
         reasons: Counter[str] = Counter()
         for name in names:
-            if name in current or not self.path(name).exists():
+            if name in current:
                 continue
-            try:
-                with unsealed(self.path(name)) as file:
-                    then = known.get(str(file.attributes["made_by"]))
-            except (BrokenSealError, KeyError):
+            if not self.path(name).exists():
+                if self.path(name).with_suffix(EARLIER_SUFFIX).exists():
+                    reasons["the HDF5 container of an earlier version"] += 1
                 continue
+            with self._readable(name) as file:
+                then = known.get(str(file.attributes["made_by"]))
             if then is None:
                 reasons["something that was not written down"] += 1
             elif then["settings"] == self._made_with["settings"]:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from pipeline.catalogue.scene_files import located, portable
 from pipeline.config import FilterConfig
@@ -39,7 +40,7 @@ class TrajectoryStore(Store):
     @staticmethod
     def describe(file: SealedFile) -> dict[str, Any]:
         told = {name: file.attributes[name] for name in ("kept", "reason", "mode", "resolved")}
-        return {**told, "steps": file.length("actions"), **(file.attributes["quality"] or {})}
+        return {**told, "steps": len(file.array("actions")), **(file.attributes["quality"] or {})}
 
     def save(self, trajectory: Trajectory) -> None:
         scene = trajectory.scene
@@ -53,12 +54,14 @@ class TrajectoryStore(Store):
             # Others' files stay what they were before there were pushes.
             **({} if scene.push is None else {"push": scene.push}),
         }
-        with self.created(trajectory.trajectory_id, attributes) as file:
-            file["model_xml"] = np.frombuffer(portable(trajectory.model_xml).encode(), np.uint8)
-            file["start"] = scene.state
-            file["states"] = trajectory.states
-            file["actions"] = trajectory.actions
-            file.create_dataset("site_alpha", data=trajectory.site_alpha, compression="gzip")
+        arrays: dict[str, NDArray[Any]] = {
+            "model_xml": np.frombuffer(portable(trajectory.model_xml).encode(), np.uint8),
+            "start": scene.state,
+            "states": trajectory.states,
+            "actions": trajectory.actions,
+            "site_alpha": trajectory.site_alpha,
+        }
+        self.write(trajectory.trajectory_id, arrays, attributes)
 
     def load(self, trajectory_id: str) -> Trajectory:
         """Read a trajectory back.

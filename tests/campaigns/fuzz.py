@@ -328,8 +328,8 @@ KINDS = {
     "configuration": Kind("full.yaml", _configuration, load, exact=False, text=True),
     "plan": Kind("plan.parquet", _plan, plan.read),
     "manifest": Kind("manifest.parquet", _manifest, manifest.read),
-    "trajectory": Kind("trajectory.h5", _trajectory, _read_trajectory),
-    "frames": Kind("frames.h5", _frames, _read_frames),
+    "trajectory": Kind("trajectory.npz", _trajectory, _read_trajectory),
+    "frames": Kind("frames.npz", _frames, _read_frames),
     "record": Kind("rlds.json", _record, _read_record, exact=False, text=True),
     "report": Kind(
         "counts.json", lambda: b'{"camera": {"libero_goal": {"kept": 3}}}', read_json, exact=False, text=True

@@ -218,7 +218,7 @@ def _alive(session: int) -> list[psutil.Process]:
 
 def _stored(clone: Path) -> Iterator[Path]:
     for folder in ("trajectories", "frames"):
-        yield from (clone / "data" / "tiny" / folder).rglob("*.h5")
+        yield from (clone / "data" / "tiny" / folder).rglob("*.npz")
 
 
 def contents(clone: Path) -> dict[str, str]:

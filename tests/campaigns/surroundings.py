@@ -104,7 +104,7 @@ def remount(disk: Path, option: str) -> None:
 
 def remade_by_another_clock(clone: Path) -> list[str]:
     """Date all files ahead, as if they had been made before the clock was set back, and run all stages again."""
-    files = [file for file in (clone / "data" / "tiny").rglob("*.h5") if file.is_file()]
+    files = [file for file in (clone / "data" / "tiny").rglob("*.npz") if file.is_file()]
     ahead_s = time.time() + DAY_S
     for file in files:
         os.utime(file, (ahead_s, ahead_s))

@@ -32,7 +32,7 @@ def test_a_run_whose_replay_and_render_are_killed_has_what_one_has_that_is_not(f
     for folder in ("trajectories", "frames"):
         store = clone / "data" / "tiny" / folder
         (store / "index.parquet").unlink()
-        for made_last in sorted(store.rglob("*.h5"), key=lambda path: path.stat().st_size)[:2]:
+        for made_last in sorted(store.rglob("*.npz"), key=lambda path: path.stat().st_size)[:2]:
             made_last.unlink()
     killed = kill_and_resume(clone, kills=2, seed=SEED, took_s=dict.fromkeys(REPEATED, 5.0), target="manifest")
     assert killed.faults == [], f"repeat with seed {SEED}"

@@ -165,7 +165,7 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     rendered, *others = sorted((clone / "data/tiny/frames").glob("*/"))
     shutil.rmtree(rendered)
     assert would_run() == ["render", "exports and all that follows"]
-    (clone / "data/tiny/trajectories" / f"{others[0].name}.h5").unlink()
+    (clone / "data/tiny/trajectories" / f"{others[0].name}.npz").unlink()
     assert would_run() == ["replay", "render", "exports and all that follows"]
     configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
     assert "plan: another configuration: plan.seed" in call(clone, "status").stdout
@@ -273,7 +273,7 @@ def test_run_elsewhere_with_a_subset_in_one_format(ablation: Ablation) -> None:
     assert json.loads(found.stdout.splitlines()[-1])["openvla_oft"]["libero_tiny_goal"]["episodes"] == len(written)
     pushed = call(clone, "push", "lerobot", "me/tiny")
     assert "the run has no lerobot" in pushed.stderr
-    rot(next((data / "trajectories").glob("*.h5")))
+    rot(next((data / "trajectories").glob("*.npz")))
     assert call(clone, "check").returncode == 1
 
     (clone / "params.yaml").write_text("run: tiny\ndata: data\n")

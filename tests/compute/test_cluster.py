@@ -193,4 +193,4 @@ def test_replays_that_workers_leave_undone_are_named(tmp_path: Path) -> None:
     rows = plan.make(demos.index().entries, CLEAN, ReplayConfig(), NONE)
     with pytest.raises(PipelineError, match="1 trajectories were replayed and are still not there") as caught:
         Replays(demos, ReplayConfig(), tmp_path, lambda work, jobs, what: []).of(rows)
-    assert f"{rows[0].trajectory_id}.h5" in str(caught.value)
+    assert f"{rows[0].trajectory_id}.npz" in str(caught.value)

@@ -134,7 +134,7 @@ def test_a_demonstration_that_changed_since_the_plan_is_refused(short_demos: Pat
     with pytest.raises(PipelineError, match=r"changed since the plan(?s:.*)run the plan stage again") as caught:
         Replays(demos, ReplayConfig(), tmp_path / "trajectories", loop).of(rows)
     assert f"{file} demo_0" in str(caught.value)
-    assert not list(tmp_path.rglob("*.h5"))
+    assert not list(tmp_path.rglob("*.npz"))
 
 
 class PathSeen(PhysicsPerturbation):

@@ -113,11 +113,11 @@ def test_a_finished_dataset_is_made_anew_only_where_that_was_allowed(
 
 def test_a_lost_shard_and_a_damaged_trajectory_are_made_again(clone: Path, config: Config) -> None:
     shard = largest(config.data / "rlds")
-    trajectory = next((config.data / "trajectories").glob("*.h5"))
+    trajectory = next((config.data / "trajectories").glob("*.npz"))
     before = shard.read_bytes(), trajectory.read_bytes()
     shard.unlink()
     trajectory.write_bytes(before[1][: len(before[1]) // 2])
-    stale = config.data / "trajectories" / "stale.h5"
+    stale = config.data / "trajectories" / "stale.npz"
     stale.write_bytes(b"of an earlier plan")
     done = dvc(clone, "repro")
     assert done.returncode == 0, done.stdout + done.stderr

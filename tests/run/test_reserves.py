@@ -73,7 +73,7 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
     for name in ("machine.json", ".finished/doctor.json"):  # The machine was tried for that run.
         copy_of(f"data/tiny/{name}", finished.parent.parent, clone)
     made(clone, "replay")
-    replayed = set((clone / "data/tiny/trajectories").glob("*.h5"))
+    replayed = set((clone / "data/tiny/trajectories").glob("*.npz"))
     assert len(replayed) == 3, "the twin and the first candidates"
     refuse_frames_of_first_candidate(clone, fields)
     made(clone, "manifest")
@@ -90,7 +90,7 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
 
     # As a kill leaves it, after the refusals were stored and before the reserves had their frames: one of these has no
     # trajectory either.
-    reserves = sorted(set((clone / "data/tiny/trajectories").glob("*.h5")) - replayed)
+    reserves = sorted(set((clone / "data/tiny/trajectories").glob("*.npz")) - replayed)
     assert len(reserves) == 2
     reserves[0].unlink()
     for reserve in reserves:

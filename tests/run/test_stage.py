@@ -40,7 +40,7 @@ def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.slow
 def test_a_copy_with_the_old_name_is_refused_before_anything_else(clone: Path) -> None:
     claimed(Path("configs/tiny.yaml"))
-    trajectory = clone / "data" / "tiny" / "trajectories" / "0123.h5"
+    trajectory = clone / "data" / "tiny" / "trajectories" / "0123.npz"
     trajectory.parent.mkdir()
     trajectory.write_bytes(b"hours of work")
     shutil.copy("configs/tiny.yaml", "configs/copy.yaml")

@@ -34,7 +34,7 @@ def test_what_is_no_longer_asked_for_is_named_with_its_remedy(
 
 
 def test_parts_that_are_there_have_their_megabytes(tmp_path: Path) -> None:
-    for name, size in (("frames/one/file.h5", 2_500_000), ("frames/two/file.h5", 500_000), ("plan.parquet", 1000)):
+    for name, size in (("frames/one/file.npz", 2_500_000), ("frames/two/file.npz", 500_000), ("plan.parquet", 1000)):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         with (tmp_path / name).open("wb") as file:
             file.truncate(size)

@@ -196,9 +196,9 @@ def test_a_plan_that_grows_or_shrinks_has_the_files_of_a_first_run_and_renders_w
     def files(planned: Sequence[plan.Row], folder: str) -> dict[str, bytes]:
         store = FrameStore(tmp_path / folder, config.render)
         rendered = render_plan(planned, config, replayed, tmp_path / folder, loop)
-        (store.root / "0123.h5").write_bytes(b"all frames of a trajectory, as an earlier version stored them")
+        (store.root / "0123.npz").write_bytes(b"all frames of a trajectory, as an earlier version stored them")
         store.keep(rendered)
-        return {path.relative_to(store.root).as_posix(): path.read_bytes() for path in store.root.rglob("*.h5")}
+        return {path.relative_to(store.root).as_posix(): path.read_bytes() for path in store.root.rglob("*.npz")}
 
     first = files(rows, "first"), files(rows[:1], "shorter")
     made.clear()
@@ -224,18 +224,28 @@ def test_a_rejection_that_is_no_longer_planned_is_forgotten(
     assert row["streams"] == sorted(twin.streams)
 
 
-def test_a_damaged_file_is_rendered_again_and_hinders_no_other(
+def test_a_damaged_file_is_an_error_and_is_never_silently_rendered_again(
     config: Config, rows: list[plan.Row], replayed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pipeline.run.render_stage.STREAMS_OF_A_JOB", 2)
-    files = render_plan(rows, config, replayed, tmp_path, loop)
-    store = FrameStore(tmp_path, config.render)
+    frames = tmp_path / "frames"
+    files = render_plan(rows, config, replayed, frames, loop)
+    store = FrameStore(frames, config.render)
     whole, damaged = sorted(files)
     before = store.path(damaged).read_bytes()
     streams = store.rows()[whole]["streams"]
     store.path(damaged).write_bytes(before[:-100])
-    assert store.load(rows[0].trajectory_id, streams).streams.keys() == set(streams)
-    assert render_plan(rows, config, replayed, tmp_path, loop) == files
+    assert store.load(rows[0].trajectory_id, streams).streams.keys() == set(streams), "it hinders no other file"
+    wanted = {s.stream_id: s.geometry.stream_id for row in rows for s in streams_of(row.perturbations).values()}
+    for read in (
+        lambda: store.stored(rows[0].trajectory_id, wanted, gl.choose().device),
+        lambda: render_plan(rows, config, replayed, frames, nothing_to_do),
+    ):
+        with pytest.raises(PipelineError, match=rf"(?s){store.path(damaged).name}: damaged \(.+\).*move the file away"):
+            read()
+    assert store.path(damaged).read_bytes() == before[:-100]
+    store.path(damaged).rename(tmp_path / "moved away")
+    assert render_plan(rows, config, replayed, frames, loop) == files
     assert store.path(damaged).read_bytes() == before
 
 

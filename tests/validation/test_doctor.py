@@ -141,7 +141,7 @@ def test_demonstrations_count_by_their_files_and_before_by_what_is_published(sho
 def test_what_a_run_has_made_already_needs_no_more_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     link_testset(tmp_path)
-    frames = tmp_path / "data" / "starter" / "frames" / "0123" / "4567.h5"
+    frames = tmp_path / "data" / "starter" / "frames" / "0123" / "4567.npz"
     frames.parent.mkdir(parents=True)
     with frames.open("wb") as file:
         file.truncate(500_000_000)
@@ -255,7 +255,7 @@ def stored(folder: Path, *names: str) -> Path:
     """A run's folder with a file in each of these folders, as if made there."""
     for name in names:
         (folder / name / "0123").mkdir(parents=True)
-        (folder / name / "0123" / "4567.h5").touch()
+        (folder / name / "0123" / "4567.npz").touch()
     return folder
 
 
