@@ -1,10 +1,12 @@
 """Bring a dataset up to date: what is finished stays, what a killed run had finished of it stays too.
 
 Pieces are written into ``data/<run>/.work/<format>/<identity>/``, each under a temporary name that is renamed once it
-is whole. The finished dataset then takes the place of the one before in one rename, and the work folder goes.
+is whole. Then the dataset before is moved into ``.work``, the finished one takes its place, and its record is written.
+Only then is anything deleted, so that a kill at any moment leaves what the same command takes up again.
 """
 
 import json
+import os
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,7 +21,17 @@ from pipeline.compute.pool import Workers, runner
 from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
-from pipeline.files import checksum, keep_below, put_in_place, remove, remove_if_empty, replaced, sync, write_json
+from pipeline.files import (
+    checksum,
+    keep_below,
+    put_in_place,
+    read_json,
+    remove,
+    remove_if_empty,
+    replaced,
+    sync,
+    write_json,
+)
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
 from pipeline.formats.registry import failures_of
@@ -32,6 +44,12 @@ from pipeline.testset import benchmark
 from pipeline.types import Extra
 
 AnyFormat = Format[Any]
+
+FINISHED = "record.json"
+"""File of a work folder: the record of its dataset, which is whole; later the record beside the dataset."""
+
+BEFORE = "before"
+"""Folder of a format's work folder: the dataset that was replaced, until the new one has its record."""
 
 
 def export_run(kind: type[AnyFormat], config: Config) -> None:
@@ -77,7 +95,9 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
     """
     own = target.sets(target.pieces(episodes)) if episodes.ids else set()
     with suppress(PipelineError):  # There is none, or it has changed since.
-        own |= {name.partition("/")[0] for name in target.record().files}
+        own |= _sets(target.record())
+    for record_file in target.work.glob(f"*/{FINISHED}"):  # A killed call put this dataset in place, perhaps.
+        own |= _sets(Export(**read_json(record_file)))
     foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in own)
     if foreign:
         raise PipelineError(
@@ -86,6 +106,11 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
             expected=f"only {', '.join(sorted(own))}",
             remedy=f"move it out of {target.folder}; to train on both, make a folder of links to them",
         )
+
+
+def _sets(record: Export) -> set[str]:
+    """Names of the datasets whose files a record lists, each a folder of the format's folder."""
+    return {name.partition("/")[0] for name in record.files}
 
 
 def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Episodes:
@@ -220,7 +245,7 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
     pieces = target.pieces(episodes)
     work = target.work / identity(target, episodes)
     keep_below(target.work, {work})
-    finished = work / "record.json"
+    finished = work / FINISHED
     if not finished.is_file():
         _write_pieces(target, work, pieces, episodes.load, workers)
         # In a worker, which has the format's packages loaded already.
@@ -233,11 +258,24 @@ def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:
         with replaced(finished) as temporary:
             record = Export(work.name, files, places, request(target, episodes), _made_with(target))
             temporary.write_text(json.dumps(asdict(record), indent=0) + "\n")
-    target.record_file.unlink(missing_ok=True)  # It is about the dataset before.
+    _replace(target, work)
+
+
+def _replace(target: AnyFormat, work: Path) -> None:
+    """Put a finished dataset and its record in the place of the ones before.
+
+    Nothing is deleted until the record is written: a folder that is half deleted would have sets of no record.
+
+    Args:
+        work: has the folder ``dataset``, unless a killed call moved it, and the record of it.
+    """
     if (work / "dataset").is_dir():
+        if target.folder.exists():
+            os.replace(target.folder, target.work / BEFORE)
+        target.record_file.unlink(missing_ok=True)  # It is about the dataset before.
         put_in_place(work / "dataset", target.folder)
-    finished.touch()  # No file of the dataset is younger than its record.
-    put_in_place(finished, target.record_file)
+    (work / FINISHED).touch()  # No file of the dataset is younger than its record.
+    put_in_place(work / FINISHED, target.record_file)
     _clear_work(target)
 
 

@@ -103,12 +103,13 @@ def test_killed_and_resumed(name: str, where: str, undisturbed: Path, tmp_path: 
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert not is_current(made, source)
-    (work,) = made.work.iterdir()
+    (work,) = (folder for folder in made.work.iterdir() if folder.name != "before")
     whole = {path: path.stat() for piece in made.pieces(source) if (path := work / piece.path).exists()}
-    if where == "record":
-        assert not (made.folder / "earlier").exists()
+    if where in ("rename", "record"):
+        assert (made.work / "before" / "earlier").exists(), "the dataset before stays until the new one has its record"
     else:
         assert (made.folder / "earlier").exists(), "the dataset before stays until the new one is whole"
+    if where != "record":
         assert len(whole) == (2 if where == "last piece" else PIECES)
     before = {} if where == "record" else stamps(work)
     loaded: list[str] = []

@@ -1,0 +1,115 @@
+"""A kill at any change of the file system while sets of new names replace old ones: the same command ends the same."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from synthetic import episodes, files
+
+from pipeline.config import Config
+from pipeline.export_config import LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.formats.base import Format
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.rlds import Rlds
+from pipeline.run.export import _bring_up_to_date, notice_changes
+
+PLAN = {"axes": {"camera": {}}, "episodes": {"camera": 1}}
+CONFIG = Config.model_validate({"name": "tiny", "plan": PLAN, "compute": {"cluster": "loop"}})
+
+CHANGES = {"os.rename", "os.remove", "os.rmdir"}
+"""What Python's audit reports of rename and replace, of unlink and remove, and of rmdir, before it happens."""
+
+
+def target(name: str, data: Path, called: str) -> Format[Any]:
+    if name == "rlds":
+        return Rlds(data, RldsConfig(name=called, shards=2))
+    if name == "lerobot":
+        return LeRobot(data, LeRobotConfig(name=called))
+    return LeRobotV21(data, LeRobotV21Config(name=called, convention="ipec"))
+
+
+def command(name: str, data: Path) -> None:
+    """What a run does with one format: the stage ``inputs``, then that of the export."""
+    notice_changes(target(name, data, "new"))
+    _bring_up_to_date(target(name, data, "new"), episodes(), CONFIG)
+
+
+def in_a_fork(action: Callable[[], None]) -> int:
+    """The exit status of a process that does this, as ``os.waitstatus_to_exitcode`` tells it."""
+    if (process := os.fork()) == 0:
+        status = 1
+        try:
+            action()
+            status = 0
+        except Exception as error:
+            print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        finally:
+            sys.stderr.flush()
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+
+def killed_before(change: int, name: str, data: Path) -> None:
+    """Be killed before a change of the file system, counted from when the new dataset is whole in the work folder."""
+    left, whole = change, False
+
+    def count(event: str, _: tuple[object, ...]) -> None:
+        nonlocal left, whole
+        if event not in CHANGES:
+            return
+        whole = whole or any(data.glob(".work/*/*/record.json"))
+        if whole:
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(count)
+    command(name, data)
+
+
+def kill_everywhere(name: str, folder: Path) -> None:
+    """In a process of its own: print how many kills there were, and what the same command then came to."""
+    expected, before, prepared = (folder / part for part in ("expected", "before", "prepared"))
+    command(name, expected)
+    _bring_up_to_date(target(name, before, "old"), episodes(), CONFIG)
+    shutil.copytree(before, prepared)
+    killed = in_a_fork(lambda: killed_before(1, name, prepared))
+    assert killed == -signal.SIGKILL
+    kills, faults = 0, []
+    while killed:
+        kills += 1
+        data = folder / str(kills)
+        shutil.copytree(prepared, data)
+        killed = in_a_fork(lambda: killed_before(kills, name, data))  # noqa: B023 - called at once
+        if in_a_fork(lambda: command(name, data)):  # noqa: B023 - called at once
+            faults.append(f"{kills}: rejected")
+        elif files(data) != files(expected):
+            faults.append(f"{kills}: {sorted(files(data).keys() ^ files(expected).keys())}")
+        shutil.rmtree(data)
+    print(json.dumps({"kills": kills - 1, "faults": faults}))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["rlds", "lerobot", "lerobot_v21"])
+def test_a_kill_at_every_change_of_the_file_system_is_taken_up(name: str, tmp_path: Path) -> None:
+    code = f"import test_replaced_sets as t, pathlib; t.kill_everywhere({name!r}, pathlib.Path({str(tmp_path)!r}))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(("tests", "tests/run", os.environ.get("PYTHONPATH", "")))},
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["faults"] == [], done.stderr
+    assert found["kills"] >= 10
