@@ -9,6 +9,7 @@ from pipeline.config import Config
 from pipeline.files import read_json
 from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
+from pipeline.run import dropped
 from pipeline.run.outcome import outdated, rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
@@ -22,6 +23,7 @@ def run(config: Config) -> None:
     rows = plan.read(config.data / "plan.parquet")
     plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, config, gl.choose().device), config.data)
+    dropped.refuse_unasked(rows, config)
     # The configuration may be another one since the plan was made.
     config.export.refuse_too_few(plan.demonstrations(rows))
     replayed = int(read_json(config.data / "replay.json")["replayed"])

@@ -5,6 +5,7 @@ from pipeline.config import Config
 from pipeline.files import write_json
 from pipeline.identity import refuse_unasked
 from pipeline.planning import plan
+from pipeline.run import dropped
 from pipeline.run.outcome import outdated
 from pipeline.run.replay_stage import Replays
 from pipeline.run.stage import main
@@ -15,6 +16,7 @@ def run(config: Config) -> None:
     rows = plan.read(config.data / "plan.parquet")
     plan.refuse_other_settings(rows, config.replay)
     refuse_unasked(outdated(rows, config), config.data)
+    dropped.refuse_unasked(rows, config)
     folder = config.data / "trajectories"
     with runner(config.compute, config.data) as workers:
         verdicts = Replays(config.demos, config.replay, folder, workers, config.filter).of(rows)

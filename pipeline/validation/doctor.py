@@ -28,8 +28,7 @@ from pipeline.identity import DISTRIBUTION
 from pipeline.libero.assets import REINSTALL
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
-from pipeline.planning import plan
-from pipeline.run import machine
+from pipeline.run import dropped, machine, plan_stage
 from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import outdated
 from pipeline.testset import benchmark
@@ -111,9 +110,16 @@ def _same(data: Path) -> Diagnosis:
 
 
 def _finished(config: Config) -> Diagnosis:
-    """What of the last plan's stored work this version or this device would make anew, if it were allowed to."""
-    file = config.data / "plan.parquet"
-    found = outdated(plan.read(file), config, gl.choose().device) if file.exists() else {}
+    """Stored work that the run would delete or make anew, if it were allowed to."""
+    try:
+        rows = plan_stage.upcoming(config)
+    except PipelineError as error:
+        return Diagnosis("finished work", "warn", f"not known, as the run cannot be planned: {error.what}")
+    unneeded = dropped.measure(rows, config)
+    if unneeded.asks:
+        remedy = "put the configuration back, give it another `name:`, or `REMAKE=1` before the command"
+        return Diagnosis("finished work", "warn", f"no longer needed, and would be deleted: {unneeded}", remedy)
+    found = outdated(rows, config, gl.choose().device)
     if not found:
         return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
     told = "; ".join(f"{number} {what}" for what, number in found.items())

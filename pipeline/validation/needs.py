@@ -4,9 +4,8 @@ Every planned episode counts as kept, and so does the clean twin of every demons
 demonstration.
 
 Sizes are rounded up from four runs of one demonstration of 90 steps (``benchmarks/disk.py``, see ``docs/cost.md``).
-Times are CPU times of one core of the machine that ``REFERENCE`` describes: of frames 0.8 of what
-``benchmarks/frame_cost.py`` gave beside other work, so that they sum up to the stage of ``configs/starter.yaml``; the
-others are of the stages of that run and of one of 1,004 episodes, which took 19 % less time than they say.
+Times of frames and replays are those of ``run/work_time.py``; the others are CPU times of one core of the same machine,
+of the stages of ``configs/starter.yaml`` and of a run of 1,004 episodes, which took 19 % less time than they say.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN
 from pipeline.libero import bddl
-from pipeline.libero.bddl import Arena
 from pipeline.libero.demonstrations import HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.run.machine import Speed
+from pipeline.run.work_time import ENCODE_S, FRAME_S, REFERENCE, replay_s
 from pipeline.types import Extra, Task
 
 JPEG_KB = {50: 6.0, 80: 10.0, 90: 15.0, 95: 20.0, 100: 35.0}
@@ -51,25 +50,10 @@ RUN_MB = 100.0
 PUBLISHED = 50
 """Demonstrations of a task in LIBERO's files."""
 
-REFERENCE = Speed(step_s=0.0033, frame_s=0.093)
-"""Of the machine of the figures below, by ``machine.trial``: one step again and again, and a frame without savings."""
-
-FRAME_S: dict[Arena, tuple[float, float]] = {
-    "tabletop": (0.032, 0.041),
-    "floor": (0.022, 0.034),
-    "kitchen": (0.041, 0.033),
-    "living_room": (0.024, 0.047),
-    "study": (0.028, 0.035),
-}
-"""A frame of the agent view and of the wrist view, with savings."""
 SHADOWS_S, SHADOWS = 0.13, 0.4
 """What shadows add to a frame, and the share of the light episodes that have them."""
-ENCODE_S = 0.004
-"""Of a frame: the JPEG, and the noise where there is some. A GPU does not make it quicker."""
 MAPS_S = 0.045
 """Depth or segmentation, or both, of a view of one step: rendered once more, and PNG files."""
-SCENE_S, STEP_S, TRIES = 2.2, 0.007, 1.4
-"""A trajectory besides its control steps; a step; how often steps are run, as tracking follows a replay that missed."""
 RLDS_S, LEROBOT_S, VALIDATE_S = 0.0004, 0.0015, 0.0006
 """A step of an episode in the exports and in ``validate``."""
 FIXED_S = 100.0
@@ -147,7 +131,7 @@ def needed_s(config: Config, speed: Speed) -> dict[str, float]:
     formats = {"rlds": RLDS_S, "lerobot": LEROBOT_S, "lerobot_v21": LEROBOT_S}
     _, exported_steps = _exported(config, amounts)
     return {
-        "replay": processor * trajectories * (SCENE_S + TRIES * amounts.mean_steps * STEP_S),
+        "replay": trajectories * replay_s(amounts.mean_steps, speed),
         "render": encoded_s + rendered_s * (not speed.gpus),
         "export": processor * exported_steps * sum(formats[name] for name in config.export.formats),
         "validate": processor * exported_steps * VALIDATE_S * len(config.export.formats),

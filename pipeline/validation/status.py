@@ -13,7 +13,7 @@ from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
-from pipeline.run import cleaning, export, finished, inputs, machine, outcome
+from pipeline.run import cleaning, dropped, export, finished, inputs, machine, outcome, plan_stage
 from pipeline.run.outcome import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
@@ -34,9 +34,10 @@ def told(config: Config) -> Iterator[str | Table]:
     """A run's state in a few paragraphs and tables."""
     yield f"run {config.name}, in {config.data}"
     try:
-        rows = plan.read(config.data / "plan.parquet")
-    except PipelineError:
-        rows = []
+        rows = plan_stage.upcoming(config)
+    except PipelineError as error:
+        yield f"the run cannot be planned: {error}"
+        return
     verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), config.filter)
     frames = shown_of(FrameStore(config.data / "frames", config.render).rows())
     rejected = outcome.rejections(rows, frames)
@@ -45,6 +46,9 @@ def told(config: Config) -> Iterator[str | Table]:
     steps = dict(_steps(config, rows, verdicts, frames, rejected))
     yield "would run:" if steps else "nothing would run: all of this configuration is made"
     yield from (f"  {step}: {why}" for step, why in steps.items())
+    unneeded = dropped.measure(rows, config)
+    if unneeded.asks:
+        yield f"no longer needed, and deleted by a run with REMAKE=1, without which it stops: {unneeded}"
     yield _disk(config)
     # What is not replayed yet is hoped for.
     hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
@@ -76,15 +80,12 @@ def _steps(
     frames: Mapping[str, Shown],
     rejected: Mapping[str, str],
 ) -> Iterator[tuple[str, str]]:
-    changed = _changed(config.data / "settings.json", inputs.settings(config))
-    of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
     if not rows:
         yield "plan", "there is no plan yet"
         return
-    if files := sorted(_changed(config.data / "inputs.json", inputs.listing(config))):
-        of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
+    of_plan = not plan_stage.is_up_to_date(config)
     if of_plan:
-        yield "plan", f"another configuration: {', '.join(of_plan)}"
+        yield "plan", _why_planned(config)
     made_anew = outdated(rows, config)
     if needed := selection.pending(rows, verdicts, rejected):
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
@@ -123,6 +124,15 @@ def _follow(config: Config) -> Iterator[tuple[str, str]]:
     for stage, memory in memories.items():
         if not memory(config).holds():
             yield stage, "not made from these files"
+
+
+def _why_planned(config: Config) -> str:
+    changed = _changed(config.data / "settings.json", inputs.settings(config))
+    of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
+    if files := sorted(_changed(config.data / "inputs.json", inputs.listing(config))):
+        of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
+    # The stage `inputs` wrote the new settings down before a plan was rejected.
+    return f"another configuration: {', '.join(of_plan)}" if of_plan else "made from other settings, files or versions"
 
 
 def _changed(file: Path, now: Mapping[str, Any]) -> list[str]:

@@ -21,11 +21,12 @@ from pipeline.export_config import ExportConfig, LeRobotConfig
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import machine
+from pipeline.run.work_time import REFERENCE
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Extra
 from pipeline.validation import doctor
-from pipeline.validation.needs import REFERENCE, needed_mb
+from pipeline.validation.needs import needed_mb
 
 REAL_TRIAL = machine.trial
 

@@ -10,7 +10,8 @@ from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.export_config import ExportConfig, Where
 from pipeline.run.machine import Speed
-from pipeline.validation.needs import REFERENCE, in_words, needed_mb, needed_s
+from pipeline.run.work_time import REFERENCE
+from pipeline.validation.needs import in_words, needed_mb, needed_s
 
 STARTER = load(REPOSITORY / "configs" / "starter.yaml")
 

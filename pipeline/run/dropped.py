@@ -1,0 +1,163 @@
+"""Finished work that a changed configuration no longer needs: measured, and reported before a stage deletes it.
+
+The stages ``plan``, ``replay`` and ``render`` ask here before they replace or delete anything, and ``status`` and
+``doctor`` report the same.
+"""
+
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from pipeline.config import Config
+from pipeline.errors import PipelineError
+from pipeline.identity import ALLOW, REMAKE
+from pipeline.planning import plan
+from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
+from pipeline.planning.streams import streams_of
+from pipeline.run import machine
+from pipeline.run.outcome import MISSED, rejections, rendered
+from pipeline.run.work_time import REFERENCE, frame_s, replay_s
+from pipeline.stores.frame_store import FrameStore, shown_of
+from pipeline.stores.store import TABLE, Store
+from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.types import Verdict
+
+LARGEST_SHARE = 0.1
+"""The share of the finished work that stages delete without a question."""
+
+Rows = Mapping[str, Mapping[str, Any]]
+"""Name of a stored file to its row of the store's table."""
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """Finished work that a plan does not need.
+
+    Attributes:
+        trajectories: how many.
+        streams: how many streams of frames.
+        work_s: seconds of one core that these took.
+        share: of all finished work, in [0, 1].
+    """
+
+    trajectories: int
+    streams: int
+    work_s: float
+    share: float
+
+    @property
+    def asks(self) -> bool:
+        """Whether a person must allow it."""
+        return self.share > LARGEST_SHARE
+
+    def __str__(self) -> str:
+        return (
+            f"{self.trajectories} trajectories and {self.streams} streams of frames, {self.share:.0%} of the finished "
+            f"work, about {_hours(self.work_s)} of one core"
+        )
+
+
+def measure(rows: Sequence[plan.Row], config: Config) -> Dropped:
+    """Finished work that the stages ``replay`` and ``render`` would delete under a plan.
+
+    An episode counts as needed while it is not known whether it is: where it, or a candidate before it, is not
+    replayed or not rendered yet.
+    """
+    replays, frames = _replays(config), _frames(config)
+    trajectories, streams = _needed(rows, config)
+    speed = machine.known_speed(config.data) or REFERENCE
+    encoded = config.render.model_dump(mode="json")
+    all_s = dropped_s = 0.0
+    unneeded_streams = 0
+    replayed = _finished(replays)
+    unneeded = replayed.keys() - trajectories
+    for name, row in replayed.items():
+        took_s = replay_s(row["steps"], speed)
+        all_s += took_s
+        dropped_s += took_s * (name in unneeded)
+    settings = _settings(frames)
+    for name, row in _finished(frames).items():
+        other = settings.get(row["made_by"], encoded) != encoded
+        of_file = {(name.split("/")[0], stream) for stream in row["streams"]}
+        gone = of_file if other else of_file - streams
+        stream_s = row["steps"] * frame_s(speed)
+        all_s += len(of_file) * stream_s
+        dropped_s += len(gone) * stream_s
+        unneeded_streams += len(gone)
+    return Dropped(len(unneeded), unneeded_streams, dropped_s, dropped_s / all_s if all_s else 0.0)
+
+
+def refuse_unasked(rows: Sequence[plan.Row], config: Config) -> None:
+    """Print how much finished work a plan drops, and stop where it is much and nobody allowed it.
+
+    Raises:
+        PipelineError: when it is more than ``LARGEST_SHARE``. Nothing was changed.
+    """
+    dropped = measure(rows, config)
+    if dropped.asks and os.environ.get(REMAKE) != "1":
+        raise PipelineError(
+            f"the configuration no longer needs, and the run would delete: {dropped}",
+            where=config.data,
+            expected=f"a configuration that needs all but {LARGEST_SHARE:.0%} of the finished work",
+            remedy=f"put the configuration back; or copy it to a file with another `name:`, which gets a folder of its "
+            f"own; or allow it: {ALLOW}",
+        )
+    if dropped.trajectories or dropped.streams:
+        print(f"no longer needed, and deleted by the stages replay and render: {dropped}")
+
+
+def _needed(rows: Sequence[plan.Row], config: Config) -> tuple[set[str], set[tuple[str, str]]]:
+    """Ids of the trajectories that a plan may need, and of the streams, each with its trajectory's."""
+    verdicts = verdicts_of(_replays(config).rows(), config.filter)
+    shown = shown_of(_frames(config).rows())
+    rejected = rejections(rows, shown)
+    unknown = Verdict(False, NOT_REPLAYED)
+    # Reserves are needed unless candidates before them are known to be kept, frames included.
+    known = {row.trajectory_id: verdicts.get(row.trajectory_id, unknown) for row in rows}
+    not_rendered = {row.episode_id: NOT_REPLAYED for row in rows if not rendered(row, shown)}
+    judged = select(rows, known, not_rendered | rejected)
+    trajectories: set[str] = set()
+    streams: set[tuple[str, str]] = set()
+    failures = MISSED if config.export.failures else ()
+    for row in rows:
+        verdict = judged[row.episode_id]
+        if verdict.reason == NOT_NEEDED:
+            continue
+        trajectories.add(row.trajectory_id)
+        if verdict.kept or verdict.reason in (NOT_REPLAYED, rejected.get(row.episode_id), *failures):
+            streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations).values()}
+    return trajectories, streams
+
+
+def _replays(config: Config) -> TrajectoryStore:
+    return TrajectoryStore(config.data / "trajectories")
+
+
+def _frames(config: Config) -> FrameStore:
+    return FrameStore(config.data / "frames", config.render)
+
+
+def _finished(store: Store) -> Rows:
+    """Every finished file that can be read or that the table on disk lists, also those of other settings."""
+    path = store.root / TABLE
+    listed: Iterable[dict[str, Any]] = pq.read_table(path).to_pylist() if path.exists() else ()
+    there = {row["file"]: row for row in listed if store.path(row["file"]).exists()}
+    return there | store.rows()
+
+
+def _settings(store: Store) -> dict[str, Any]:
+    """Fingerprint of stored files to the settings that they were made with, as far as the table says so."""
+    try:
+        made_with = json.loads(pq.read_schema(store.root / TABLE).metadata[b"made_with"])
+    except (OSError, pa.ArrowException, LookupError, TypeError, ValueError):
+        return {}
+    return {made_by: made["settings"] for made_by, made in made_with.items()}
+
+
+def _hours(seconds: float) -> str:
+    return f"{seconds / 3600:.1f} h" if seconds >= 360 else f"{seconds / 3600:.3f} h"

@@ -1,0 +1,123 @@
+"""A changed configuration deletes no more than a tenth of the finished work unless that was allowed."""
+
+import hashlib
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from conftest import run_stages
+
+from pipeline.config import load
+from pipeline.identity import REMAKE
+from pipeline.run import dropped, machine, plan_stage
+from pipeline.run.work_time import REFERENCE
+from pipeline.stores.frame_store import FrameStore
+from pipeline.validation import doctor, status
+
+Change = Callable[[dict[str, Any]], None]
+
+
+@pytest.fixture
+def clone(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of a finished run, which the process works in."""
+    folder = shutil.copytree(finished.parent.parent, tmp_path / "clone", symlinks=True)
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv(REMAKE, raising=False)
+    return folder
+
+
+def changed(clone: Path, change: Change) -> dict[str, Any]:
+    fields: dict[str, Any] = yaml.safe_load((clone / "configs" / "tiny.yaml").read_text())
+    change(fields)
+    (clone / "configs" / "tiny.yaml").write_text(yaml.safe_dump(fields))
+    return fields
+
+
+def work(clone: Path) -> dict[str, str]:
+    """Every finished file to its SHA-256."""
+    folders = [clone / "data" / "tiny" / name for name in ("trajectories", "frames", "rlds", "lerobot")]
+    files = [file for folder in folders for file in folder.rglob("*") if file.is_file()]
+    files.append(clone / "data" / "tiny" / "plan.parquet")
+    return {str(file): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
+
+
+def other_seed(fields: dict[str, Any]) -> None:
+    fields["plan"]["seed"] = 6
+
+
+def other_range(fields: dict[str, Any]) -> None:
+    fields["plan"]["axes"]["noise"] = {"levels": [5]}
+    fields["plan"]["axes"]["camera"] = {"levels": [5]}
+
+
+def other_quality(fields: dict[str, Any]) -> None:
+    fields["render"]["jpeg_quality"] = 90
+
+
+def fewer_episodes(fields: dict[str, Any]) -> None:
+    fields["plan"] |= {"episodes": {"camera": 1, "noise": 1, "language": 3}, "reserve": 9.0}
+
+
+@pytest.mark.parametrize("change", [other_seed, other_range, other_quality, fewer_episodes])
+def test_a_run_stops_before_it_deletes_and_status_and_doctor_say_the_same(
+    change: Change, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = work(clone)
+    fields = changed(clone, change)
+    run_stages(clone, fields, ["inputs"])
+    stages = ["render"] if change is other_quality else ["plan"]
+    with pytest.raises(AssertionError, match=r"no longer needed|no longer needs") as error:
+        run_stages(clone, fields, stages)
+    assert "REMAKE=1" in str(error.value)
+    assert work(clone) == before, "nothing was deleted or replaced"
+    config = load(Path("configs/tiny.yaml"))
+    amount = str(dropped.measure(plan_stage.upcoming(config), config))
+    assert amount in str(error.value)
+    assert any(amount in part for part in status.told(config) if isinstance(part, str))
+    finding = doctor._finished(config)
+    assert finding.status == "warn"
+    assert amount in finding.detail
+    monkeypatch.setenv(REMAKE, "1")
+    assert "no longer needed, and deleted" in run_stages(clone, fields, stages)
+
+
+def test_a_replay_alone_deletes_nothing_unasked(clone: Path) -> None:
+    """As where the plan is of a stage that was called alone, with permission."""
+    fields = changed(clone, other_seed)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(REMAKE, "1")
+        run_stages(clone, fields, ["inputs", "plan", "leakage"])
+    before = work(clone)
+    for stage in ("replay", "render"):
+        with pytest.raises(AssertionError, match="no longer needs"):
+            run_stages(clone, fields, [stage])
+    assert work(clone) == before
+
+
+def test_what_drops_little_or_nothing_is_not_asked_for(clone: Path) -> None:
+    config = load(Path("configs/tiny.yaml"))
+    rows = plan_stage.upcoming(config)
+    assert plan_stage.is_up_to_date(config)
+    assert dropped.measure(rows, config) == dropped.Dropped(0, 0, 0.0, 0.0)
+    fields = changed(clone, lambda fields: fields["plan"].update(reserve=2.0))
+    assert "no longer" not in run_stages(clone, fields, ["inputs", "plan", "leakage", "replay"])
+    shutil.rmtree(clone / "data" / "tiny" / "frames")
+    assert "no longer" not in run_stages(clone, fields, ["inputs", "replay"])
+
+
+def test_the_hours_are_those_of_the_frames_that_would_be_rendered_again(clone: Path) -> None:
+    """All frames of the run under another JPEG quality, at the measured cost of a frame on the reference machine."""
+    config = load(Path("configs/tiny.yaml"))
+    machine.keep_speed(config.data, REFERENCE)
+    stored = FrameStore(config.data / "frames", config.render).rows().values()
+    frames = sum(len(row["streams"]) * row["steps"] for row in stored)
+    assert frames > 100
+    changed(clone, other_quality)
+    config = load(Path("configs/tiny.yaml"))
+    found = dropped.measure(plan_stage.upcoming(config), config)
+    mean_s = (0.032 + 0.041 + 0.022 + 0.034 + 0.041 + 0.033 + 0.024 + 0.047 + 0.028 + 0.035) / 10 + 0.004
+    assert found.work_s == pytest.approx(frames * mean_s)
+    assert found.trajectories == 0
