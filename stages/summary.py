@@ -16,7 +16,9 @@ def run(config: Config) -> None:
         memory.keep()
     from rich.console import Console
 
-    Console().print(counts.shown(rows))
+    Console().print(counts.shown(rows, config.plan.episodes))
+    for sentence in counts.shortfalls(counts.targets(rows, config.plan.episodes)):
+        print(sentence)
 
 
 def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:

@@ -22,7 +22,7 @@ from pipeline.files import checksum, read_json, replaced, schema_file
 from pipeline.formats.base import Format
 from pipeline.libero.tasks import SUITES
 from pipeline.run import manifest
-from pipeline.run.counts import Counts, named, origins, tally, tried
+from pipeline.run.counts import Counts, named, origins, tally, targets, tried
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """What the card is made from, besides the manifest; in the run's folder."""
@@ -60,7 +60,7 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
         PipelineError: when something that it describes cannot be read.
     """
     rows = manifest.read(data / "manifest.parquet")
-    source = manifest.settings(data / "manifest.parquet").source
+    settings = manifest.settings(data / "manifest.parquet")
     reports = {name: read_json(data / name) for name in REPORTS}
     clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)
@@ -71,7 +71,17 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
             for axis in sheets:
                 shutil.copyfile(data / "sheets" / f"{axis}.png", folder / one.name / "pictures" / f"{axis}.png")
             others = [other.title for other in formats if other is not one]
-            text = render(one, others, rows, reports, clients, sheets=sheets, name=name, source=source)
+            text = render(
+                one,
+                others,
+                rows,
+                reports,
+                clients,
+                sheets=sheets,
+                name=name,
+                source=settings.source,
+                episodes=settings.episodes,
+            )
             (folder / one.name / "README.md").write_text(text)
             sums = {one.repository_path(path): sha256 for path, sha256 in one.record().files.items()}
             sums["manifest.parquet"] = checksum(data / "manifest.parquet")
@@ -89,6 +99,7 @@ def render(
     sheets: Sequence[str],
     name: str,
     source: str,
+    episodes: Mapping[str, int],
 ) -> str:
     """The card of one format, with the hub's metadata in front.
 
@@ -98,6 +109,7 @@ def render(
         clients: the section of that name in ``finetune.yaml``: where and how each policy's code is called.
         sheets: the axes that have a picture.
         source: of the demonstrations, ``starter`` or ``hdf5``.
+        episodes: ``plan.episodes``, empty where the manifest does not have it.
     """
     leakage, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
@@ -131,6 +143,7 @@ def render(
         suites=named(rows, "suite"),
         planned=named(tried(rows), "axis"),
         counts=Counts.of,
+        targets=targets(rows, episodes),
         levels=LEVELS,
         axes=axes,
         sheets=sheets,

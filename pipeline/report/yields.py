@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS
-from pipeline.run.counts import Counts, Rows, named, tally
+from pipeline.run.counts import Counts, Rows, Target, named, tally
 
 
 class Cell(NamedTuple):
@@ -36,6 +36,15 @@ def tables(tried: Rows) -> list[Table]:
         _by_axis("dropped, by reason", [row for row in tried if not row["kept"]], "reason"),
         _by_axis("kept, by how it was replayed", [row for row in tried if row["kept"]], "replay_mode"),
     ]
+
+
+def wanted_and_kept(targets: Mapping[str, Target]) -> Table:
+    """Kept episodes of each axis beside those that the configuration wants."""
+    body: list[tuple[Cell, ...]] = []
+    for axis, target in targets.items():
+        share = min(1.0, target.kept / target.wanted) if target.wanted else None
+        body.append((Cell(axis), Cell(f"{target.wanted:,}"), Cell(f"{target.kept:,}", share)))
+    return Table("wanted and kept", ("axis", "wanted", "kept"), body)
 
 
 def by_suite(tried: Rows) -> Table:

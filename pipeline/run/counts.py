@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
+from pipeline.export_config import CLEAN
 from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import HUMAN
 from pipeline.planning.selection import NOT_NEEDED
@@ -38,6 +39,47 @@ class Counts:
 
     def __str__(self) -> str:
         return f"{self.planned}/{self.replayed}/{self.kept}" if self.planned else "-"
+
+
+@dataclass(frozen=True)
+class Target:
+    """Episodes of an axis or combination, those that ``export.where`` leaves out included.
+
+    Attributes:
+        wanted: as ``plan.episodes`` has it; of ``clean``, the demonstrations.
+        planned: of these, how many the plan has perturbations for.
+        kept: how many reached their goal with frames that show enough.
+    """
+
+    wanted: int
+    planned: int
+    kept: int
+
+
+def targets(rows: Rows, episodes: Mapping[str, int]) -> dict[str, Target]:
+    """Axis or combination to its target, ``clean`` first.
+
+    Args:
+        episodes: ``plan.episodes``; where it lacks an axis, what is planned counts as wanted.
+    """
+    planned = Counter(row["axis"] for row in rows if row["wanted"])
+    kept = Counter(row["axis"] for row in rows if row["reason"] in MADE)
+    wanted = {axis: planned[axis] for axis in named(rows, "axis")} | dict(episodes)
+    return {axis: Target(number, planned[axis], kept[axis]) for axis, number in wanted.items()}
+
+
+def shortfalls(found: Mapping[str, Target]) -> list[str]:
+    """A sentence for each axis that has fewer kept episodes than wanted, with the setting that helps."""
+    sentences = []
+    for axis, target in found.items():
+        if axis == CLEAN or target.kept >= target.wanted:
+            continue
+        if target.planned < target.wanted:
+            remedy = f"only {target.planned} could be planned: use more demonstrations, or wider ranges"
+        else:
+            remedy = "raise plan.reserve, which adds candidates and keeps what is finished"
+        sentences.append(f"{axis}: {target.kept} of {target.wanted} wanted episodes are kept; {remedy}")
+    return sentences
 
 
 def tried(rows: Rows) -> list[Mapping[str, Any]]:
@@ -89,19 +131,26 @@ def by_axis_and_suite(rows: Rows) -> dict[str, dict[str, dict[str, int]]]:
     return table
 
 
-def shown(rows: Rows) -> Table:
-    """The same as a table for people, with totals."""
+def shown(rows: Rows, episodes: Mapping[str, int]) -> Table:
+    """The same as a table for people, with totals and the episodes that are wanted.
+
+    Args:
+        episodes: ``plan.episodes``.
+    """
     from rich.table import Table
 
     suites, axes = named(rows, "suite"), named(tried(rows), "axis")
     heads = [suite.removeprefix("libero_") for suite in suites]
-    table = Table("axis", *heads, "all", title="planned/replayed/kept episodes")
+    found = targets(rows, episodes)
+    table = Table("axis", *heads, "all", "wanted", title="planned/replayed/kept episodes")
     for column in table.columns[1:]:
         column.justify, column.no_wrap = "right", True
     for axis in axes:
         cells = [Counts.of(rows, axis=axis, suite=suite) for suite in suites]
         # A combination's name may break behind a +.
-        table.add_row(axis.replace("+", "+ "), *map(str, cells), str(Counts.of(rows, axis=axis)))
+        of_axis = Counts.of(rows, axis=axis), found[axis].wanted
+        table.add_row(axis.replace("+", "+ "), *map(str, (*cells, *of_axis)))
+    wanted = sum(target.wanted for target in found.values())
     table.add_section()
-    table.add_row("all", *(str(Counts.of(rows, suite=suite)) for suite in suites), str(Counts.of(rows)))
+    table.add_row("all", *(str(Counts.of(rows, suite=suite)) for suite in suites), str(Counts.of(rows)), str(wanted))
     return table

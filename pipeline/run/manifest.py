@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from pipeline.axes.base import Frozen
 from pipeline.config import Config, RenderConfig, ReplayConfig
@@ -61,15 +61,22 @@ class Settings(Frozen):
 
     Attributes:
         source: ``starter`` or ``hdf5``; where its files lie differs from machine to machine.
+        episodes: ``plan.episodes``: how many were wanted. Manifests of earlier versions lack it.
     """
 
     source: Literal["starter", "hdf5"]
     replay: ReplayConfig
     render: RenderConfig
+    episodes: dict[str, int] = Field(default_factory=dict)
 
     @classmethod
     def of(cls, config: Config) -> Settings:
-        return cls(source=config.demos.source, replay=config.replay, render=config.render)
+        return cls(
+            source=config.demos.source,
+            replay=config.replay,
+            render=config.render,
+            episodes=config.plan.episodes,
+        )
 
 
 def build(

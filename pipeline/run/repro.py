@@ -16,6 +16,7 @@ from pipeline.errors import PipelineError
 from pipeline.exit_status import Terminated
 from pipeline.files import remove, write
 from pipeline.formats.registry import formats_of
+from pipeline.run import counts, manifest
 from pipeline.run.stage import PARAMS
 
 DVC = (sys.executable, "-m", "dvc")
@@ -45,6 +46,9 @@ def run(file: Path) -> int:
         width = max(map(len, places))
         for name, path in places.items():
             print(f"{name:>{width}}  {path}")
+        rows = manifest.read(config.data / "manifest.parquet")
+        for sentence in counts.shortfalls(counts.targets(rows, config.plan.episodes)):
+            print(sentence)
     return status
 
 

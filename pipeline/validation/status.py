@@ -13,7 +13,7 @@ from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
-from pipeline.run import cleaning, dropped, export, finished, inputs, machine, outcome, plan_stage
+from pipeline.run import cleaning, counts, dropped, export, finished, inputs, machine, outcome, plan_stage
 from pipeline.run.outcome import outdated
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
@@ -44,8 +44,15 @@ def told(config: Config) -> Iterator[str | Table]:
     judged = selection.select(rows, verdicts, rejected)
     yield _counts(config, rows, judged, frames)
     steps = dict(_steps(config, rows, verdicts, frames, rejected))
-    yield "would run:" if steps else "nothing would run: all of this configuration is made"
-    yield from (f"  {step}: {why}" for step, why in steps.items())
+    if steps:
+        yield "would run:"
+        yield from (f"  {step}: {why}" for step, why in steps.items())
+    # Until all is replayed and rendered, what is not known is hoped for.
+    if not steps.keys() & {"plan", "replay", "render"}:
+        missing = counts.shortfalls(_targets(config, rows, judged))
+        yield from missing
+        if not steps:
+            yield "nothing would run" if missing else "nothing would run: all of this configuration is made"
     unneeded = dropped.measure(rows, config)
     if unneeded.asks:
         yield f"no longer needed, and deleted by a run with REMAKE=1, without which it stops: {unneeded}"
@@ -54,6 +61,11 @@ def told(config: Config) -> Iterator[str | Table]:
     hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
     needed = [row for row in rows if row.episode_id in hopes]
     yield from _time_left(config, needed, verdicts, frames, steps) if steps else ()
+
+
+def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict]) -> dict[str, counts.Target]:
+    results = [{"axis": row.axis, "wanted": row.wanted, "reason": judged[row.episode_id].reason} for row in rows]
+    return counts.targets(results, config.plan.episodes)
 
 
 def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]) -> Table:

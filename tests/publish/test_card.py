@@ -55,10 +55,10 @@ def test_the_hub_reads_the_metadata(data: Path, kind: str) -> None:
 def test_tables_say_what_the_manifest_says(data: Path) -> None:
     text = written(data, "rlds")
     assert "7 episodes (700 steps" in text
-    assert cells(text, "axis", "Episodes") == ["libero_object", "libero_goal", "all"]
-    assert cells(text, "camera", "Episodes") == ["1", "1", "2"]
-    assert cells(text, "layout", "Episodes") == ["1", "0", "1"]
-    assert cells(text, "**all**", "Episodes") == ["5", "2", "7"]
+    assert cells(text, "axis", "Episodes") == ["libero_object", "libero_goal", "all", "wanted"]
+    assert cells(text, "camera", "Episodes") == ["1", "1", "2", "0"]
+    assert cells(text, "layout", "Episodes") == ["1", "0", "1", "0"]
+    assert cells(text, "**all**", "Episodes") == ["5", "2", "7", "0"]
     levels = text.partition("By strength")[2]
     assert "| camera | 0 | 0 | 0 | 3 | 0 |" in levels
     assert "| background | 0 | 2 | 0 | 0 | 0 |" in levels
