@@ -7,21 +7,27 @@ from pydantic import Field, model_validator
 from pipeline.axes.base import Frozen
 from pipeline.export_config import Count
 
+LARGEST_GB = 4.6
+"""Most memory that a worker process has taken: in ``validate`` of 1,004 episodes of all 40 tasks (docs/cost.md)."""
+
+JOB_GB = round(4 / 3 * LARGEST_GB)
+"""Memory of a job of SLURM, which ends a job that takes more: a third above ``LARGEST_GB``."""
+
 
 class SlurmConfig(Frozen):
-    """What each worker asks SLURM for; what is left out, SLURM decides.
+    """What each worker asks SLURM for; fields that are left out have the value of the site's ``jobqueue.yaml``.
 
     Attributes:
         partition, account: of the site.
-        walltime: after which SLURM ends a worker, such as ``"12:00:00"``; its work is done again by another.
-        memory_gb: of a worker.
-        options: further ones of ``sbatch``, such as ``--gres=gpu:1``.
+        walltime: after which SLURM ends a worker, such as ``"12:00:00"``; another worker repeats its work.
+        memory_gb: of a worker; ``JOB_GB`` where neither this nor the site's ``job-mem`` is set.
+        options: further options of ``sbatch``, such as ``--gres=gpu:1``, after the site's ``job-extra-directives``.
     """
 
     partition: str | None = None
     account: str | None = None
     walltime: str | None = None
-    memory_gb: float = Field(default=4.0, gt=0.0, le=1000.0)
+    memory_gb: float | None = Field(default=None, gt=0.0, le=1000.0)
     options: tuple[str, ...] = ()
 
 

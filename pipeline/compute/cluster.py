@@ -117,7 +117,8 @@ def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
         PipelineError: naming every worker that cannot work for this run, and why.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    token = folder.absolute() / f".cluster-{uuid4().hex}"
+    # Of a killed run, the next stage deletes it as it does all such files (``files.remove_leftovers``).
+    token = folder.absolute() / f".cluster-{uuid4().hex}.tmp"
     workplace = Workplace(Path.cwd(), token, setup())
     token.touch()
     try:

@@ -15,7 +15,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from pipeline.compute.cluster import Workplace, in_place, workplace_of
 from pipeline.compute.progress import progress_of
-from pipeline.compute.workers import ended, local_cluster, slurm_cluster
+from pipeline.compute.slurm import slurm_jobs
+from pipeline.compute.workers import ended, local_cluster
 from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
 from pipeline.exit_status import GO_ON
@@ -133,11 +134,11 @@ def _started(config: ComputeConfig, folder: Path, renders: bool) -> Iterator[_Wo
         with local_cluster(config.workers, renders) as (client, refill):
             yield _Workers(client, refill=refill)
     elif config.cluster == "slurm":
-        with slurm_cluster(config, folder) as cluster, Client(cluster) as client:
-            client.wait_for_workers(1)
+        with slurm_jobs(config, folder) as jobs, Client(jobs.cluster) as client:
+            jobs.wait_for_one(client)
             with workplace_of(client, folder) as workplace:
-                # Jobs that end are asked for again; they may wait in the queue for hours.
-                yield _Workers(client, workplace, partial(cluster.scale, config.workers), patience_s=inf)
+                # Jobs may wait in the queue for hours.
+                yield _Workers(client, workplace, jobs.refill, patience_s=inf)
     else:
         try:
             client = Client(config.cluster, timeout=CONNECT_S)

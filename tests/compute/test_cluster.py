@@ -29,6 +29,7 @@ from pipeline.machine_code import SETTINGS
 from pipeline.planning import plan
 from pipeline.run.render_job import RenderJob
 from pipeline.run.replay_stage import Replays
+from pipeline.run.stage import locked
 from pipeline.testset.benchmark import TestSet
 
 Start = Callable[..., str]
@@ -182,6 +183,32 @@ def test_a_worker_with_another_device_is_refused(cluster: Start, tmp_path: Path)
         work(RenderJob.__call__, [job], "render")
     assert device in str(caught.value)
     assert not (tmp_path / "frames").exists()
+
+
+BUSY = """
+import sys, time
+from pathlib import Path
+from pipeline.compute.pool import runner
+from pipeline.compute_config import ComputeConfig
+with runner(ComputeConfig(cluster=sys.argv[1]), Path(sys.argv[2])) as work:
+    work(time.sleep, [0.5] * 120, "busy")
+"""
+
+
+@pytest.mark.slow
+def test_the_next_stage_deletes_what_a_killed_run_left_for_its_workers(cluster: Start, tmp_path: Path) -> None:
+    data, environment = tmp_path / "data", os.environ | {"PYTHONPATH": str(REPOSITORY)}
+    busy = subprocess.Popen([sys.executable, "-c", BUSY, cluster((1, {})), str(data)], cwd=tmp_path, env=environment)
+    deadline = time.monotonic() + 60
+    while not list(data.glob(".cluster-*")):
+        assert busy.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    busy.kill()
+    busy.wait()
+    assert list(data.glob(".cluster-*"))
+    with locked(data):
+        assert [entry.name for entry in data.iterdir()] == [".lock"]
 
 
 def test_workers_have_all_that_files_are_made_with() -> None:

@@ -5,17 +5,20 @@ import os
 import shutil
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import dask
 import pytest
+import yaml
 from conftest import REPOSITORY
 from pydantic import ValidationError
 
 from pipeline.compute.pool import runner
-from pipeline.compute_config import ComputeConfig, SlurmConfig
+from pipeline.compute_config import JOB_GB, ComputeConfig, SlurmConfig
 from pipeline.errors import PipelineError
 from pipeline.machine_code import machine_code
 
@@ -112,6 +115,83 @@ def test_what_slurm_refuses_is_said_in_its_words(slurm: Path, tmp_path: Path) ->
     with pytest.raises(PipelineError, match="invalid partition") as caught, runner(compute, tmp_path / "data") as work:
         work(job_of, [0], "none")
     assert "compute.slurm" in str(caught.value)
+
+
+@contextmanager
+def site(settings: str) -> Iterator[None]:
+    """Apply what a site has in its ``jobqueue.yaml``."""
+    import dask_jobqueue  # noqa: F401 - its defaults
+
+    with dask.config.set({f"jobqueue.slurm.{name}": value for name, value in yaml.safe_load(settings).items()}):
+        yield
+
+
+def told_by_site(item: int) -> tuple[str, dict[str, float], str]:
+    """In a worker: what the job's script exported, the worker's own options, and what SLURM knows of the job."""
+    from distributed import get_worker
+
+    job = asked("scontrol", "show", "job", os.environ["SLURM_JOB_ID"])
+    return os.environ["SITE"], dict(get_worker().state.total_resources), job
+
+
+@pytest.mark.slow
+def test_settings_of_the_site_and_of_the_run_apply(slurm: Path, tmp_path: Path) -> None:
+    settings = """
+        job-extra-directives: ["--comment=of-the-site", "--time-min=1"]
+        job-script-prologue: ["export SITE='module load'", "export LP_NUM_THREADS=7"]
+        worker-extra-args: ["--resources", "licences=3"]
+        scheduler-options: {host: 127.0.0.1}
+        job-mem: 700M
+    """
+    compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(options=("--comment=of-the-run",)))
+    with site(settings), runner(compute, tmp_path / "data") as work:
+        ((exported, resources, job),) = work(told_by_site, [0], "site")
+        ((_, _, works_with),) = work(job_of, [0], "threads")
+    assert (exported, resources) == ("module load", {"licences": 3.0})
+    # Where both name an option, the run's decides.
+    assert works_with.split()[0] == "1"
+    assert "Comment=of-the-run" in job
+    assert "MinMemoryNode=700M" in job
+
+
+@pytest.mark.slow
+def test_jobs_that_end_before_their_worker_starts_end_the_run(
+    slurm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pipeline.compute.slurm.LOOK_S", 1)
+    compute = ComputeConfig(cluster="slurm", workers=2, slurm=SlurmConfig(memory_gb=0.5))
+    with (
+        site("python: /removed/bin/python"),
+        pytest.raises(PipelineError, match="4 jobs ended before their worker started") as caught,
+        runner(compute, tmp_path / "data") as work,
+    ):
+        work(job_of, [0], "none")
+    assert "/removed/bin/python: No such file or directory" in str(caught.value)
+    assert str(tmp_path / "data" / ".work" / "slurm") in str(caught.value)
+    assert not asked("squeue", "-h")
+
+
+@pytest.mark.slow
+def test_jobs_that_can_no_longer_start_end_the_run(
+    slurm: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first job works; what takes its place ends at once, as where the environment was removed meanwhile."""
+    monkeypatch.setattr("pipeline.compute.pool.LOOK_S", 1)
+    python = tmp_path / "python"
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    compute = ComputeConfig(cluster="slurm", workers=1, slurm=SlurmConfig(memory_gb=0.5))
+    with site(f"python: {python}"), runner(compute, tmp_path / "data") as work:
+        ((_, job, _),) = work(job_of, [0], "first")
+        python.unlink()
+        asked("scancel", job)
+        with pytest.raises(PipelineError, match="2 jobs ended before their worker started"):
+            work(job_of, [0], "second")
+
+
+def test_a_job_has_the_memory_that_the_stages_were_measured_to_take() -> None:
+    """By docs/cost.md: 4.6 GB, in ``validate`` of 1,004 episodes."""
+    assert JOB_GB > 4.6
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,192 @@
+"""Workers as jobs of SLURM, which wait in its queue until it has room."""
+
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+from pipeline.compute_config import JOB_GB, ComputeConfig, SlurmConfig
+from pipeline.errors import PipelineError
+from pipeline.exit_status import GO_ON
+from pipeline.machine_code import SETTINGS, in_shell
+
+LOGS = Path(".work") / "slurm"
+"""Folder, below the run's, of the jobs' output."""
+
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "LP_NUM_THREADS")
+
+STARTS = 2
+"""Number of jobs that may end before their worker starts, as a multiple of the workers."""
+
+LOOK_S = 5
+"""Time between two looks at the queue while no worker has started."""
+
+LINES_SHOWN = 8
+"""Last lines of a job's output in an error."""
+
+
+@dataclass
+class SlurmJobs:
+    """The jobs of a cluster, one for each worker.
+
+    Attributes:
+        cluster: a ``SLURMCluster``.
+        workers: number of workers that are wanted.
+        logs: folder of the jobs' output.
+        started: ids of the jobs whose worker has connected to the scheduler.
+        in_vain: number of jobs that ended before their worker started, since a worker last started.
+    """
+
+    cluster: Any
+    workers: int
+    logs: Path
+    started: set[str] = field(default_factory=set)
+    in_vain: int = 0
+
+    def wait_for_one(self, client: Any) -> None:
+        """Wait until a worker has connected, for as long as a job is in the queue.
+
+        Raises:
+            PipelineError: if every job has ended.
+        """
+        while True:
+            with suppress(TimeoutError):
+                client.wait_for_workers(1, timeout=LOOK_S)
+                return
+            self.refill()
+
+    def refill(self) -> None:
+        """Submit a job for each job that has ended.
+
+        Raises:
+            PipelineError: if every job has ended, and ``STARTS`` times as many as wanted ended before their worker
+                started.
+        """
+        connected = {worker["name"] for worker in self.cluster.scheduler_info["workers"].values()}
+        # Dask gives the job that replaces another one the same name.
+        jobs = {name: job.job_id for name, job in dict(self.cluster.workers).items()}
+        started = {job_id for name, job_id in jobs.items() if name in connected}
+        if started - self.started:
+            self.started |= started
+            self.in_vain = 0
+        queued = _queued()
+        if queued is None:
+            return
+        # Dask replaces workers that were connected; it does not notice a job that ends before.
+        ended = {name: job_id for name, job_id in jobs.items() if job_id not in self.started | queued}
+        if self.in_vain + len(ended) < STARTS * self.workers:
+            if ended:
+                self.in_vain += len(ended)
+                print(f"{len(ended)} jobs of SLURM ended before their worker started: see {self.logs}", file=sys.stderr)
+                self.cluster.sync(self.cluster.scale_down, list(ended))
+            self.cluster.scale(self.workers)
+        elif not connected and len(ended) == len(jobs):
+            raise self._failed(ended)
+
+    def _failed(self, ended: Mapping[str, str | None]) -> PipelineError:
+        last = max((job_id for job_id in ended.values() if job_id), key=int, default=None)
+        if last is None:
+            what = "sbatch submitted no job"
+        else:
+            what = f"{self.in_vain + len(ended)} jobs ended before their worker started; the last lines of job {last}:"
+        return PipelineError(
+            "\n".join([what, *self._last_lines(last)]),
+            where=self.logs,
+            expected="jobs in which `dask worker` starts and reaches this machine",
+            remedy=f"correct compute.slurm or the site's jobqueue.yaml, and {GO_ON}",
+        )
+
+    def _last_lines(self, job_id: str | None) -> list[str]:
+        lines: list[str] = []
+        for log in sorted(self.logs.glob(f"*-{job_id}.*")):
+            lines += log.read_text(errors="replace").splitlines()
+        return [line for line in lines if line.strip()][-LINES_SHOWN:]
+
+
+@contextmanager
+def slurm_jobs(config: ComputeConfig, folder: Path) -> Iterator[SlurmJobs]:
+    """Start a scheduler in this process and submit a job for each worker; cancel the jobs when the block ends.
+
+    The site's settings in ``jobqueue.yaml`` apply. Lists of both come one after the other, ours last, so that ours
+    decide where both name the same option.
+
+    Args:
+        config: with ``cluster: slurm``.
+        folder: what the work writes into; the nodes must see it too.
+
+    Raises:
+        PipelineError: if SLURM rejects the job.
+    """
+    from dask_jobqueue.slurm import SLURMCluster
+
+    job, workers = config.slurm or SlurmConfig(), config.workers or 1
+    logs = (folder / LOGS).absolute()
+    logs.mkdir(parents=True, exist_ok=True)
+    # A site may keep the environment of the submitting process from its jobs.
+    environment = f"export {in_shell(SETTINGS | dict.fromkeys(ONE_THREAD, '1'))}"
+    cluster = SLURMCluster(
+        cores=1,
+        processes=1,
+        memory=f"{JOB_GB}GB",
+        job_mem=None if job.memory_gb is None else f"{ceil(job.memory_gb * 1e9 / 2**20)}M",
+        queue=job.partition,
+        account=job.account,
+        walltime=job.walltime,
+        job_extra_directives=[*_of_site("job-extra-directives", "job-extra"), *job.options],
+        job_script_prologue=[*_of_site("job-script-prologue", "env-extra"), environment],
+        log_directory=str(logs),
+        # SLURM limits memory itself.
+        worker_extra_args=[*_of_site("worker-extra-args", "extra"), "--memory-limit", "0"],
+        scheduler_options={"dashboard_address": "127.0.0.1:0", **_scheduler_of_site()},
+    )
+    with cluster:
+        _try(cluster.job_script())
+        cluster.scale(workers)
+        print(f"{workers} jobs wait in SLURM's queue; their output is in {logs}", file=sys.stderr)
+        yield SlurmJobs(cluster, workers, logs)
+
+
+def _of_site(name: str, former_name: str) -> list[str]:
+    """Read a list of the section ``slurm`` of ``jobqueue.yaml``, also under the name of earlier versions."""
+    import dask
+
+    for each in (name, former_name):
+        if values := dask.config.get(f"jobqueue.slurm.{each}", None):
+            return [str(value) for value in values]
+    return []
+
+
+def _scheduler_of_site() -> dict[str, Any]:
+    import dask
+
+    return dict(dask.config.get("jobqueue.slurm.scheduler-options", None) or {})
+
+
+def _queued() -> set[str] | None:
+    """List the ids of the user's jobs that wait or run; None if SLURM does not answer."""
+    asked = subprocess.run(["squeue", "--me", "--noheader", "--format=%i"], capture_output=True, text=True, check=False)
+    return set(asked.stdout.split()) if asked.returncode == 0 else None
+
+
+def _try(script: str) -> None:
+    """Have SLURM check a job without submitting it.
+
+    Raises:
+        PipelineError: if SLURM rejects it, in SLURM's words.
+    """
+    try:
+        looked = subprocess.run(["sbatch", "--test-only"], input=script, capture_output=True, text=True, check=False)
+        refusal = looked.stderr.strip() if looked.returncode else ""
+    except FileNotFoundError as error:
+        refusal = str(error)
+    if refusal:
+        raise PipelineError(
+            f"takes no job ({refusal})",
+            where="sbatch",
+            expected="a machine from which SLURM's jobs can be started, and options that it knows",
+            remedy="mend compute.slurm, or set compute.cluster: local",
+        )
