@@ -104,9 +104,13 @@ class Perturbation(Frozen):
         compared = distances[~np.isnan(distances)]
         return Nearest(float(compared.min(initial=np.inf)), len(compared))
 
+    def in_scene(self, task: Task) -> Self:
+        """The same change, with things named alike in all tasks that begin in the scene of ``task``."""
+        return self
+
     def apart(self, others: Sequence[Self]) -> Floats:
         """The distance to each of N draws of this class (N,), as ``distances`` measures it; NaN where there is nothing
-        to compare. At least one, all of the ``same`` task or scene.
+        to compare. At least one, all of the ``same`` task or scene, and ``in_scene`` if their tasks differ.
 
         By default 0 to a draw that is equal, else 1.
         """

@@ -19,7 +19,7 @@ from pipeline.axes.base import Axis, Frozen, Level, PhysicsPerturbation, pick, p
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.libero.task_goal import relation_holds
-from pipeline.libero.tasks import Same
+from pipeline.libero.tasks import Same, find_task
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
@@ -100,6 +100,9 @@ class PosePerturbation(PhysicsPerturbation):
         """
         return self._apart_m(_test_moves_m(test, task, self.moved))
 
+    def in_scene(self, task: Task) -> PosePerturbation:
+        return self.model_copy(update={"moved": _scene_name(task, self.moved)})
+
     def apart(self, others: Sequence[PosePerturbation]) -> Floats:
         """Compared with the draws that move the same object."""
         return self._apart_m([(p.dx_m, p.dy_m) if p.moved == self.moved else NOWHERE for p in others])
@@ -115,9 +118,28 @@ NOWHERE = (math.nan, math.nan)
 
 @cache
 def _test_moves_m(test: TestSet, task: Task, moved: str) -> Floats:
-    """(N, 2) how far each of the axis's test tasks in the scene of ``task`` moves a thing; NaN where it stays."""
-    tests = test.on(task, "pose", "scene")
-    return np.array([displacements(one.parameters).get(moved, NOWHERE) for one in tests]).reshape(-1, 2)
+    """(N, 2) how far each of the axis's test tasks in the scene of ``task`` moves a thing; NaN where it stays.
+
+    A test task of another task may call the thing by another name.
+    """
+    name = _scene_name(task, moved)
+    return np.array([shifts.get(name, NOWHERE) for shifts in _test_shifts(test, task)]).reshape(-1, 2)
+
+
+@cache
+def _test_shifts(test: TestSet, task: Task) -> list[Shifts]:
+    """How far each of the axis's test tasks in the scene of ``task`` moves each thing, by its name in the scene."""
+    listed = []
+    for tested in test.on(task, "pose", "scene"):
+        base = find_task(tested.suite, tested.base)
+        moves = displacements(tested.parameters)
+        listed.append({_scene_name(base, name): shift for name, shift in moves.items()})
+    return listed
+
+
+def _scene_name(task: Task, thing: str) -> str:
+    """The name of a thing of a task in every task that begins in the same scene."""
+    return bddl.read(task.bddl_file).scene_names.get(thing, thing)
 
 
 Shifts = dict[str, tuple[float, float]]
@@ -167,6 +189,10 @@ class ScenePerturbation(PhysicsPerturbation):
         """Compared in all things that both move."""
         return self._apart_m(lambda name: _test_moves_m(test, task, name))
 
+    def in_scene(self, task: Task) -> ScenePerturbation:
+        moves = tuple(move.model_copy(update={"name": _scene_name(task, move.name)}) for move in self.moves)
+        return self.model_copy(update={"moves": moves})
+
     def apart(self, others: Sequence[ScenePerturbation]) -> Floats:
         shifts = [other.shifts for other in others]
         return self._apart_m(lambda name: [one.get(name, NOWHERE) for one in shifts])
@@ -196,14 +222,14 @@ def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePertu
     goal suite, things are first put where LIBERO-Plus puts them, but for what the hand could not grasp there: the bowl.
     """
     known = bddl.read(task.bddl_file)
-    carriers = known.carriers
+    carriers, centres_m = known.carriers, known.centres_m
     radius_m = level * next(
         (m for name, m in WIDER_M.items() if task.name.startswith(name)), STEP_M.get(task.suite, 0.01)
     )
     base_m = {
         name: shift
         for name, shift in BASE_M.items()
-        if task.suite == "libero_goal" and _within_reach(task, name, np.add(known.regions[known.places[name]], shift))
+        if task.suite == "libero_goal" and _within_reach(task, name, np.add(centres_m[name], shift))
     }
     for _ in range(DRAWS):
         own = {}
@@ -211,7 +237,7 @@ def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePertu
             reach_m, bearing_rad = radius_m * math.sqrt(rng.uniform()), rng.uniform(-math.pi, math.pi)
             offset_m = [reach_m * math.cos(bearing_rad), reach_m * math.sin(bearing_rad)]
             own[carrier] = np.round(np.add(base_m.get(carrier, (0.0, 0.0)), offset_m), 4)
-        xy_m = {thing: known.regions[known.places[carriers[thing]]] + own[carriers[thing]] for thing in carriers}
+        xy_m = {thing: np.add(centres_m[thing], own[carrier]) for thing, carrier in carriers.items()}
         if _fits(task, xy_m):
             break
     moves = tuple(
@@ -224,10 +250,11 @@ def draw_scene(rng: np.random.Generator, level: Level, task: Task) -> ScenePertu
 def _fits(task: Task, xy_m: dict[str, Floats]) -> bool:
     """Whether things at ``xy_m`` (2,), in the frame of their surface, keep the task's relations and their distance."""
     known = bddl.read(task.bddl_file)
+    centres_m = known.centres_m
     alone = [thing for thing, carrier in known.carriers.items() if thing == carrier]
     for index, one in enumerate(alone):
         for other in alone[:index]:
-            apart_m = math.dist(known.regions[known.places[one]], known.regions[known.places[other]])
+            apart_m = math.dist(centres_m[one], centres_m[other])
             objects = {one, other} <= known.objects.keys()
             least_m = min(CLOSE_M, APART * apart_m) if objects else min(FIXTURE_CLOSE_M, FIXTURE_APART * apart_m)
             if math.dist(xy_m[one], xy_m[other]) < least_m:
@@ -243,8 +270,7 @@ def _within_reach(task: Task, thing: str, place_m: Floats) -> bool:
     if thing not in known.objects or thing not in known.of_interest:
         return True
     robot_m = (ROBOT_X_M[known.arena], 0.0)
-    was_m = known.regions[known.places[known.carriers[thing]]]
-    return math.dist(place_m, robot_m) <= max(REACH_M, math.dist(was_m, robot_m))
+    return math.dist(place_m, robot_m) <= max(REACH_M, math.dist(known.centres_m[thing], robot_m))
 
 
 class PoseAxis(Axis):
@@ -274,7 +300,7 @@ class PoseAxis(Axis):
         named: dict[Component, tuple[str, ...]] = {
             "target": known.targets,
             "receptacle": known.receptacles,
-            "scene": ("all",),
+            "scene": ("all",) if known.places and known.centres_m.keys() == known.places.keys() else (),
         }
         return [(component, name) for component in self.components for name in named[component]]
 

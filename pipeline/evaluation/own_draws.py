@@ -125,14 +125,14 @@ class PlannedDraws:
         for row in rows:
             task = find_task(row.suite, row.task)
             for one in from_json(row.perturbations):
-                self._draws[_comparable(one, task)].append((one, row.episode_id))
+                self._draws[_comparable(one, task)].append((one.in_scene(task), row.episode_id))
                 self.counts[one.axis] += 1
 
     def nearest(self, drawn: Perturbation, task: Task) -> tuple[float, str]:
         """The distance to the nearest planned draw on the same axis and the episode it belongs to; infinite, and no
         episode, where there is none to compare with."""
         others = self._draws.get(_comparable(drawn, task), [])
-        distances = drawn.apart([other for other, _ in others]) if others else np.array([])
+        distances = drawn.in_scene(task).apart([other for other, _ in others]) if others else np.array([])
         if not np.isfinite(distances).any():
             return math.inf, ""
         closest = int(np.nanargmin(distances))

@@ -194,9 +194,8 @@ def _put() -> Mapping[tuple[str, str], set[str]]:
 
 def _kind(place: str, known: Bddl) -> str:
     """A place by its thing's category: ``basket_contain_region`` for ``basket_1_contain_region``."""
-    kinds = {**known.objects, **known.fixtures}
-    thing = max((name for name in kinds if f"{place}_".startswith(f"{name}_")), key=len)
-    return kinds[thing] + place.removeprefix(thing)
+    thing = known.owner(place) or ""
+    return known.category(thing) + place.removeprefix(thing)
 
 
 def _reworded(task: Task, old: str, category: str) -> str:

@@ -1,11 +1,12 @@
 """What a BDDL file says of a task: its instruction, what is in its scene, where things start, and its goal."""
 
 import re
+from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any, Literal, cast, get_args
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 from bddl.parsing import scan_tokens
 
@@ -20,6 +21,22 @@ Arena = Literal["tabletop", "kitchen", "living_room", "study", "floor"]
 _ARENA = re.compile(rf"libero_({'|'.join(get_args(Arena))})(?:_tabletop)?_manipulation")
 _PROBLEM = re.compile(r"\(define\s+\(problem\s+([^\s()]+)\)")
 _LANGUAGE = re.compile(r"\(:language\s([^()]*)\)")
+
+
+REGION_WORDS = {"cookies": "box", "flat_stove": "stove", "glazed_rim_porcelain_ramekin": "ramekin"}
+"""Categories that the names of LIBERO's regions call otherwise."""
+
+
+class Beside(NamedTuple):
+    """What the name of a region of the working surface says.
+
+    Attributes:
+        relation: ``next to``, ``between``, or the last word of the name, such as ``left``.
+        things: the object or fixture that the region is beside, or the two that it is between.
+    """
+
+    relation: str
+    things: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -57,35 +74,80 @@ class Bddl:
         """Object or fixture to the region or thing that it starts on or in."""
         return {fact[1]: fact[2] for fact in self.start if fact[0] in ("on", "in")}
 
-    @property
+    @cached_property
     def scene(self) -> Hashable:
-        """Equal for tasks that begin in the same scene: the arena, and of what kind and where each thing is."""
-        kinds = {**self.fixtures, **self.objects}
-        where = {name: self.regions.get(place, place) for name, place in self.places.items()}
-        return self.arena, frozenset((name, kinds[name], where[name]) for name in where)
+        """Equal for tasks that begin in the same scene: the arena, and what stands where."""
+        return self.arena, frozenset(self.scene_names.values())
+
+    @cached_property
+    def scene_names(self) -> dict[str, str]:
+        """Object or fixture to the name that it has in every task that begins in the same scene.
+
+        Tasks number things of one category as they like: the bowl on the stove is akita_black_bowl_1 in one task and
+        akita_black_bowl_2 in another. So the name consists of the category and the place. Things of one category at
+        one place are numbered.
+        """
+        spots = {thing: f"{self.category(thing)} {self._spot(thing)}" for thing in sorted(self.places)}
+        before: Counter[str] = Counter()
+        names = {}
+        for thing, spot in spots.items():
+            before[spot] += 1
+            names[thing] = f"{spot} #{before[spot]}"
+        return names
+
+    def category(self, name: str) -> str:
+        """Of an object or fixture; the name itself if the file declares no such thing."""
+        return self.objects.get(name) or self.fixtures.get(name) or name
 
     @property
     def carriers(self) -> dict[str, str]:
-        """Object or fixture to what it moves with: itself where it starts in a region of the working surface, else
-        what it stands on or in, such as wooden_cabinet_1 for a bowl that starts in wooden_cabinet_1_top_region."""
-        carriers: dict[str, str] = {}
-        for thing in self.places:
-            carrier = thing
-            while (place := self.places[carrier]) not in self.regions:
-                carrier = next(host for host in self.places if f"{place}_".startswith(f"{host}_"))
-            carriers[thing] = carrier
-        return carriers
+        """Object or fixture to what it moves with: itself if it starts in a region of the working surface, else what it
+        stands on or in, such as wooden_cabinet_1 for a bowl that starts in wooden_cabinet_1_top_region."""
+        return {thing: self._supports(thing)[-1] for thing in self.places}
+
+    @property
+    def centres_m(self) -> dict[str, tuple[float, float]]:
+        """Object or fixture to the centre (x, y) of the region that it, or else what carries it, starts in; without
+        things that start in no region with a range."""
+        places = {thing: self.places[carrier] for thing, carrier in self.carriers.items()}
+        return {thing: self.regions[place] for thing, place in places.items() if place in self.regions}
+
+    def owner(self, name: str) -> str | None:
+        """The object or fixture that has a part or region: wooden_cabinet_1 for wooden_cabinet_1_top_region.
+
+        A thing owns itself. `None` if the name begins with no thing's name.
+        """
+        owners = [thing for thing in (*self.objects, *self.fixtures) if f"{name}_".startswith(f"{thing}_")]
+        return max(owners, key=len, default=None)
+
+    def beside(self, region: str) -> Beside | None:
+        """Parse the name of a region of the working surface; `None` if it names no thing.
+
+        A region names a thing only if all that the name leaves, without surface and relation, is the thing's name, its
+        category or its word in ``REGION_WORDS``. ``left_region`` names none, and neither does ``plate_left_region`` if
+        there are two plates.
+        """
+        surface = self.owner(region)
+        if surface is None or not self._on_surface(region):
+            return None
+        words = region.removeprefix(f"{surface}_").removesuffix("_region")
+        if words.startswith("next_to_"):
+            return self._beside("next to", words.removeprefix("next_to_"))
+        if words.startswith("between_"):
+            both = words.removeprefix("between_").split("_")
+            splits = (("_".join(both[:at]), "_".join(both[at:])) for at in range(1, len(both)))
+            pairs = (self._beside("between", *pair) for pair in splits)
+            return next((pair for pair in pairs if pair is not None), None)
+        words, _, side = words.rpartition("_")
+        return self._beside(side, words)
 
     @property
     def goal_regions(self) -> dict[str, str]:
         """Region of the working surface that the goal puts something in to the thing that names it: plate_1 for
         living_room_table_plate_right_region, which is to the right of the plate."""
-        placed = {place: thing for thing, place in self.places.items()}
-        named = {}
-        for region in (fact[2] for fact in self.goal if len(fact) > 2 and fact[2] in self.regions):
-            words = region.removesuffix("_region").rsplit("_", 1)[0]
-            named[region] = next(thing for place, thing in placed.items() if place.startswith(words))
-        return named
+        regions = (fact[2] for fact in self.goal if len(fact) > 2)
+        named = {region: self.beside(region) for region in regions}
+        return {region: found.things[0] for region, found in named.items() if found and len(found.things) == 1}
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -107,14 +169,54 @@ class Bddl:
     def things_named(self, names: Iterable[str]) -> tuple[str, ...]:
         """The ``things`` among some names. A region, such as a drawer of a cabinet or the burner of a stove, stands for
         the thing that it belongs to."""
-        named = [f"{name}_" for name in names]
-        return tuple(thing for thing in self.things if any(name.startswith(f"{thing}_") for name in named))
+        owners = {self.owner(name) for name in names}
+        return tuple(thing for thing in self.things if thing in owners)
 
     @property
     def receptacles(self) -> tuple[str, ...]:
         """The movable objects that the goal puts others on or in, none twice; basket_1 for basket_1_contain_region."""
-        places = [fact[2] for fact in self.goal if fact[0] in ("on", "in")]
-        return tuple(name for name in self.objects if any(f"{place}_".startswith(f"{name}_") for place in places))
+        owners = {self.owner(fact[2]) for fact in self.goal if fact[0] in ("on", "in")}
+        return tuple(name for name in self.objects if name in owners)
+
+    def _on_surface(self, region: str) -> bool:
+        """Whether a region is one of the working surface, not of a thing that stands on it."""
+        return region in self.regions and self.owner(region) not in self.places
+
+    def _supports(self, thing: str) -> list[str]:
+        """The thing, what it stands on or in, what that stands on or in, and so on, without the working surface."""
+        supports = [thing]
+        while not self._on_surface(place := self.places.get(supports[-1], "")):
+            support = self.owner(place)
+            if support is None or support not in self.places or support in supports:
+                break
+            supports.append(support)
+        return supports
+
+    def _spot(self, thing: str) -> str:
+        """Where a thing starts, without names of things: in which part of what, down to the working surface."""
+        parts = []
+        for support in self._supports(thing):
+            place = self.places[support]
+            owner = self.owner(place) or ""
+            part = place.removeprefix(owner)
+            if place in self.regions:
+                x_m, y_m = self.regions[place]
+                part = f" at {x_m:.4f}, {y_m:.4f}"
+            parts.append(f"on {self.category(owner)}{part}")
+        return " ".join(parts)
+
+    def _beside(self, relation: str, *words: str) -> Beside | None:
+        """The things that are called by some words, if each of these calls exactly one."""
+        things = [self._called(word) for word in words]
+        return None if None in things else Beside(relation, tuple(thing for thing in things if thing is not None))
+
+    def _called(self, word: str) -> str | None:
+        """The thing of this name; else the only one of this category, or of the category that regions call so."""
+        if word in self.places:
+            return word
+        categories = {word, *(category for category, called in REGION_WORDS.items() if called == word)}
+        things = [thing for thing in self.places if self.category(thing) in categories]
+        return things[0] if len(things) == 1 else None
 
 
 @cache

@@ -3,7 +3,6 @@
 And what one calls the things and places of it, in plain words, and whether what those words say still holds."""
 
 import math
-import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -149,6 +148,7 @@ class _Scene:
     def __init__(self, bddl: Bddl):
         self.kinds = {**bddl.objects, **bddl.fixtures}
         self.starts = bddl.places
+        self._owner = bddl.owner
 
     def count(self, name: str) -> int:
         """How many there are of the kind of a thing."""
@@ -179,7 +179,7 @@ class _Scene:
 
     def _region(self, name: str) -> tuple[str, list[str]]:
         """The kind of what a name begins with, and the words that are left of it."""
-        host = max((thing for thing in self.kinds if f"{name}_".startswith(f"{thing}_")), key=len, default=name)
+        host = self._owner(name) or name
         return self.kinds.get(host, host), name[len(host) :].split("_")
 
     def _named(self, words: list[str]) -> Iterator[str]:
@@ -201,15 +201,10 @@ def _alike(task: Task, thing: str) -> tuple[str, ...]:
 
 @cache
 def _anchors(task: Task, thing: str) -> tuple[str, ...]:
-    """The one thing that an object starts next to, or the two that it starts between; none where neither is said."""
-    places = read(task.bddl_file).places
-    # Such as main_table_between_plate_ramekin_region: the plate starts in main_table_plate_region.
-    found = re.fullmatch(r"(\w+?)_(?:next_to_([a-z]+)|between_([a-z]+)_([a-z]+))_region", places.get(thing, ""))
-    if found is None:
-        return ()
-    surface, *words = (word for word in found.groups() if word)
-    at = {region: name for name, region in places.items()}
-    return tuple(at[f"{surface}_{word}_region"] for word in words)
+    """The one thing that an object starts next to, or the two that it starts between; empty if its region names none."""
+    known = read(task.bddl_file)
+    named = known.beside(known.places.get(thing, ""))
+    return named.things if named is not None and named.relation in ("next to", "between") else ()
 
 
 def relation_holds(task: Task, target: str, xy_m: Callable[[str], Floats]) -> bool:

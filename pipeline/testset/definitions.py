@@ -211,10 +211,10 @@ def _displacement(scene: Bddl, original: Bddl) -> dict[str, Value]:
     them is the ``target``, and ``others`` lists the rest.
     """
     moves = {}
-    for name in scene.places:
-        new_m, old_m = _centre(name, scene), _centre(name, original)
-        if new_m and old_m:
-            moves[name] = (round(new_m[0] - old_m[0], 6), round(new_m[1] - old_m[1], 6))
+    originals_m = original.centres_m
+    for name, (x_m, y_m) in scene.centres_m.items():
+        if name in originals_m:
+            moves[name] = (round(x_m - originals_m[name][0], 6), round(y_m - originals_m[name][1], 6))
     listed: dict[str, Value] = {"moves": _listed(moves)}
     moved = [name for name in scene.targets if name in moves]
     if not moved:
@@ -228,12 +228,3 @@ def _displacement(scene: Bddl, original: Bddl) -> dict[str, Value]:
 def _listed(moves: dict[str, tuple[float, float]]) -> str:
     """Such as moka_pot_2:0.01,-0.02;plate_1:0,0.03."""
     return ";".join(f"{name}:{dx:.6g},{dy:.6g}" for name, (dx, dy) in moves.items())
-
-
-def _centre(thing: str, scene: Bddl) -> tuple[float, float] | None:
-    """Centre of the region that something starts in, or else of that of what it starts on."""
-    places = scene.places
-    place = places.get(thing)
-    if place is None or place in scene.regions:
-        return scene.regions.get(place or "")
-    return next((_centre(host, scene) for host in places if host != thing and place.startswith(host)), None)
