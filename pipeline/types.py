@@ -95,6 +95,7 @@ class Demo:
         states: (T, S) the same before each action, or None when the source recorded only the first.
         model_xml: MJCF of the recorded scene with asset paths of this machine, or None when the source did
             not record it (then fixtures are placed by LIBERO's own reset under a fixed seed).
+        perturbations: JSON of what an expansion changed; an empty list if nothing.
     """
 
     task: Task
@@ -106,6 +107,7 @@ class Demo:
     init_state: Floats
     states: Floats | None
     model_xml: str | None
+    perturbations: str = "[]"
 
     @property
     def demo_id(self) -> str:

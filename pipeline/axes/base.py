@@ -104,6 +104,13 @@ class Perturbation(Frozen):
         compared = distances[~np.isnan(distances)]
         return Nearest(float(compared.min(initial=np.inf)), len(compared))
 
+    def after(self, earlier: Sequence[Perturbation]) -> Self:
+        """The same change to a demonstration that an expansion made by ``earlier`` changes.
+
+        Distances count from LIBERO's own scene, so a change of the same thing has to add what was changed before.
+        """
+        return self
+
     def in_scene(self, task: Task) -> Self:
         """The same change, with things named alike in all tasks that begin in the scene of ``task``."""
         return self

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from pipeline.axes.base import Axis, Frozen, Level, PhysicsPerturbation, pick, point
+from pipeline.axes.base import Axis, Frozen, Level, Perturbation, PhysicsPerturbation, pick, point
 from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.libero.task_goal import relation_holds
@@ -60,7 +60,62 @@ DRAWS = 200
 """How often a scene is drawn to keep its relations, before it is left to be refused."""
 
 
-class PosePerturbation(PhysicsPerturbation):
+Shifts = dict[str, tuple[float, float]]
+"""Thing to its displacement (dx, dy) in m."""
+
+
+class Move(Frozen):
+    """Displacement of one thing along the world's axes from where the demonstration has it."""
+
+    name: str
+    dx_m: float
+    dy_m: float
+
+
+class _PosePerturbation(PhysicsPerturbation):
+    """What all perturbations of the axis have.
+
+    Attributes:
+        source_moves: how far an expansion moved things in the demonstration that is perturbed, from where LIBERO's own
+            scene has them. Distances are those of both displacements together; `apply` adds its own alone.
+    """
+
+    source_moves: tuple[Move, ...] = Field(default=(), exclude_if=lambda moves: not moves)
+
+    same: ClassVar[Same | None] = "scene"
+
+    @property
+    def shifts(self) -> Shifts:
+        """How far each thing is moved from where the demonstration has it."""
+        raise NotImplementedError
+
+    @property
+    def shifts_in_all(self) -> Shifts:
+        """How far each thing is moved from where LIBERO's own scene has it."""
+        total = _shifts(self.source_moves)
+        for name, (dx_m, dy_m) in self.shifts.items():
+            source_dx_m, source_dy_m = total.get(name, (0.0, 0.0))
+            total[name] = (round(source_dx_m + dx_m, 6), round(source_dy_m + dy_m, 6))
+        return total
+
+    def after(self, earlier: Sequence[Perturbation]) -> Self:
+        moved = [one.shifts_in_all for one in earlier if isinstance(one, _PosePerturbation)]
+        return self.model_copy(update={"source_moves": _moves(moved[0])}) if moved else self
+
+    def in_scene(self, task: Task) -> Self:
+        source = {_scene_name(task, name): shift for name, shift in _shifts(self.source_moves).items()}
+        return self.model_copy(update={"source_moves": _moves(source)})
+
+
+def _shifts(moves: Iterable[Move]) -> Shifts:
+    return {move.name: (move.dx_m, move.dy_m) for move in moves}
+
+
+def _moves(shifts: Shifts) -> tuple[Move, ...]:
+    return tuple(Move(name=name, dx_m=dx_m, dy_m=dy_m) for name, (dx_m, dy_m) in shifts.items())
+
+
+class PosePerturbation(_PosePerturbation):
     """One object moved in the horizontal plane and turned on the spot.
 
     Attributes:
@@ -91,8 +146,6 @@ class PosePerturbation(PhysicsPerturbation):
 
         return move_one(scene, demo.task, self.moved, (self.dx_m, self.dy_m), self.dyaw_deg)
 
-    same: ClassVar[Same | None] = "scene"
-
     def distances_on(self, test: TestSet, task: Task) -> Floats:
         """Compared with the test tasks that move the same object, alone or with others.
 
@@ -100,16 +153,20 @@ class PosePerturbation(PhysicsPerturbation):
         """
         return self._apart_m(_test_moves_m(test, task, self.moved))
 
-    def in_scene(self, task: Task) -> PosePerturbation:
-        return self.model_copy(update={"moved": _scene_name(task, self.moved)})
+    @property
+    def shifts(self) -> Shifts:
+        return {self.moved: (self.dx_m, self.dy_m)}
+
+    def in_scene(self, task: Task) -> Self:
+        return super().in_scene(task).model_copy(update={"moved": _scene_name(task, self.moved)})
 
     def apart(self, others: Sequence[PosePerturbation]) -> Floats:
         """Compared with the draws that move the same object."""
-        return self._apart_m([(p.dx_m, p.dy_m) if p.moved == self.moved else NOWHERE for p in others])
+        return self._apart_m([p.shifts_in_all[p.moved] if p.moved == self.moved else NOWHERE for p in others])
 
     def _apart_m(self, moves_m: ArrayLike) -> Floats:
         """(N,) from moves (N, 2) of the same object."""
-        return np.asarray(np.linalg.norm(np.subtract(moves_m, (self.dx_m, self.dy_m)), axis=1))
+        return np.asarray(np.linalg.norm(np.subtract(moves_m, self.shifts_in_all[self.moved]), axis=1))
 
 
 NOWHERE = (math.nan, math.nan)
@@ -142,19 +199,7 @@ def _scene_name(task: Task, thing: str) -> str:
     return bddl.read(task.bddl_file).scene_names.get(thing, thing)
 
 
-Shifts = dict[str, tuple[float, float]]
-"""Thing to its displacement (dx, dy) in m."""
-
-
-class Move(Frozen):
-    """Displacement of one thing along the world's axes from where the demonstration has it."""
-
-    name: str
-    dx_m: float
-    dy_m: float
-
-
-class ScenePerturbation(PhysicsPerturbation):
+class ScenePerturbation(_PosePerturbation):
     """Every object and fixture moved in the horizontal plane.
 
     Attributes:
@@ -183,27 +228,26 @@ class ScenePerturbation(PhysicsPerturbation):
 
         return move(scene, demo.task, self.shifts)
 
-    same: ClassVar[Same | None] = "scene"
-
     def distances_on(self, test: TestSet, task: Task) -> Floats:
         """Compared in all things that both move."""
         return self._apart_m(lambda name: _test_moves_m(test, task, name))
 
-    def in_scene(self, task: Task) -> ScenePerturbation:
-        moves = tuple(move.model_copy(update={"name": _scene_name(task, move.name)}) for move in self.moves)
-        return self.model_copy(update={"moves": moves})
+    def in_scene(self, task: Task) -> Self:
+        shifts = {_scene_name(task, name): shift for name, shift in self.shifts.items()}
+        return super().in_scene(task).model_copy(update={"moves": _moves(shifts)})
 
     def apart(self, others: Sequence[ScenePerturbation]) -> Floats:
-        shifts = [other.shifts for other in others]
+        shifts = [other.shifts_in_all for other in others]
         return self._apart_m(lambda name: [one.get(name, NOWHERE) for one in shifts])
 
     @property
     def shifts(self) -> Shifts:
-        return {one.name: (one.dx_m, one.dy_m) for one in self.moves}
+        return _shifts(self.moves)
 
     def _apart_m(self, moves_m: Callable[[str], ArrayLike]) -> Floats:
         """(N,) from the moves (N, 2) of each thing by its name."""
-        offsets_m = [np.subtract(moves_m(one.name), (one.dx_m, one.dy_m)) for one in self.moves]
+        shifts = self.shifts_in_all
+        offsets_m = [np.subtract(moves_m(one.name), shifts[one.name]) for one in self.moves]
         return np.asarray(np.fmax.reduce([np.abs(offset_m).max(axis=1) for offset_m in offsets_m]))
 
 

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple, Protocol
 
@@ -34,7 +34,7 @@ class DemoEntry:
     """A demonstration in a source's index: all that planning needs, without its arrays.
 
     Attributes:
-        task, key, source, origin, sha256: as in ``Demo``.
+        task, key, source, origin, sha256, perturbations: as in ``Demo``.
         steps: number of actions, 20 a second.
     """
 
@@ -44,6 +44,7 @@ class DemoEntry:
     origin: str
     sha256: str
     steps: int
+    perturbations: str = "[]"
 
     @property
     def demo_id(self) -> str:
@@ -51,7 +52,7 @@ class DemoEntry:
 
     @classmethod
     def of(cls, demo: Demo) -> DemoEntry:
-        return cls(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions))
+        return cls(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions), demo.perturbations)
 
 
 class Problem(NamedTuple):
@@ -232,7 +233,10 @@ class HDF5Source:
         source = f"{task.suite}/{path.name} {key}"
         origin = EXPANDED if hdf5.EXPANDED_FROM in group.attrs else HUMAN
         model_file = hdf5.text(group, "model_file", where)
-        return _Recorded(task, key, source, origin, actions, states, model_file).checked(where)
+        demo = _Recorded(task, key, source, origin, actions, states, model_file).checked(where)
+        if origin == HUMAN:
+            return demo
+        return replace(demo, perturbations=hdf5.text(group, "perturbations", where))
 
 
 class _Recorded(NamedTuple):

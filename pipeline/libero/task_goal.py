@@ -201,7 +201,7 @@ def _alike(task: Task, thing: str) -> tuple[str, ...]:
 
 @cache
 def _anchors(task: Task, thing: str) -> tuple[str, ...]:
-    """The one thing that an object starts next to, or the two that it starts between; empty if its region names none."""
+    """The one thing that an object starts next to, or the two that it starts between, by its region's name."""
     known = read(task.bddl_file)
     named = known.beside(known.places.get(thing, ""))
     return named.things if named is not None and named.relation in ("next to", "between") else ()

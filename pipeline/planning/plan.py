@@ -11,7 +11,16 @@ from typing import Annotated
 
 import pyarrow as pa
 
-from pipeline.axes import Axis, Perturbation, PhysicsPerturbation, TextPerturbation, in_order, of_layer, to_json
+from pipeline.axes import (
+    Axis,
+    Perturbation,
+    PhysicsPerturbation,
+    TextPerturbation,
+    from_json,
+    in_order,
+    of_layer,
+    to_json,
+)
 from pipeline.config import PlanConfig, ReplayConfig
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.grouping import grouped
@@ -157,21 +166,36 @@ class Draws:
     seed: int
     test: TestSet
 
-    def of(self, demo_id: str, task: Task) -> Iterator[tuple[Perturbation, ...]]:
+    def of(self, demo_id: str, task: Task, expanded_by: str = "[]") -> Iterator[tuple[Perturbation, ...]]:
         """Draws for one demonstration, variant after variant: all different, and clear of the test set.
+
+        Args:
+            expanded_by: JSON of the perturbations by which an expansion made the demonstration.
 
         Yields:
             One perturbation of each axis, until no different draw is left.
+
+        Raises:
+            PipelineError: when another version with other perturbations made the demonstration.
         """
+        try:
+            earlier = from_json(expanded_by)
+        except PipelineError as error:
+            raise PipelineError(
+                f"the perturbations of this expanded demonstration cannot be read ({error.what})",
+                where=demo_id,
+                expected="perturbations of this version",
+                remedy="expand the human demonstrations again into another folder",
+            ) from error
         place = int(rng(self.seed, self.name, demo_id).integers(2**31))
         drawn: set[tuple[str, ...]] = set()
         for variant in count():
             for attempt in range(_ATTEMPTS):
                 key = rng(self.seed, self.name, demo_id, variant, attempt)
                 # All from one generator, before any is drawn anew from one of its own.
-                sampled = [axis.sample(key, task, place) for axis in self.axes]
+                sampled = [axis.sample(key, task, place).after(earlier) for axis in self.axes]
                 found = [
-                    self._clear(first, axis, task, place, (demo_id, variant, attempt, number))
+                    self._clear(first, axis, task, place, earlier, (demo_id, variant, attempt, number))
                     for number, (first, axis) in enumerate(zip(sampled, self.axes, strict=True))
                 ]
                 place += 1
@@ -185,7 +209,13 @@ class Draws:
             yield perturbations
 
     def _clear(
-        self, first: Perturbation, axis: Axis, task: Task, place: int, key: tuple[str | int, ...]
+        self,
+        first: Perturbation,
+        axis: Axis,
+        task: Task,
+        place: int,
+        earlier: Sequence[Perturbation],
+        key: tuple[str | int, ...],
     ) -> Perturbation | None:
         """The ``first`` draw of an axis where it keeps clear of the test set, else another of its component and level.
 
@@ -199,7 +229,7 @@ class Draws:
             return first
         again, alike = rng(self.seed, self.name, *key), axis.model_copy(update={"levels": (first.level,)})
         for _ in range(_ATTEMPTS):
-            one = alike.sample(again, task, place)
+            one = alike.sample(again, task, place).after(earlier)
             if (one.component, one.level) == (first.component, first.level) and clear(one):
                 return one
         return None
@@ -211,7 +241,7 @@ def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[Demo
     A demonstration of which no more different draws are left that keep clear of the test set is passed over; the
     candidates end when none is left of any.
     """
-    left = {demo: draws.of(demo.demo_id, demo.task) for demo in group}
+    left = {demo: draws.of(demo.demo_id, demo.task, demo.perturbations) for demo in group}
     for variant in count():
         for demo, drawn in [*left.items()]:
             if (perturbations := next(drawn, None)) is None:

@@ -196,7 +196,7 @@ class _Run:
                 away_cm = 100 * math.dist(self._look(row, end).position_m, self._look(twin, end).position_m)
                 yield f"disturbance: hand off its path after a push of level {change.level} (cm)", away_cm
             case (ScenePerturbation() as change,):
-                yield from _targets_moved(row.suite, row.task, change.shifts, change.level)
+                yield from _targets_moved(row.suite, row.task, change.shifts_in_all, change.level)
             case (LayoutPerturbation() as change,):
                 trajectory = self._store.load(row.trajectory_id)
                 model, placed = physics_to_read(trajectory.model_xml), trajectory.scene.resolved["layout"]["objects"]
@@ -254,11 +254,8 @@ def to_nearest_draw(test: TestSet, rows: Iterable[Row]) -> Iterator[tuple[str, f
     for row in rows:
         for change in from_json(row.perturbations):
             match change:
-                case ScenePerturbation():
-                    drawn[row.suite, row.task].append((row.episode_id, change.shifts))
-                case PosePerturbation():
-                    shifts = {change.moved: (change.dx_m, change.dy_m)}
-                    drawn[row.suite, row.task].append((row.episode_id, shifts))
+                case ScenePerturbation() | PosePerturbation():
+                    drawn[row.suite, row.task].append((row.episode_id, change.shifts_in_all))
     return _to_nearest(test, drawn)
 
 

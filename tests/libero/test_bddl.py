@@ -149,7 +149,7 @@ def test_a_thing_without_a_region_is_no_exception(stove: str) -> None:
 
 
 def test_a_scene_does_not_depend_on_names() -> None:
-    """The same file with the two bowls' names exchanged begins in the same scene, and with one bowl elsewhere does not."""
+    """With the two bowls' names exchanged it is the same scene; with one bowl elsewhere it is not."""
     for task in tasks("libero_spatial"):
         text = task.bddl_file.read_text().lower()
         exchanged = re.sub(r"bowl_([12])", lambda number: f"bowl_{3 - int(number[1])}", text)
