@@ -20,6 +20,7 @@ import numpy as np
 
 gl.prepare()
 
+from pipeline.axes import level_of_test  # noqa: E402
 from pipeline.episode_schema import SCHEMA  # noqa: E402
 from pipeline.evaluation import libero_plus  # noqa: E402
 from pipeline.evaluation.simulator import Simulator  # noqa: E402
@@ -52,7 +53,7 @@ def main() -> None:
             for number, test in _robot_starts(task):
                 simulator.start(0, libero_states(task)[0], libero_plus.postures_rad()[number])
                 moved = Look.of(simulator.model, simulator.state)
-                level = test.level
+                level = level_of_test(test)
                 measured += moved.away_from(look, "controller_posture", level).items()
         for name, value in measured:
             values[name].append(value)
@@ -64,7 +65,7 @@ def _robot_starts(task: Task) -> list[tuple[int, TestTask]]:
     """The first robot test task of each level that perturbs a task, by the number of its posture."""
     chosen: dict[int, TestTask] = {}
     for test in benchmark.load().on(task, "robot"):
-        chosen.setdefault(test.level, test)
+        chosen.setdefault(level_of_test(test), test)
     return [(int(test.parameters["id"]), test) for test in chosen.values()]
 
 

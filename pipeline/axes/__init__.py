@@ -24,6 +24,7 @@ from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.errors import PipelineError
+from pipeline.testset.benchmark import TestTask
 
 
 class Axes(Frozen):
@@ -78,6 +79,11 @@ def axes_of(name: str) -> tuple[str, ...]:
     if len(set(axes)) < len(axes):
         raise ValueError(f"{name!r} names an axis twice, but an episode is perturbed once on each axis")
     return tuple(sorted(axes, key=_PLACE.__getitem__))
+
+
+def level_of_test(tested: TestTask) -> int:
+    """Strength of a test task, 1 to 5, by the ranges of its axis; 0 if its parameters do not tell."""
+    return AXES[tested.axis].level_of_test(tested)
 
 
 def components_of(axis: str) -> tuple[str, ...]:

@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from pipeline.libero.tasks import Same
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, Frame, RollOut, Scene, Task
 from pipeline.types import Frozen as Frozen
 
@@ -173,6 +173,14 @@ class Axis(Frozen):
         return self
 
     @classmethod
+    def level_of_test(cls, tested: TestTask) -> int:
+        """Strength of one of the axis's test tasks, 1 to 5, by the axis's own ranges; 0 if its parameters do not tell.
+
+        The benchmark's own ``difficulty_level`` is another thing: how many of four models fail.
+        """
+        return 0
+
+    @classmethod
     def held_out(cls) -> Axis:
         """The ranges of held-out perturbations: the default ones, from which a key of their own keeps draws apart."""
         return cls()
@@ -265,6 +273,11 @@ class PhysicsPerturbation(Perturbation):
             RefusedError: when the change cannot be made here; its reason is written into the manifest.
         """
         raise NotImplementedError
+
+
+def level_from(strength: float) -> int:
+    """The level of a strength that reaches the upper end of level k at k."""
+    return min(max(math.ceil(round(strength, 6)), 1), 5)
 
 
 T = TypeVar("T")

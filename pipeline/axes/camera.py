@@ -10,9 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from pipeline.axes.base import Axis, ByLevel, Degrees, Frozen, Intervals, RenderPerturbation, draw, pick, point
+from pipeline.axes.base import (
+    Axis,
+    ByLevel,
+    Degrees,
+    Frozen,
+    Intervals,
+    RenderPerturbation,
+    draw,
+    level_from,
+    pick,
+    point,
+)
 from pipeline.rotations import about, product, rotate
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats, Task
 
 if TYPE_CHECKING:
@@ -252,6 +263,18 @@ class CameraAxis(Axis):
         if not (self.distance or self.spherical or self.orientation):
             raise ValueError("leave at least one of distance, spherical and orientation")
         return self
+
+    @classmethod
+    def level_of_test(cls, tested: TestTask) -> int:
+        """By the distance, by the azimuth, or by the larger of yaw and pitch, in steps of the default ranges."""
+        value = {name: float(tested.parameters[name]) for name in PARAMETERS}
+        match tested.component:
+            case "distance":
+                return level_from((value["distance_scale"] - 1) / 0.2)
+            case "spherical":
+                return level_from(abs(value["azimuth_deg"]) / 15)
+            case _:
+                return level_from(max(abs(value["yaw_deg"]), abs(value["pitch_deg"])) / 2)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> CameraPerturbation:
         chosen = pick(rng, [one for one in (self.distance, self.spherical, self.orientation) if one is not None])

@@ -27,9 +27,9 @@ from pipeline.axes.base import Axis, Level, Nearest, TextPerturbation
 from pipeline.axes.language_lint import CLASSES, LENGTH, NAMED, REMEDY, Component, lint, normalise
 from pipeline.errors import PipelineError
 from pipeline.jit import compiled
-from pipeline.libero.tasks import Same
+from pipeline.libero.tasks import Same, find_task
 from pipeline.strict_yaml import FastStrictLoader
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Place, Task
 
 Bank = dict[str, dict[str, dict[Component, tuple[str, ...]]]]
@@ -95,6 +95,11 @@ class LanguageAxis(Axis):
 
     def _classes(self, axes: Collection[str]) -> tuple[Component, ...]:
         return tuple(one for one in self.classes if one in NAMED) if "layout" in axes else self.classes
+
+    @classmethod
+    def level_of_test(cls, tested: TestTask) -> int:
+        """By the edit distance to the instruction of the LIBERO task, as rewrites."""
+        return level_of(str(tested.parameters["text"]), find_task(tested.suite, tested.base).instruction)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
         """The rewrite at ``place`` of the task's list, which starts again once all were drawn.

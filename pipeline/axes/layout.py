@@ -16,7 +16,7 @@ from pipeline.catalogue.object_sources import Source
 from pipeline.catalogue.objects import find, goes_with, models, taken
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import Same
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 SHELF = 13
@@ -101,6 +101,11 @@ class LayoutAxis(Axis):
 
     sources: Annotated[tuple[Source, ...], Field(min_length=1)] = ("libero", "robosuite")
     area_m2: float = Field(default=0.12, gt=0.0, le=10.0)
+
+    @classmethod
+    def level_of_test(cls, tested: TestTask) -> int:
+        """By the number of added objects."""
+        return int(tested.parameters["count"])
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> LayoutPerturbation:
         level = self.draw_level(rng)

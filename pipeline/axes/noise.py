@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import model_validator
 
 from pipeline import seeding
-from pipeline.axes.base import LEVELS, Axis, ByLevel, PixelPerturbation, pick
+from pipeline.axes.base import LEVELS, Axis, ByLevel, PixelPerturbation, level_from, pick
 from pipeline.axes.corruptions import Component, Fog, Gaussian, Glass, Motion, Zoom
 from pipeline.errors import PipelineError
 from pipeline.testset import benchmark
@@ -117,6 +117,11 @@ class NoiseAxis(Axis):
     glass: ByLevel[Glass] = _grid(
         Glass, sigma_px=(0.6, 0.95, 1.2, 1.65, 2.35), delta_px=(1, 2, 3, 4, 5), passes=(3, 3, 2, 2, 1)
     )
+
+    @classmethod
+    def level_of_test(cls, tested: TestTask) -> int:
+        """By the severity; two make one level."""
+        return level_from(float(tested.parameters["severity"]) / 2)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> NoisePerturbation:
         """A component and a level, each with equal chance, whatever the task and the place."""

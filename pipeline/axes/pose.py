@@ -20,7 +20,7 @@ from pipeline.libero import bddl
 from pipeline.libero.bddl import Arena
 from pipeline.libero.task_goal import relation_holds
 from pipeline.libero.tasks import Same, find_task
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 Component = Literal["target", "receptacle", "scene"]
@@ -347,6 +347,11 @@ class PoseAxis(Axis):
             "scene": ("all",) if known.places and known.centres_m.keys() == known.places.keys() else (),
         }
         return [(component, name) for component in self.components for name in named[component]]
+
+    @classmethod
+    def level_of_test(cls, tested: TestTask) -> int:
+        """The benchmark's own number, by which the radius of its disks grows."""
+        return int(tested.parameters["level"])
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> PosePerturbation | ScenePerturbation:
         component, moved = pick(rng, self._choices(task))

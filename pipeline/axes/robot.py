@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, pick
+from pipeline.axes.base import Axis, ByLevel, Nearest, PhysicsPerturbation, level_from, pick
 from pipeline.errors import RefusedError
 from pipeline.libero.starts import HOME_RAD
-from pipeline.testset.benchmark import TestSet
+from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Demo, Floats, RollOut, Scene, Task
 
 Joints = tuple[float, float, float, float, float, float, float]
@@ -131,6 +131,11 @@ class RobotAxis(Axis):
 
     components: Annotated[tuple[Component, ...], Field(min_length=1)] = ("controller_posture", "initial_joints")
     norm_rad: ByLevel[Norm] = (0.1, 0.2, 0.3, 0.4, 0.5)
+
+    @classmethod
+    def level_of_test(cls, tested: TestTask) -> int:
+        """By the norm of the offset, 0.1 rad a level."""
+        return level_from(float(tested.parameters["id"]) / 100)
 
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> RobotPerturbation:
         level = self.draw_level(rng)

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 
 from pipeline import seeding
+from pipeline.axes import level_of_test
 from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoisePerturbation, effect_of
 from pipeline.errors import PipelineError
@@ -84,7 +85,7 @@ def camera(test: TestTask) -> TestCamera:
     """The agent view of a test task, whatever its axis."""
     if test.axis != "camera":
         return TestCamera(component="orientation", level=1)
-    return TestCamera.model_validate({"component": test.component, "level": test.level, **test.parameters})
+    return TestCamera.model_validate({"component": test.component, "level": level_of_test(test), **test.parameters})
 
 
 def noise(test: TestTask, seed: int) -> NoisePerturbation:
@@ -95,7 +96,7 @@ def noise(test: TestTask, seed: int) -> NoisePerturbation:
             a global generator.
     """
     own = int(seeding.rng("evaluation", seed, "noise", test.suite, test.name).integers(2**53))
-    what = {"component": test.component, "effect": effect_of(test), "level": test.level, "seed": own}
+    what = {"component": test.component, "effect": effect_of(test), "level": level_of_test(test), "seed": own}
     return NoisePerturbation.model_validate(what)
 
 

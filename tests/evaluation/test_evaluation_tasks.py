@@ -3,6 +3,7 @@
 import io
 import json
 import pickle
+import re
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
@@ -12,8 +13,10 @@ import pytest
 import torch
 from conftest import STOVE
 from episode_results import result
+from libero.libero.benchmark import get_benchmark_dict
 
 from pipeline import seeding
+from pipeline.axes import level_of_test
 from pipeline.axes.robot import benchmark_offsets_rad
 from pipeline.errors import PipelineError
 from pipeline.evaluation import libero_plus, tasks
@@ -24,6 +27,7 @@ from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.statistics import grade, summary, wilson
 from pipeline.evaluation.tasks import EvaluationTask, balanced, libero_states
 from pipeline.libero.starts import HOME_RAD
+from pipeline.libero.tasks import SUITES, find_task
 from pipeline.testset import benchmark
 
 
@@ -160,6 +164,70 @@ def test_the_harness_names_tasks_by_our_form_or_by_its_own() -> None:
     clean = select(Selection(suites=("libero_goal",), tasks=("turn_on_the_stove",), episodes=4))
     own_class = {"name": "turn on the stove", "suite": "libero_goal", "task_id": 7}
     assert [EvaluationTask.of_harness({**own_class, "episode_idx": number}) for number in range(4)] == clean
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_the_harness_gets_the_task_that_liberos_list_has_at_its_number(suite: str) -> None:
+    """Of LIBERO-90, 16 tasks share their instruction with a task of another scene."""
+    theirs = get_benchmark_dict()[suite]()
+    for number in range(theirs.n_tasks):
+        known = theirs.get_task(number)
+        named = {"name": known.language, "suite": suite, "task_id": number}
+        assert EvaluationTask.of_harness(named).base == known.name
+    for other in ({"task_id": theirs.n_tasks}, {"task_id": -1}, {"name": "fly to the moon"}):
+        with pytest.raises(PipelineError, match=f"{suite} has no task"):
+            EvaluationTask.of_harness(named | other)
+
+
+LEVELS = {
+    "camera": (0, 133, 256, 362, 406, 442),
+    "robot": (0, 156, 307, 350, 366, 371),
+    "layout": (0, 106, 151, 180, 185, 207),
+    "pose": (0, 124, 134, 146, 148, 144),
+    "light": (1142, 0, 0, 0, 0, 0),
+    "background": (1076, 0, 0, 0, 0, 0),
+}
+"""Test tasks of unknown level and of levels 1 to 5; robot, layout and pose as counted from the benchmark's names."""
+
+
+def test_every_axis_states_the_level_of_its_test_tasks() -> None:
+    counts = Counter((one.axis, level_of_test(one)) for one in benchmark.load().tasks)
+    assert {axis: tuple(counts[axis, level] for level in range(6)) for axis in LEVELS} == LEVELS
+    added = benchmark.load().of("layout")
+    # The benchmark's names number 30 layouts of a task; six in a row add equally many objects.
+    assert all(level_of_test(one) == -(-int(one.name.rpartition("_add_")[2]) // 6) for one in added)
+    assert all(f"_level{level_of_test(one)}_sample" in one.name for one in benchmark.load().of("pose"))
+
+
+def edits(one: str, other: str) -> int:
+    """Levenshtein distance by its definition."""
+    row = list(range(len(other) + 1))
+    for i, letter in enumerate(one, 1):
+        before, row = row, [i]
+        for j, another in enumerate(other, 1):
+            row.append(min(before[j] + 1, row[-1] + 1, before[j - 1] + (letter != another)))
+    return row[-1]
+
+
+def test_the_level_of_a_language_test_is_its_share_of_edits() -> None:
+    for tested in benchmark.load().of("language")[::97]:
+        text, original = (
+            re.sub(r"[^a-z0-9 ]", "", text.lower())
+            for text in (str(tested.parameters["text"]), find_task(tested.suite, tested.base).instruction)
+        )
+        share = edits(text, original) / max(len(text), len(original))
+        assert level_of_test(tested) == 1 + sum(share >= least for least in (0.5, 0.6, 0.67, 0.72)), text
+
+
+def test_tasks_of_unknown_level_are_counted_where_a_level_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    chosen = select(Selection(source="libero_plus", levels=(1, 2, 3, 4, 5)))
+    counts = Counter(task.axis for task in chosen)
+    assert counts == {"camera": 1599, "robot": 1550, "noise": 1601, "language": 1537, "pose": 696}
+    assert "left out, because the parameters do not tell their level (0): background 1076, light 1142" in (
+        capsys.readouterr().out
+    )
+    select(Selection(source="libero_plus", axes=("background",), levels=(0,)))
+    assert "level" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

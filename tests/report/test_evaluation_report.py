@@ -13,6 +13,7 @@ from html_page import Page, needs_nothing_beside_itself, screenshot
 from scipy.stats import binomtest
 
 from pipeline import files
+from pipeline.axes import level_of_test
 from pipeline.errors import PipelineError
 from pipeline.evaluation.results import EpisodeFiles, EpisodeResult, read, stored
 from pipeline.evaluation.selection import Selection, select
@@ -63,9 +64,9 @@ def test_all_tasks_of_a_column_weigh_the_same() -> None:
 
 def test_a_total_weighs_each_column_by_its_tasks() -> None:
     """Of each kind and level one test: all with another camera are solved, and nothing else is."""
-    tests = {(one.axis, one.component, one.level): one for one in benchmark.load().tasks}.values()
+    tests = {(one.axis, one.component, level_of_test(one)): one for one in benchmark.load().tasks}.values()
     tasks = [
-        EvaluationTask("libero_plus", one.suite, one.base, one.name, one.axis, one.component, one.level, 0)
+        EvaluationTask("libero_plus", one.suite, one.base, one.name, one.axis, one.component, level_of_test(one), 0)
         for one in tests
     ]
     (line,) = paper_table({"mine": [result(task, task.axis == "camera", "mine") for task in tasks]})["evaluated"]

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY
 
+from pipeline.axes import level_of_test
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import find_task
 from pipeline.testset import benchmark
@@ -85,7 +86,7 @@ def test_parameters_are_those_the_benchmark_was_measured_to_have(test: TestSet) 
 
     severities = Counter((task.component, task.parameters["severity"]) for task in test.of("noise"))
     assert [severities["zoom", s] for s in range(1, 11)] == [13, 16, 19, 24, 30, 32, 40, 40, 37, 37]
-    zooms = Counter(task.level for task in test.of("noise") if task.component == "zoom")
+    zooms = Counter(level_of_test(task) for task in test.of("noise") if task.component == "zoom")
     assert zooms == {1: 13 + 16, 2: 19 + 24, 3: 30 + 32, 4: 40 + 40, 5: 37 + 37}
 
     assert Counter(task.parameters["prefix"] for task in test.of("light")) == {
