@@ -80,7 +80,7 @@ def audit(arguments: argparse.Namespace) -> int:
     found = audit(arguments.dataset, benchmark.load(), arguments.manifest)
     rich.print(leakage.report(found.axes))
     for axis, episodes in found.unknown.items():
-        print(f"{axis}: not known of {episodes:,} of {found.episodes:,} episodes, which have no labels")
+        print(f"{axis}: not known of {episodes:,} of {found.episodes:,} episodes: no labels, no text, or no known task")
     print(json.dumps(asdict(found) | {"unknown": found.unknown}))
     return int(any(finding.overlaps for finding in found.axes.values()))
 

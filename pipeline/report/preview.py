@@ -145,6 +145,8 @@ def configured(name: str, config: Config) -> Axis:
 def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> list[Perturbation]:
     """Draws of the plan's that cover the axis's components, and within each component its levels.
 
+    Empty if none of the axis's draws keeps clear of the test set.
+
     Raises:
         PipelineError: when the axis has nothing to change in the task, or a level has no draw that keeps clear.
     """
@@ -155,7 +157,7 @@ def variants(name: str, axis: Axis, demo: Demo, seed: int, test: TestSet) -> lis
     draws = Draws(name, (axis,), seed, test).of(demo.demo_id, demo.task, demo.perturbations)
     left = [perturbation for (perturbation,) in islice(draws, CANDIDATES)]
     chosen: list[Perturbation] = []
-    count = PHYSICS_VARIANTS if isinstance(left[0], PhysicsPerturbation) else VARIANTS
+    count = PHYSICS_VARIANTS if of_layer(left, PhysicsPerturbation) else VARIANTS
 
     def wish(candidate: Perturbation) -> tuple[int, int, int]:
         """The smaller, the more a draw adds: a rare component, a level far from those shown of it, a rare level."""
@@ -184,6 +186,8 @@ def axis_sheet(stage: Stage, name: str, config: Config, test: TestSet) -> Image.
     side = SIDE_PX[len(views)]
     original = stage.frames(views)
     tiles = [Tile(side_by_side(original, side), f"original: {demo.task.instruction}")]
+    if not drawn:
+        tiles.append(_nothing_drawn(name, tiles[0].picture.size))
     if strips := [tile for push in drawn for tile in _strip(stage, push)]:
         tiles, drawn, views = strips, [], ["image"]
     for perturbation in drawn:
@@ -224,7 +228,8 @@ def overview(stage: Stage, config: Config, test: TestSet) -> Image.Image:
         axis = configured(name, config)
         without_rewrites = isinstance(axis, LanguageAxis) and not axis.wordings(demo.task, [name], test)
         if axis.applies(demo.task) and not without_rewrites:
-            tiles.append(_strongest(stage, variants(name, axis, demo, config.plan.seed, test)))
+            drawn = variants(name, axis, demo, config.plan.seed, test)
+            tiles.append(_strongest(stage, drawn) if drawn else _nothing_drawn(name))
     return sheet(f"{demo.task}: first frame of the agent view, one draw of each axis", tiles, 5)
 
 
@@ -240,6 +245,10 @@ def _strongest(stage: Stage, drawn: Sequence[Perturbation]) -> Tile:
                 caption += f": {text.apply(stage.demo.task.instruction)}"
             return Tile(Image.fromarray(frame), caption)
     return _refused(*last)
+
+
+def _nothing_drawn(name: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:
+    return Tile(Image.new("RGB", size_px, REFUSED_GREY), f"no draw of {name} keeps clear of the test set here")
 
 
 def _refused(why: RefusedError, caption: str, size_px: tuple[int, int] = (SIDE_PX[1], SIDE_PX[1])) -> Tile:

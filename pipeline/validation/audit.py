@@ -6,6 +6,7 @@ other axes only this project's labels tell (``perturbations``), in the dataset o
 
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
@@ -42,13 +43,14 @@ class Found:
 
     Attributes:
         episode_id: this project's name of it, or what the dataset calls it.
+        instruction: what the policy is told; None where the dataset has no text.
         extrinsics: (4, 4) from the agent view to the world (z forward, y down); None where the dataset has none.
-        suite, task: of LIBERO; None where nothing tells.
+        suite, task: of the labels, perhaps of no task that is known here; None where nothing tells.
         perturbations: the labels, as the manifest writes them; None where there are none.
     """
 
     episode_id: str
-    instruction: str
+    instruction: str | None
     extrinsics: Floats | None = None
     suite: str | None = None
     task: str | None = None
@@ -63,7 +65,9 @@ class Audit:
         axes: axis to how close its episodes come to the test tasks.
         unlabelled: episodes without labels, of which nothing is known but the instruction and the camera.
         without_camera: unlabelled episodes without the camera's matrices.
-        without_task: episodes that no LIBERO task of the four suites was found for.
+        without_task: episodes that no known task was found for.
+        without_instruction: episodes without a text to compare.
+        unplaced: axis to the episodes that it perturbs and whose task is not known, so nothing can be compared.
     """
 
     episodes: int
@@ -71,11 +75,15 @@ class Audit:
     unlabelled: int
     without_camera: int
     without_task: int
+    without_instruction: int
+    unplaced: dict[str, int]
 
     @property
     def unknown(self) -> dict[str, int]:
         """Axis to the number of episodes of which nothing tells whether it perturbs them."""
-        counts = {axis: self.unlabelled for axis in AXES if axis != "language"} | {"camera": self.without_camera}
+        counts = Counter({axis: self.unlabelled for axis in AXES if axis != "language"})
+        counts |= {"camera": self.without_camera, "language": self.without_instruction}
+        counts.update(self.unplaced)
         return {axis: count for axis, count in counts.items() if count}
 
 
@@ -98,12 +106,15 @@ def audit(dataset: Path, test: TestSet, manifest: Path | None = None) -> Audit:
     ]
     found = [_task_of(one) for one in episodes]
     rows = [_row(one, task, test) for one, task in zip(episodes, found, strict=True)]
+    without_task = [one for one, task in zip(episodes, found, strict=True) if task is None]
     return Audit(
-        len(episodes),
-        compare(rows, test),
-        sum(one.perturbations is None for one in episodes),
-        sum(one.perturbations is None and one.extrinsics is None for one in episodes),
-        found.count(None),
+        episodes=len(episodes),
+        axes=compare(rows, test),
+        unlabelled=sum(one.perturbations is None for one in episodes),
+        without_camera=sum(one.perturbations is None and one.extrinsics is None for one in episodes),
+        without_task=len(without_task),
+        without_instruction=sum(one.instruction is None for one in episodes),
+        unplaced=dict(Counter(p.axis for one in without_task for p in _labels(one) if _needs_task(p))),
     )
 
 
@@ -141,7 +152,9 @@ def _rlds(folder: Path) -> Iterator[Found]:
             said = {name.removeprefix(METADATA): value for name, value in step.items() if name.startswith(METADATA)}
             text = {name: said[name][0].decode() for name in ("episode_id", *LABELS) if name in said}
             episode_id, instruction = text.pop("episode_id", ""), step["language_instruction"][0].decode()
-            yield Found(episode_id or f"{shard.name}:{number}", instruction, said.get("image_extrinsics"), **text)
+            yield Found(
+                episode_id or f"{shard.name}:{number}", instruction or None, said.get("image_extrinsics"), **text
+            )
 
 
 def _lerobot(folder: Path) -> Iterator[Found]:
@@ -162,7 +175,7 @@ def _lerobot(folder: Path) -> Iterator[Found]:
         matrix = row.get(camera_column("image", "extrinsics"))
         yield Found(
             row.get(EPISODE_ID) or ids.get(index) or f"episode {index}",
-            episode["tasks"][0],
+            next(iter(episode["tasks"]), None),
             None if matrix is None else np.reshape(matrix, SCHEMA.extrinsics.shape),
             **{name: row.get(name) for name in LABELS},
         )
@@ -185,8 +198,7 @@ def _manifest(file: Path) -> dict[str, Mapping[str, Any]]:
 
 def _row(one: Found, task: Task | None, test: TestSet) -> Compared:
     """What an episode shows in the axes' own parameters; what only labels tell is taken from these."""
-    labels = () if one.perturbations is None else from_json(one.perturbations)
-    seen: list[Perturbation] = [p for p in labels if p.axis != "language"]
+    seen = [p for p in _labels(one) if task is not None or not _needs_task(p)]
     if one.extrinsics is not None:
         seen = [p for p in seen if p.axis != "camera"]
         arenas = list(AGENT_VIEWS) if task is None else [bddl.read(task.bddl_file).arena]
@@ -194,18 +206,34 @@ def _row(one: Found, task: Task | None, test: TestSet) -> Compared:
         if None not in cameras:
             anywhere = tasks(TESTED_SUITES[0])[0]
             seen.append(min((c for c in cameras if c), key=lambda c: c.nearest(test, anywhere).distance))
-    own = task is not None and normalise(one.instruction) == normalise(task.instruction)
-    rewrites = [] if own else [LanguagePerturbation(component="paraphrase", level=1, text=one.instruction)]
+    rewrites = []
+    if one.instruction is not None and (task is None or normalise(one.instruction) != normalise(task.instruction)):
+        rewrites = [LanguagePerturbation(component="paraphrase", level=1, text=one.instruction)]
     if task is None:  # an unknown episode is compared with the task whose test instructions come nearest
-        every = (task for suite in TESTED_SUITES for task in tasks(suite))
-        task = min(every, key=lambda task: rewrites[0].nearest(test, task).distance)
+        every = [task for suite in TESTED_SUITES for task in tasks(suite)]
+        task = min(every, key=lambda task: rewrites[0].nearest(test, task).distance) if rewrites else every[0]
     return Compared(one.episode_id, task.suite, task.name, to_json([*seen, *rewrites]))
 
 
+def _labels(one: Found) -> list[Perturbation]:
+    """The labels of an episode but language, which its instruction shows."""
+    labels = () if one.perturbations is None else from_json(one.perturbations)
+    return [p for p in labels if p.axis != "language"]
+
+
+def _needs_task(perturbation: Perturbation) -> bool:
+    """Whether it is compared only with the test tasks of one task or scene."""
+    return perturbation.same is not None
+
+
 def _task_of(one: Found) -> Task | None:
+    """By the labels, else by the instruction; labels may name a suite of somebody else's."""
     if one.suite and one.task:
-        return find_task(one.suite, one.task)
-    return _tasks_by_text().get(normalise(one.instruction))
+        try:
+            return find_task(one.suite, one.task)
+        except PipelineError:
+            return None
+    return None if one.instruction is None else _tasks_by_text().get(normalise(one.instruction))
 
 
 @cache

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 import pytest
-from conftest import BOWL, MILK, REPOSITORY, starter_demo
+from conftest import BOWL, MILK, PLATE, REPOSITORY, starter_demo
 from PIL import Image
 
 from pipeline import __main__ as command_line
@@ -20,6 +20,7 @@ from pipeline.axes.base import Axis, Nearest
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.disturbance import DisturbanceAxis
 from pipeline.axes.language import LanguageAxis
+from pipeline.axes.pose import PoseAxis
 from pipeline.axes.robot import RobotAxis
 from pipeline.compute.pool import loop
 from pipeline.config import PlanConfig, load
@@ -367,3 +368,28 @@ def test_a_sheet_of_a_large_run_shows_every_component_suite_and_level() -> None:
     }
     few = sheets.spread(rows[:3], 16)
     assert sorted(map(str, few)) == sorted(map(str, rows[:3]))
+
+
+def test_an_axis_without_a_draw_for_the_first_task_is_said_on_its_sheet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever half a millimetre puts the plate, a test has it within 5 mm."""
+    monkeypatch.chdir(REPOSITORY)
+    captions: list[str] = []
+
+    def tile(picture: Image.Image, caption: str) -> sheets.Tile:
+        captions.append(caption)
+        return sheets.Tile(picture, caption)
+
+    monkeypatch.setattr(preview, "Tile", tile)
+    still = PoseAxis(components=("target",), levels=(1,), step_m=0.0005, turn_deg=0)
+    axes = Axes(pose=still, language=LanguageAxis())
+    config = STARTER.model_copy(
+        update={
+            "demos": STARTER.demos.model_copy(update={"tasks": (str(PLATE),)}),
+            "plan": STARTER.plan.model_copy(update={"axes": axes}),
+        }
+    )
+    preview.for_run(config, tmp_path / "previews", loop)
+    assert {file.name for file in (tmp_path / "previews" / PLATE.suite).iterdir()} == {"pose.png", "language.png"}
+    assert captions.count("no draw of pose keeps clear of the test set here") == 1

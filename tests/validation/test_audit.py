@@ -139,6 +139,34 @@ def test_a_set_of_instructions_alone(test: TestSet, tmp_path: Path) -> None:
     assert found.without_task == 2
 
 
+def test_an_episode_without_a_text_and_one_of_an_unknown_suite_are_counted(
+    datasets: Path, test: TestSet, tmp_path: Path
+) -> None:
+    """An editor left one episode's list of tasks empty; another is of a suite that only its maker has."""
+    edited = tmp_path / "edited"
+    shutil.copytree(datasets / "lerobot_v21", edited)
+    (lines,) = edited.rglob("episodes.jsonl")
+    rows = [json.loads(line) for line in lines.read_text().splitlines()]
+    rows[IDS.index(CLEAR)]["tasks"] = []
+    lines.write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    (provenance,) = edited.rglob("provenance.parquet")
+    listed = pq.read_table(provenance).to_pylist()
+    moved = {"axis": "pose", "component": "scene", "level": 1, "moves": [{"name": "bowl_1", "dx_m": 0.01, "dy_m": 0}]}
+    for row in listed:
+        if row["episode_id"] == LABELLED:
+            row["suite"] = "my_kitchen"
+            row["perturbations"] = json.dumps([moved, *json.loads(row["perturbations"])])
+    write_table(pa.Table.from_pylist(listed), provenance)
+    found = audit(edited, test)
+    assert (found.episodes, found.without_instruction, found.without_task) == (6, 1, 1)
+    assert found.unknown == {"language": 1, "pose": 1}
+    # The noise of the unknown suite's episode is the same in every task, and still found.
+    assert {axis: one.closest for axis, one in found.axes.items() if one.overlaps} == {
+        "camera": CAMERA, "language": WORDS, "noise": LABELLED,
+    }  # fmt: skip
+    assert "pose" not in found.axes
+
+
 @pytest.mark.parametrize("arena", get_args(Arena))
 def test_the_agent_views_are_liberos(arena: Arena) -> None:
     class Recorder:
