@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline import seeding
-from pipeline.axes.language_goal import pattern, words
+from pipeline.axes.language_goal import found, pattern, thing_words, words
 from pipeline.catalogue.object_sources import offered
 from pipeline.errors import PipelineError
 from pipeline.grouping import grouped
@@ -143,13 +143,18 @@ class Replacement:
         return text[:start] + re.sub(rf"\b{self.old}\b", self.new, text[start:])
 
 
+WHICH = r".*?(?= and (?:place|put)\b)| (?:at|on|in) the (?:back|front|left|middle|right)(?! of)\b"
+"""What says which of several things of a category is meant, after the words for it."""
+
+
 @cache
 def replacements(task: Task) -> tuple[Replacement, ...]:
     """All that can take the place of an object that the task's goal puts somewhere.
 
-    The new object can be moved, carries nothing, is not in the goal yet and is the only one of its category, so that
-    its words mean it alone. It fits where the old one goes: one of LIBERO's 130 tasks puts an object of its category on
-    or in a thing of the same kind, or it is no larger than an object that one of them puts there.
+    The new object can be moved, carries nothing, is not in the goal yet and is not what names the place, as the plate
+    does for a region beside it. It is the only one of its category, and its words mean it alone. It fits where the old
+    one goes: one of LIBERO's 130 tasks puts an object of its category on or in a thing of the same kind, or it is no
+    larger than an object that one of them puts there.
     """
     known = bddl.read(task.bddl_file)
     named = {word for fact in known.goal for word in fact}
@@ -160,10 +165,13 @@ def replacements(task: Task) -> tuple[Replacement, ...]:
         if [known.objects[target] for target in known.targets].count(known.objects[old]) > 1:
             continue  # "both moka pots" has no words for one of them
         relation, place = next((fact[0], fact[2]) for fact in known.goal if fact[1] == old)
+        beside = known.beside(place)
+        taken = {*known.receptacles, *carrying, *named, *(beside.things if beside else ())}
         for new, category in known.objects.items():
-            free = new not in (*known.receptacles, *carrying, *named)
-            if free and kinds.count(category) == 1 and _fits(category, relation, place, known):
-                possible.append(Replacement(old, new, category, _reworded(task, old, category)))
+            if new in taken or kinds.count(category) > 1 or not _fits(category, relation, place, known):
+                continue
+            if (instruction := _reworded(task, old, category)) is not None:
+                possible.append(Replacement(old, new, category, instruction))
     return tuple(possible)
 
 
@@ -210,27 +218,44 @@ def _kind(place: str, known: Bddl) -> str:
     return known.category(thing) + place.removeprefix(thing)
 
 
-def _reworded(task: Task, old: str, category: str) -> str:
-    """The instruction with the words for another category in the place of those for ``old``, and of what says which of
-    several it is: ``between the plate and the ramekin``."""
+def _reworded(task: Task, old: str, category: str) -> str | None:
+    """The instruction with the words for another category in the place of those for ``old``, and of the phrase that
+    says which of several it is: ``between the plate and the ramekin``, ``at the back``.
+
+    `None` if that would be no plain sentence about one thing: the words for ``old`` stand in it twice or not at all, or
+    the new words also mean another thing of the scene.
+    """
     known = bddl.read(task.bddl_file)
-    several = list(known.objects.values()).count(known.objects[old]) > 1
-    which = r"(?:.*?(?= and (?:place|put)\b))" if several else ""
-    mention = re.compile(pattern(words().things[known.objects[old]].names).pattern + which)
-    return mention.sub(_words(task.suite, category), task.instruction, count=1)
+    old_category, new_words = known.objects[old], _words(task.suite, category)
+    scene = thing_words(tuple(dict.fromkeys(map(known.category, known.things))), hints=False)
+    mentions = [match for match, kinds in found(task.instruction, scene) if old_category in kinds]
+    if len(mentions) != 1 or _means_another(new_words, category, known):
+        return None
+    before, after = task.instruction[: mentions[0].start()], task.instruction[mentions[0].end() :]
+    if list(known.objects.values()).count(old_category) > 1:
+        after = re.sub(f"^(?:{WHICH})", "", after)
+    return f"{before}{new_words}{after}"
+
+
+def _means_another(text: str, category: str, known: Bddl) -> bool:
+    """Whether a thing of another category in the scene is called so too."""
+    others = {known.category(thing) for thing in known.things} - {category}
+    meant = thing_words(tuple(others), hints=False)
+    return pattern(tuple(meant)).fullmatch(text) is not None
 
 
 @cache
 def _words(suite: str, category: str) -> str:
-    """What LIBERO's instructions call a category, in this suite if they do.
+    """What LIBERO's instructions call the only thing of a category, in this suite if they do.
 
     Raises:
-        PipelineError: when no instruction in a scene that has it calls it by any of its names.
+        PipelineError: when no instruction in a scene that has one of it calls it by any of its names.
     """
     for among in ((suite,), SUITES):
-        scenes = (task for one in among for task in tasks(one))
-        said = [task.instruction for task in scenes if category in bddl.read(task.bddl_file).objects.values()]
+        scenes = [(task, bddl.read(task.bddl_file)) for one in among for task in tasks(one)]
+        told = [task.instruction for task, known in scenes if list(known.objects.values()).count(category) == 1]
         for name in words().things[category].names:
-            if any(re.search(rf"\b{name}\b", instruction) for instruction in said):
-                return name
+            for instruction in told:
+                if match := pattern((name,)).search(instruction):
+                    return match[0]
     raise PipelineError(f"LIBERO's instructions have no words for {category}", where="language_words.yaml")

@@ -370,6 +370,7 @@ def test_a_sheet_of_a_large_run_shows_every_component_suite_and_level() -> None:
     assert sorted(map(str, few)) == sorted(map(str, rows[:3]))
 
 
+@pytest.mark.slow
 def test_an_axis_without_a_draw_for_the_first_task_is_said_on_its_sheet(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
