@@ -274,6 +274,14 @@ class PhysicsPerturbation(Perturbation):
         """
         raise NotImplementedError
 
+    def fault_of(self, actions: Floats) -> str | None:
+        """Return why a replay with these executed actions (K, 7) does not show the change as promised, else ``None``.
+
+        The reason is written into the manifest and the replay is dropped. A tracked replay waits for the hand, so its
+        steps are not those of the demonstration.
+        """
+        return None
+
 
 def level_from(strength: float) -> int:
     """The level of a strength that reaches the upper end of level k at k."""

@@ -38,7 +38,7 @@ class DisturbancePerturbation(PhysicsPerturbation):
         wrench: (6,) force in N and torque in N m along the world's axes, the same at each of the steps.
         first_step: executed actions before the push, since the first look.
         steps: control steps of 50 ms.
-        away_steps: how far it must be from where the demonstration opens or closes the gripper, at both ends.
+        away_steps: how far it must be from where the gripper opens or closes, at both ends.
     """
 
     axis: Literal["disturbance"] = "disturbance"
@@ -60,18 +60,21 @@ class DisturbancePerturbation(PhysicsPerturbation):
         Steps are counted in the demonstration without its no-ops, as it is replayed by default.
 
         Raises:
-            RefusedError: ``push_at_grasp`` when it is too near to where the gripper opens or closes,
-                ``push_after_end`` when the demonstration ends before it does.
+            RefusedError: a reason of ``fault_of``, here for the demonstration's own actions.
         """
-        gripper = demo.actions[kept_actions(demo.actions, "drop"), 6]
-        end = self.first_step + self.steps
-        if end + self.away_steps > len(gripper):
-            raise RefusedError("push_after_end")
-        near = gripper[max(self.first_step - self.away_steps - 1, 0) : end + self.away_steps]
-        if (near != near[0]).any():
-            raise RefusedError("push_at_grasp")
+        if fault := self.fault_of(demo.actions[kept_actions(demo.actions, "drop")]):
+            raise RefusedError(fault)
         push = Push(self.body, self.wrench, self.first_step, self.steps)
         return replace(scene, push=push, resolved={**scene.resolved, "disturbance": push._asdict()})
+
+    def fault_of(self, actions: Floats) -> str | None:
+        """Return ``push_at_grasp`` where the gripper opens or closes within ``away_steps`` of the push,
+        ``push_after_end`` where the actions (K, 7) end within them, else ``None``."""
+        gripper, end = actions[:, 6], self.first_step + self.steps
+        if end + self.away_steps > len(gripper):
+            return "push_after_end"
+        near = gripper[max(self.first_step - self.away_steps - 1, 0) : end + self.away_steps]
+        return "push_at_grasp" if (near != near[0]).any() else None
 
     @property
     def impulse_n_s(self) -> Floats:
@@ -91,8 +94,8 @@ class DisturbanceAxis(Axis):
         impulse_n_s: force times duration at each level. The defaults displace the hand by about 1 to 5 cm.
         steps: control steps that a push takes, 0.1 to 0.4 s by default.
         first_step: executed actions before it; each of the stretches is drawn as often as the others.
-        away_steps: control steps between a push and where the demonstration opens or closes the gripper; at 0 it may
-            come right before or after.
+        away_steps: control steps between a push and where the gripper opens or closes, in the demonstration and in the
+            replay, which waits for the hand; at 0 it may come right before or after.
     """
 
     draws: ClassVar = (DisturbancePerturbation,)

@@ -52,6 +52,8 @@ def replay(
     def rollout(mode: str, policy: Callable[[], Iterator[Floats]]) -> Trajectory:
         settle_steps, acting = (0, lambda: iter(())) if refused else (config.settle_steps, policy)
         states, actions, alphas, judged = _execute(environment, scene, settle_steps, acting)
+        if judged.kept and (fault := _fault_of(perturbations, actions)):
+            judged = Verdict(False, fault)
         return Trajectory(trajectory_id, mode, scene, states, actions, alphas, refused or judged)
 
     # What is pushed is tracked also where the recorded actions would reach the goal: they do not work against the push.
@@ -90,6 +92,12 @@ def _execute(
         refused = Verdict(False, error.reason)
     judged = refused or verdict(np.stack(states), np.array(succeeded, bool))
     return np.stack(states), np.array(actions).reshape(-1, 7), np.stack(alphas), judged
+
+
+def _fault_of(perturbations: Sequence[PhysicsPerturbation], actions: Floats) -> str | None:
+    """Return the first reason for which a perturbation drops the executed actions (K, 7), else ``None``."""
+    faults = (perturbation.fault_of(actions) for perturbation in perturbations)
+    return next((fault for fault in faults if fault), None)
 
 
 def _tracking(environment: Environment, reference: Reference) -> Iterator[Floats]:

@@ -10,6 +10,7 @@ from conftest import BOWL, starter_demo
 
 from pipeline.axes import Axes
 from pipeline.axes.disturbance import DisturbanceAxis, DisturbancePerturbation
+from pipeline.axes.robot import RobotPerturbation
 from pipeline.config import DemosConfig, PlanConfig, ReplayConfig
 from pipeline.errors import RefusedError
 from pipeline.evaluation.environment import EpisodeEnvironment
@@ -146,6 +147,24 @@ def test_the_hand_is_pushed_off_and_comes_back_to_the_goal(
     assert loaded.scene.push == kept.scene.push
     assert loaded.scene.resolved["disturbance"]["first_step"] == first_step
     assert np.array_equal(replayed(environment, twin, pushed_at(first_step, 80.0)).states, loaded.states)
+
+
+def test_a_push_that_comes_at_a_grasp_because_the_replay_waited_is_dropped(
+    environment: Environment, whole: dict[Task, Trajectory]
+) -> None:
+    """The demonstration closes the gripper in action 32. From this start the route waits, and closes it in action 35: 2
+    steps lie between it and the push, which begins in step 38."""
+    offsets_rad = (0.051364, -0.339128, -0.187123, -0.075247, 0.220818, 0.195144, -0.069536)
+    start = RobotPerturbation(component="initial_joints", level=5, joint_offsets_rad=offsets_rad)
+    twin = whole[BOWL]
+    reference = Reference.of(twin.model_xml, twin.states, twin.actions)
+    verdicts = {}
+    for away_steps in (2, 3, 5):
+        push = pushed_at(38, 20.0, away_steps)
+        pushed = replay(environment, DEMO, "pushed", ReplayConfig(), [start, push], lambda: reference)
+        assert np.flatnonzero(np.diff(pushed.actions[:, 6]) > 0) + 1 == 35
+        verdicts[away_steps] = pushed.verdict.reason
+    assert verdicts == {2: "kept", 3: "push_at_grasp", 5: "push_at_grasp"}
 
 
 @pytest.mark.slow
