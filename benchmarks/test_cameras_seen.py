@@ -1,0 +1,111 @@
+"""How much of the hand and of the task's things LIBERO-Plus's 1,599 test cameras show.
+
+    nice -n 10 python benchmarks/test_cameras_seen.py data/test_cameras_seen.jsonl
+
+Each test camera looks at the starter demonstration of its task, replayed open-loop: the hand's way is that of all
+steps, the things are those of the first frame. The file keeps a line for each test camera: a run that was stopped
+resumes there. Prints JSON: for each arena and component, the number of cameras, the largest share of the steps at which
+the hand is outside of the frame, and the cameras that show a thing on fewer than ``LEAST_PX`` pixels where LIBERO's own
+shows it on more. ``nominal`` is LIBERO's own camera. ``TESTED_OUTSIDE`` of ``pipeline/rendering/sight.py`` has the
+largest share of each component. It takes about 4 minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+from pipeline import gl  # before NumPy, whose machine code it fixes
+
+# isort: split
+import numpy as np
+
+gl.prepare()
+
+from pipeline.config import ReplayConfig  # noqa: E402
+from pipeline.evaluation.libero_plus import camera  # noqa: E402
+from pipeline.libero import bddl  # noqa: E402
+from pipeline.libero.demonstrations import StarterSource  # noqa: E402
+from pipeline.libero.tasks import tasks  # noqa: E402
+from pipeline.physics.environment import shared  # noqa: E402
+from pipeline.physics.replay import replay  # noqa: E402
+from pipeline.rendering.renderer import Renderer  # noqa: E402
+from pipeline.rendering.sight import LEAST_PX, Sight  # noqa: E402
+from pipeline.scenes.compiled import proprioception  # noqa: E402
+from pipeline.testset import benchmark  # noqa: E402
+from pipeline.types import Floats, Task, Trajectory  # noqa: E402
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("kept", type=Path, help="file of results so far")
+    arguments = parser.parse_args()
+    arguments.kept.parent.mkdir(parents=True, exist_ok=True)
+    arguments.kept.touch()
+    measured = {line["task"] for line in map(json.loads, arguments.kept.read_text().splitlines())}
+    for task in (task for suite in benchmark.TESTED_SUITES for task in tasks(suite)):
+        if str(task) not in measured:
+            lines = measure(task)
+            with arguments.kept.open("a") as file:
+                file.writelines(json.dumps(line) + "\n" for line in lines)
+            print(task, len(lines), file=sys.stderr, flush=True)
+    print(json.dumps(summary([json.loads(line) for line in arguments.kept.read_text().splitlines()]), indent=1))
+
+
+def measure(task: Task) -> list[dict[str, Any]]:
+    """A line for LIBERO's own camera and for each test camera of a task."""
+    demo = StarterSource().of(task)
+    trajectory = replay(shared(task), demo, "test_cameras", ReplayConfig(mode="open_loop"))
+    arena = bddl.read(task.bddl_file).arena
+    renderer = Renderer(trajectory.model_xml)
+    hand_m = hand_way(renderer, trajectory)
+    renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+    lines = [{"task": str(task), "arena": arena, "component": "nominal", **sight(renderer, task, hand_m)}]
+    for test in benchmark.load().on(task, "camera"):
+        with renderer.perturbed([camera(test)]):
+            renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
+            line = {"task": str(task), "arena": arena, "component": test.component, **sight(renderer, task, hand_m)}
+            lines.append(line | {"test": test.name, "level": test.level})
+    renderer.close()
+    return lines
+
+
+def hand_way(renderer: Renderer, trajectory: Trajectory) -> Floats:
+    """(K, 3) where the hand is before each action, in m in the world, as ``rendering/render.py`` has it."""
+    places = []
+    for state, alpha in zip(trajectory.states[:-1], trajectory.site_alpha[:-1], strict=True):
+        renderer.restore(state, alpha)
+        places.append(proprioception(renderer.data)[0][:3])
+    return np.stack(places).astype(float)
+
+
+def sight(renderer: Renderer, task: Task, hand_m: Floats) -> dict[str, Any]:
+    seen = Sight.of(renderer, task, hand_m)
+    return {"hand_outside": round(seen.hand_outside, 4), "things_px": seen.things_px}
+
+
+def summary(lines: list[dict[str, Any]]) -> dict[str, dict[str, dict[str, float]]]:
+    """What the cameras of each arena and component come to."""
+    nominal = {line["task"]: line["things_px"] for line in lines if line["component"] == "nominal"}
+    kinds: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    for line in lines:
+        kinds[line["arena"], line["component"]].append(line)
+    found: dict[str, dict[str, dict[str, float]]] = defaultdict(dict)
+    for (arena, component), cameras in sorted(kinds.items()):
+        outside = max(camera["hand_outside"] for camera in cameras)
+        hiding = sum(hides(camera["things_px"], nominal[camera["task"]]) for camera in cameras)
+        found[arena][component] = {"cameras": len(cameras), "hand_outside": outside, "hiding_a_thing": hiding}
+    return found
+
+
+def hides(things_px: dict[str, int], nominal_px: dict[str, int]) -> bool:
+    """Whether one of the task's things shows on too few pixels, where LIBERO's own camera shows it on more."""
+    return any(px < min(LEAST_PX, nominal_px[thing]) for thing, px in things_px.items())
+
+
+if __name__ == "__main__":
+    main()
