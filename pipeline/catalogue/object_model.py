@@ -30,6 +30,15 @@ _CONTACT = {
 _PLACES = {"axisangle", "xyaxes", "zaxis", "fromto"}
 _TAGS = {"default", "include", "deformable", "frame", "replicate", "composite", "flexcomp", "attach"}
 """Attributes and elements that place geoms in ways that are not read here."""
+_NOT_READ = {
+    "compiler": {"strippath", "discardvisual"},
+    "texture": {"fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"},
+    "geom": {"fitscale", "hfield"},
+}
+"""Element to attributes that change which files are used or what is seen, and that are not read here."""
+_TYPES_NOT_READ = {"plane", "hfield", "sdf"}
+_VIEWED = {"0", "1", "2"}
+"""Groups of geoms that MuJoCo's viewer shows."""
 
 
 class Shape(NamedTuple):
@@ -136,16 +145,27 @@ class ObjectModel:
                 expected="paths relative to the model, pos and quat for places, every attribute on its element",
                 remedy="compile it, save it with mujoco.mj_saveLastXML, then resolve frames and defaults",
             )
+        if unread := sorted(_unread(root)):
+            raise PipelineError(
+                f"the model has {', '.join(unread)}, which would be left out",
+                where=self.mjcf,
+                expected="bodies of boxes, spheres, capsules, cylinders, ellipsoids and meshes; one file a texture",
+                remedy="take them out, or put the geoms into a body",
+            )
         return root
 
     @cached_property
     def _assets(self) -> tuple[ET.Element, ...]:
-        used = {geom.get(kind) for geom in self._root.iter("geom") for kind in ("mesh", "material")}
-        used |= {material.get("texture") for material in self._root.iter("material") if material.get("name") in used}
+        """Meshes, materials and textures that the geoms use, with absolute paths."""
+        used = {geom.get(kind) for geom in self._root.iter("geom") for kind in ("mesh", "material")} - {None}
+        for material in self._root.iter("material"):
+            if material.get("name") in used:
+                used |= {material.get("texture"), *(layer.get("texture") for layer in material.iter("layer"))}
         assets = []
         for asset in self._root.findall("asset/*"):
-            if asset.get("name") in used:
-                asset = copy.copy(asset)
+            if (name := asset_name(asset)) in used:
+                asset = copy.deepcopy(asset)
+                asset.set("name", name)
                 if file := asset.get("file"):
                     asset.set("file", str((self.mjcf.parent / file).resolve()))
                 assets.append(asset)
@@ -154,14 +174,14 @@ class ObjectModel:
     def _geoms(self, prefix: str, shift_m: Sequence[float], density: float) -> Iterator[ET.Element]:
         """Its geoms as those of one body that stands upright, moved by ``shift_m``; visual geoms have no mass."""
         placed = list(_placed(self._root.findall("worldbody/body"), np.array(shift_m, float), _UPRIGHT[self.up]))
-        has_visuals = any(_is_visual(geom) for geom, _, _ in placed)
+        drawn = _drawn([geom for geom, _, _ in placed])
         for geom, pos, quat in placed:
             shape = {key: value for key, value in geom.attrib.items() if key in ("type", "mesh", "size")}
             shape |= {"pos": _numbers(pos), "quat": _numbers(quat)}
             if not _is_visual(geom):
                 touch = {**shape, **_CONTACT, "density": f"{density:.4f}", "group": "0", "rgba": "0 0 0 0"}
                 yield _renamed(ET.Element("geom", touch), prefix)
-            if _is_visual(geom) or not has_visuals:
+            if geom in drawn:
                 look = {key: value for key, value in geom.attrib.items() if key in ("material", "rgba")}
                 seen = {**shape, **look, "contype": "0", "conaffinity": "0", "mass": "0", "group": "1"}
                 yield _renamed(ET.Element("geom", seen), prefix)
@@ -192,15 +212,50 @@ def _numbers(values: Floats) -> str:
     return " ".join(f"{value:.7g}" for value in values)
 
 
+def asset_name(asset: ET.Element) -> str:
+    """The name by which geoms and materials call an asset; without one, MuJoCo names it after its file."""
+    return asset.get("name") or Path(asset.get("file", "")).stem
+
+
+def _unread(root: ET.Element) -> Iterator[str]:
+    """What of a model would be left out without a trace."""
+    for tag, attributes in _NOT_READ.items():
+        for element in root.iter(tag):
+            yield from (f"<{tag} {name}>" for name in attributes & element.attrib.keys())
+    for geom in root.iter("geom"):
+        if geom.get("type") in _TYPES_NOT_READ:
+            yield f"<geom type={geom.get('type')}>"
+    if root.find("worldbody/geom") is not None:
+        yield "<geom> outside of a body"
+    if root.find("asset/skin") is not None or root.find("deformable") is not None:
+        yield "<skin>"
+
+
 def _is_visual(geom: ET.Element) -> bool:
     return geom.get("contype") == "0" and geom.get("conaffinity") == "0"
 
 
+def _drawn(geoms: Sequence[ET.Element]) -> list[ET.Element]:
+    """The geoms that are seen: those that MuJoCo's viewer shows.
+
+    Where some geoms only look, colliding ones of a stated group 0 are not seen: robosuite, and so LIBERO, keeps the
+    collision geometry there and renders group 1. All are seen where else none would be.
+    """
+    only_look = any(_is_visual(geom) for geom in geoms)
+    viewed = [geom for geom in geoms if geom.get("group", "0") in _VIEWED]
+    if only_look:
+        viewed = [geom for geom in viewed if _is_visual(geom) or geom.get("group") != "0"]
+    return viewed or list(geoms)
+
+
 def _renamed(element: ET.Element, prefix: str) -> ET.Element:
-    renamed = ET.Element(element.tag, dict(element.attrib))
-    for key in ("name", "mesh", "material", "texture"):
-        if prefix and key in renamed.attrib:
-            renamed.set(key, f"{prefix}_{renamed.attrib[key]}")
+    """A copy of an element and its children in which every name begins with ``prefix``."""
+    renamed = copy.deepcopy(element)
+    renamed.tail = None
+    for part in renamed.iter():
+        for key in ("name", "mesh", "material", "texture"):
+            if prefix and key in part.attrib:
+                part.set(key, f"{prefix}_{part.attrib[key]}")
     return renamed
 
 

@@ -23,7 +23,7 @@ from rich.progress import track
 
 from pipeline.catalogue import sweethome3d
 from pipeline.catalogue.meshes import RECIPE, convert
-from pipeline.catalogue.object_model import ObjectModel
+from pipeline.catalogue.object_model import ObjectModel, asset_name
 from pipeline.catalogue.sources import Folder
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, remove_leftovers, replaced
@@ -186,6 +186,7 @@ def _copy(mjcf: Path, out: Path) -> None:
                     expected="files beside the model",
                     remedy="copy it beside the model, and name it from there",
                 )
+            asset.set("name", asset_name(asset))
             asset.set("file", f"{number}{file.suffix}")
             shutil.copyfile(file, out / asset.attrib["file"])
     except (OSError, ET.ParseError) as error:

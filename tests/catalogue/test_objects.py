@@ -1,6 +1,7 @@
 """Models of objects: what is installed stands and is tellable apart; what is converted keeps size, look and licence."""
 
 import io
+import re
 import shutil
 import tarfile
 import zipfile
@@ -230,6 +231,78 @@ def test_a_user_s_mjcf_is_taken_with_its_files(folder: Path, tmp_path: Path) -> 
     (cube,) = models(own(tmp_path / "mine")).values()
     assert cube.shape.volume_m3 == pytest.approx(0.04 * 0.06 * 0.08)
     assert (compiled(cube).geom_group == 1).any(), "what is touched is also seen when the model draws nothing else"
+
+
+LABELLED = """<mujoco>
+  <asset>
+    <texture name="stripes" type="2d" file="stripes.png"/>
+    <texture type="2d" file="dots.png"/>
+    <mesh file="parts/lid.obj"/>
+    <material name="tin"><layer texture="stripes" role="rgb"/></material>
+    <material name="paper" texture="dots"/>
+  </asset>
+  <worldbody>
+    <body name="can">
+      <geom type="box" size=".02 .03 .04" material="tin"/>
+      <geom type="box" size=".01 .01 .01" pos="0 0 .05" rgba="1 0 0 1" group="2"/>
+      <geom type="mesh" mesh="lid" rgba="0 0 1 1"/>
+      <geom type="box" size=".021 .001 .02" material="paper" contype="0" conaffinity="0"/>
+      <geom type="box" size=".05 .05 .05" group="3"/>
+    </body>
+  </worldbody>
+</mujoco>"""
+
+
+def seen_by_mujoco(model: mujoco.MjModel, groups: tuple[int, ...]) -> list[tuple[Any, ...]]:
+    """Geoms of some groups: type, colour, and how wide the picture is that is laid over them."""
+    shown = []
+    for number in np.flatnonzero(np.isin(model.geom_group, groups) & (model.geom_bodyid > 0)):
+        material = model.geom_matid[number]
+        texture = model.mat_texid[material].max() if material >= 0 else -1
+        width = int(model.tex_width[texture]) if texture >= 0 else 0
+        shown.append((int(model.geom_type[number]), *model.geom_rgba[number].tolist(), width))
+    return sorted(shown)
+
+
+def test_a_user_s_mjcf_shows_what_mujoco_s_viewer_shows_of_it(folder: Path, tmp_path: Path) -> None:
+    """A label that only looks hides nothing that collides too, and a texture of a layer is there."""
+    mine = tmp_path / "mine" / "tin_can"
+    (mine / "parts").mkdir(parents=True)
+    (mine / "can.xml").write_text(LABELLED)
+    Image.new("RGB", (8, 8), "red").save(mine / "stripes.png")
+    Image.new("RGB", (16, 16), "green").save(mine / "dots.png")
+    (mine / "parts" / "lid.obj").write_text(
+        "v 0 0 0\nv .02 0 0\nv 0 .02 0\nv 0 0 .02\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+    )
+    expected = seen_by_mujoco(mujoco.MjModel.from_xml_path(str(mine / "can.xml")), (0, 1, 2))
+    assert sorted(shown[-1] for shown in expected) == [0, 0, 8, 16]
+    (can,) = models(own(tmp_path / "mine")).values()
+    assert seen_by_mujoco(compiled(can), (1,)) == expected
+
+
+@pytest.mark.parametrize(
+    ("model", "named"),
+    [
+        ('<worldbody><geom size=".1"/><body><geom size=".1"/></body></worldbody>', "<geom> outside of a body"),
+        (
+            '<asset><texture name="t" type="cube" fileright="a.png"/></asset>'
+            '<worldbody><body><geom size=".1"/></body></worldbody>',
+            "<texture fileright>",
+        ),
+        ('<compiler strippath="true"/><worldbody><body><geom size=".1"/></body></worldbody>', "<compiler strippath>"),
+        (
+            '<asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>'
+            '<worldbody><body><geom size=".1"/><geom type="hfield" hfield="h"/></body></worldbody>',
+            "<geom hfield>",
+        ),
+    ],
+    ids=["outside", "texture", "compiler", "hfield"],
+)
+def test_what_would_be_left_out_of_a_model_is_refused_by_name(model: str, named: str, tmp_path: Path) -> None:
+    file = tmp_path / "model.xml"
+    file.write_text(f"<mujoco>{model}</mujoco>")
+    with pytest.raises(PipelineError, match=re.escape(named)):
+        _ = ObjectModel("own/x", "x", "", "", file).shape
 
 
 @pytest.mark.parametrize(
