@@ -41,6 +41,9 @@ from pipeline.types import Floats, Scene, State, Task, Trajectory
 RESERVE = 2.0
 """Candidates drawn beyond those wanted, as a share: poses that collide are refused, and not every replay succeeds."""
 
+START_NORM_RAD = (0.1, 0.2, 0.3, 0.4, 0.5)
+"""Norms of the offsets of the arm's start, by level: a demonstration begins further away than an episode by default."""
+
 ROUGH = {"steps": 1.5, "path_m": 1.5, "jerk_rms_m_s3": 2.0}
 """Largest multiples of the human's episode length, path length and jerk that count as smooth."""
 
@@ -134,7 +137,8 @@ def candidates(demos: DemosConfig, per_task: int, seed: int, test: TestSet) -> l
     rows: list[plan.Row] = []
     for moved, group in by_moved.items():
         pose = PoseAxis(components=(moved,)) if moved else None
-        axes = Axes(pose=pose, robot=RobotAxis(components=("initial_joints",)))
+        robot = RobotAxis(components=("initial_joints",), initial_norm_rad=START_NORM_RAD)
+        axes = Axes(pose=pose, robot=robot)
         episodes = {"pose+robot" if moved else "robot": per_task * len({entry.task for entry in group})}
         rows += plan.make(group, PlanConfig(seed=seed, axes=axes, episodes=episodes, reserve=RESERVE), REPLAY, test)
     return rows

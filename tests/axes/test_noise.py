@@ -118,7 +118,7 @@ def magnified(image: Image, scale: float) -> Image:
     return np.asarray(large[trim : trim + side, trim : trim + side])
 
 
-def zoomed(frame: Frame, scales: Floats) -> Frame:
+def zoomed(frame: Frame, scales: NDArray[np.floating]) -> Frame:
     """The benchmark's zoom blur by SciPy, at these scales."""
     image = (frame / 255).astype(np.float32)
     total = np.zeros_like(image)
@@ -200,11 +200,11 @@ def as_the_benchmark(component: str, row: tuple[float, ...], frame: Frame, key: 
     rng, side = seeding.rng(key), len(frame)
     match component:
         case "motion":
-            return motion_blur(frame, *row, rng.uniform(-45, 45))
+            return motion_blur(frame, row[0], row[1], rng.uniform(-45, 45))
         case "gaussian":
-            return to_frame(gaussian(frame / 255, *row, channel_axis=-1))
+            return to_frame(gaussian(frame / 255, row[0], channel_axis=-1))
         case "zoom":
-            return zoomed(frame, np.arange(1, *row))
+            return zoomed(frame, np.arange(1, row[0], row[1], dtype=float))
         case "fog":
             density, decay = row
             relief = naive_relief(rng.uniform(-1, 1, (side, side)), decay)
