@@ -1,13 +1,15 @@
 """Download LIBERO's demonstrations from the Hugging Face hub."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
 import httpx
 from huggingface_hub import HfApi, snapshot_download
+from huggingface_hub.hf_api import RepoSibling
 
 from pipeline.errors import PipelineError
-from pipeline.libero import hdf5
+from pipeline.files import checksum
 from pipeline.libero.tasks import tasks
 
 REPOSITORY = "yifengzhu-hf/LIBERO-datasets"
@@ -19,32 +21,28 @@ REVISION = "f13aa24a3da8c43c7225569f28c562979fa0e35a"
 def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list[Path]:
     """Download whole suites to ``<out>/<suite>/<task>_demo.hdf5``: 10 files of 0.3 to 1 GB for each suite of 10 tasks.
 
-    A download that was cut short goes on where it stopped (since huggingface-hub 1 at the start of that file), and
-    files that are there are not fetched again. The revision is fixed.
+    A download that was cut short resumes where it stopped (since huggingface-hub 1 at the start of that file). A file
+    that has the SHA-256 that the hub states is not downloaded again; any other file stays and is an error. The revision
+    is fixed.
 
     Args:
         out: the folder to use as ``demos.root`` afterwards.
         endpoint: address of a mirror of the hub, when not the hub itself.
 
     Raises:
-        PipelineError: for an unknown suite, when a file of an expansion is there, and when the hub could not be reached
-            or lacks a file.
+        PipelineError: for an unknown suite, when a file with the name of a wanted file is not the hub's, and when the
+            hub could not be reached or lacks a file.
     """
     wanted = [f"{task}_demo.hdf5" for suite in suites for task in tasks(suite)]
-    for file in (out / name for name in wanted):
-        if file.exists() and any(_expanded(file)):
-            raise PipelineError(
-                "holds demonstrations of `demos expand`, and would be replaced",
-                where=file,
-                remedy="fetch into another folder",
-            )
     remedy = (
         "check the network (or HF_ENDPOINT, HF_HUB_OFFLINE) and run it again, it goes on where it stopped; "
         "or use the starter set, demos.source: starter, which needs no hub"
     )
     try:
         # Without a connection the download below is content with any folder that is not empty.
-        told = HfApi(endpoint, token=False).dataset_info(REPOSITORY, revision=REVISION, files_metadata=True)
+        listed = HfApi(endpoint, token=False).dataset_info(REPOSITORY, revision=REVISION, files_metadata=True)
+        stated = {file.rfilename: file for file in listed.siblings or ()}
+        _refuse_other_files(out, wanted, stated)
         snapshot_download(
             REPOSITORY,
             repo_type="dataset",
@@ -61,7 +59,7 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
         raise PipelineError(
             f"the download of {REPOSITORY} at {REVISION[:7]} stopped ({error})", where=out, remedy=remedy
         ) from error
-    size_bytes = {file.rfilename: file.size for file in told.siblings or ()}
+    size_bytes = {name: file.size for name, file in stated.items()}
     there = {name: (out / name).stat().st_size for name in wanted if (out / name).is_file()}
     missing = [name for name in wanted if name not in there or there[name] != size_bytes.get(name)]
     if missing:
@@ -73,8 +71,24 @@ def fetch(out: Path, suites: Iterable[str], endpoint: str | None = None) -> list
     return [out / name for name in wanted]
 
 
-def _expanded(file: Path) -> list[bool]:
-    try:
-        return hdf5.expanded(file)
-    except PipelineError:
-        return []  # A damaged file is fetched anew.
+def _refuse_other_files(out: Path, wanted: Iterable[str], stated: dict[str, RepoSibling]) -> None:
+    """Reject entries of ``out`` that a download would replace and that are not the hub's files.
+
+    Args:
+        stated: the hub's files by name, with size and hash.
+    """
+    others = [name for name in wanted if os.path.lexists(out / name) and not _is_copy(out / name, stated.get(name))]
+    if others:
+        raise PipelineError(
+            f"{len(others)} files are not the hub's, and a download would replace them: {', '.join(others)}",
+            where=out,
+            expected=f"no files of these names, or copies of those of {REPOSITORY} at {REVISION[:7]}",
+            remedy="fetch into another folder, or move these files to another folder",
+        )
+
+
+def _is_copy(file: Path, stated: RepoSibling | None) -> bool:
+    """Return whether a file has the size and the SHA-256 that the hub states."""
+    if stated is None or stated.lfs is None or not file.is_file():
+        return False
+    return file.stat().st_size == stated.size and checksum(file) == stated.lfs.sha256

@@ -52,7 +52,7 @@ class Hub:
                     self._send(json.dumps(tree).encode(), body)
                     return
                 if self.path.startswith(f"/api/datasets/{REPOSITORY}"):
-                    siblings = [{"rfilename": name, "size": len(data)} for name, data in hub.files.items()]
+                    siblings = [_sibling(name, data) for name, data in hub.files.items()]
                     self._send(json.dumps({"id": REPOSITORY, "sha": commit, "siblings": siblings}).encode(), body)
                     return
                 # The later commit has none of the files.
@@ -91,6 +91,17 @@ class Hub:
         self.endpoint = f"http://127.0.0.1:{self.server.server_port}"
 
 
+def _sibling(name: str, data: bytes) -> dict[str, object]:
+    """A file as the hub lists it."""
+    sha256 = hashlib.sha256(data).hexdigest()
+    return {
+        "rfilename": name,
+        "size": len(data),
+        "blobId": "0" * 40,
+        "lfs": {"sha256": sha256, "size": len(data), "pointerSize": 134},
+    }
+
+
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -121,15 +132,40 @@ def test_fetches_the_suites_asked_for(hub: Hub, tmp_path: Path) -> None:
     assert hub.sent == []
 
 
-def test_an_expansion_is_not_replaced(hub: Hub, tmp_path: Path) -> None:
-    name = "libero_goal/turn_on_the_stove_demo.hdf5"
-    (tmp_path / name).parent.mkdir()
-    with h5py.File(tmp_path / name, "w") as file:
-        file.create_group("data/demo_0").attrs["expanded_from"] = "libero_goal/turn_on_the_stove/demo_0"
-    before = (tmp_path / name).read_bytes()
-    with pytest.raises(PipelineError, match="demos expand"):
+NAME = "libero_goal/turn_on_the_stove_demo.hdf5"
+
+
+@pytest.mark.parametrize("kind", ["recording", "expansion", "as long as the hub's", "folder", "link to nothing"])
+def test_a_file_that_is_not_the_hubs_is_named_and_stays(kind: str, hub: Hub, tmp_path: Path) -> None:
+    file = tmp_path / NAME
+    file.parent.mkdir()
+    if kind == "folder":
+        file.mkdir()
+    elif kind == "link to nothing":
+        file.symlink_to(tmp_path / "unmounted" / "mine.hdf5")
+    elif kind == "as long as the hub's":
+        file.write_bytes(bytes(len(hub.files[NAME])))
+    else:
+        with h5py.File(file, "w") as content:
+            demo = content.create_group("data/demo_0")
+            if kind == "expansion":
+                demo.attrs["expanded_from"] = "libero_goal/turn_on_the_stove/demo_0"
+    before = file.read_bytes() if file.is_file() else file.lstat()
+    with pytest.raises(PipelineError, match=rf"1 files are not the hub's.*{NAME}"):
         fetch(tmp_path, ["libero_goal"], hub.endpoint)
-    assert ((tmp_path / name).read_bytes(), hub.sent) == (before, [])
+    assert (file.read_bytes() if file.is_file() else file.lstat()) == before
+    assert hub.sent == []
+    assert sorted(entry.name for entry in file.parent.iterdir()) == [file.name]
+
+
+def test_a_copy_of_the_hubs_file_from_elsewhere_is_not_downloaded_again(hub: Hub, tmp_path: Path) -> None:
+    file = tmp_path / NAME
+    file.parent.mkdir()
+    file.write_bytes(hub.files[NAME])
+    fetch(tmp_path, ["libero_goal"], hub.endpoint)
+    assert sorted(name for name, _, _ in hub.sent) == sorted(
+        f"libero_goal/{task.name}_demo.hdf5" for task in tasks("libero_goal") if task.name != "turn_on_the_stove"
+    )
 
 
 def test_goes_on_where_it_stopped(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
