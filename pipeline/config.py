@@ -16,12 +16,18 @@ from pipeline.axes.language import load_bank
 from pipeline.catalogue import object_sources, texture_sources
 from pipeline.compute_config import ComputeConfig
 from pipeline.errors import PipelineError
-from pipeline.export_config import CLEAN, Count, ExportConfig, known_to_oft
+from pipeline.export_config import CLEAN, LONGEST_NAME, Count, ExportConfig, known_to_oft
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
 from pipeline.types import Place, RenderedExtra
+
+CHECKOUT = (
+    *(".ci", ".dvc", ".git", ".venv", "benchmarks", "configs", "docs", "examples", "pipeline", "schemas", "stages"),
+    *("tasks", "tests"),
+)
+"""Folders of a checkout that no run may use: those that git tracks, its own and that of the packages, own tasks."""
 
 
 class DemosConfig(Frozen):
@@ -187,11 +193,11 @@ class Config(Frozen):
     """A whole run.
 
     Attributes:
-        name: of the run, and of its folder.
+        name: of the run, and of its folder; at most 60 characters.
         folder: that the folders of runs lie in.
     """
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=LONGEST_NAME)
     # Left out where it says nothing, so that what was finished before there was the field stays what it is.
     folder: Place = Field(default=Path("data"), exclude_if=lambda folder: folder == Path("data"))
     demos: DemosConfig = DemosConfig()
@@ -210,6 +216,13 @@ class Config(Frozen):
         except PipelineError as error:
             of_file = f"{error.where}: " if error.where else ""
             raise ValueError(f"tasks: {of_file}{error.what}, expected {error.expected}") from error
+        for own_task in (task for task in chosen if task.suite not in SUITES):
+            for kind, name in (("suite", own_task.suite), ("task", own_task.name)):
+                if len(name) > LONGEST_NAME:
+                    raise ValueError(
+                        f"tasks: the name of the {kind} {name} has {len(name)} characters, expected at most "
+                        f"{LONGEST_NAME}, as paths of datasets contain it: rename it"
+                    )
         if demos.root is None and (own := next((task for task in chosen if task.suite not in SUITES), None)):
             raise ValueError(f"the starter set has no demonstration of {own}: set root")
         return demos
@@ -254,15 +267,31 @@ class Config(Frozen):
         return self
 
     @model_validator(mode="after")
-    def _not_what_runs_share(self) -> Config:
-        if self.data in (texture_sources.FOLDER, object_sources.FOLDER, benchmark.FOLDER):
-            raise ValueError(f"name: all runs share the folder {self.data}; take another name")
+    def _folder_of_its_own(self) -> Config:
+        """Reject a run's folder in which stages would delete files that are not of the run."""
+        data = self.data.resolve()
+        for root in {Path.cwd(), Path(__file__).resolve().parents[1]}:
+            own = next((root / name for name in CHECKOUT if _nested(data, (root / name).resolve())), None)
+            if own or root.is_relative_to(data):
+                raise ValueError(f"folder: {data} is, is in or contains the folder {own or root} of the checkout")
+        if Path.home().resolve().is_relative_to(data):
+            raise ValueError(f"folder: {data} is or contains the home folder")
+        for shared in (texture_sources.FOLDER, object_sources.FOLDER, benchmark.FOLDER):
+            if _nested(data, shared.resolve()):
+                raise ValueError(f"name: all runs share the folder {shared}; take another name")
+        if self.demos.root is not None and _nested(data, self.demos.root.resolve()):
+            raise ValueError(f"folder: {data} is, is in or contains demos.root, {self.demos.root}")
         return self
 
     @property
     def data(self) -> Path:
         """The folder that everything this run makes lies in."""
         return self.folder / self.name
+
+
+def _nested(one: Path, other: Path) -> bool:
+    """Return whether two resolved paths are equal, or one is inside the other."""
+    return one.is_relative_to(other) or other.is_relative_to(one)
 
 
 def load(path: Path) -> Config:

@@ -45,7 +45,10 @@ def _of_some(share: float) -> float:
 
 
 Share = Annotated[float, Field(ge=0.0, le=0.5), AfterValidator(_of_some)]
-Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$")]
+LONGEST_NAME = 60
+"""Characters of a name that paths contain. A path may join several names; file systems end a name after 255 bytes."""
+
+Name = Annotated[str, Field(pattern=r"^([a-z][a-z0-9_]*)?$", max_length=LONGEST_NAME)]
 """Of a dataset; empty for ``libero_`` and the name of the run, which ``Config`` puts in its place."""
 
 

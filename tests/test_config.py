@@ -3,6 +3,8 @@
 import json
 import math
 import re
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from pipeline.commands.develop import schemas
 from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.export_config import Where
+from pipeline.libero.assets import libero_folder
 from pipeline.run.finished import settings_of
 
 STARTER = REPOSITORY / "configs" / "starter.yaml"
@@ -104,6 +107,81 @@ def test_faults_name_file_and_field(tmp_path: Path, value: Any, keys: tuple[str,
         load(file)
     assert message in str(caught.value)
     assert str(file) in str(caught.value)
+
+
+@pytest.mark.parametrize("keys", [("name",), ("export", "rlds", "name"), ("export", "lerobot", "name")])
+def test_names_of_more_than_60_characters_are_refused(keys: tuple[str, ...], tmp_path: Path) -> None:
+    longest = "libero" + "e" * 54
+    load(changed(tmp_path, longest, *keys))
+    with pytest.raises(PipelineError, match=f"{'.'.join(keys)}: String should have at most 60 characters"):
+        load(changed(tmp_path, longest + "e", *keys))
+
+
+@pytest.mark.parametrize(("suite", "task"), [("kitchen", "t" * 61), ("k" * 61, "turn_on")])
+def test_own_suites_and_tasks_of_more_than_60_characters_are_refused(
+    suite: str, task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LIBERO's own names are as long as they are: 85 characters in LIBERO-90."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tasks" / suite).mkdir(parents=True)
+    source = libero_folder() / "bddl_files" / "libero_goal" / "turn_on_the_stove.bddl"
+    shutil.copy(source, tmp_path / "tasks" / suite / f"{task}.bddl")
+    plan = {"axes": {"noise": {}}, "episodes": {"noise": 1}}
+    file = tmp_path / "long.yaml"
+    file.write_text(yaml.safe_dump({"name": "long", "plan": plan, "demos": {"root": "demos", "tasks": [f"{suite}/*"]}}))
+    with pytest.raises(PipelineError, match=r"demos: .*has 61 characters, expected at most 60"):
+        load(file)
+    file.write_text(yaml.safe_dump({"name": "long", "plan": plan, "demos": {"tasks": ["libero_90/*"]}}))
+    load(file)
+
+
+def tracked_folders() -> list[str]:
+    listed = subprocess.run(["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True, check=True).stdout
+    return sorted({line.partition("/")[0] for line in listed.splitlines() if "/" in line})
+
+
+def places() -> list[Path]:
+    """Folders of the user and of the checkout, each named in another way than the simplest."""
+    inside = [REPOSITORY / "docs" / ".." / name / "run" for name in tracked_folders()]
+    return [*inside, *(path.parent for path in inside), REPOSITORY, REPOSITORY.parent, Path.home(), Path("/usr/../")]
+
+
+@pytest.mark.parametrize("place", places(), ids=str)
+def test_no_run_has_a_folder_of_the_checkout_or_the_home_folder(place: Path, tmp_path: Path) -> None:
+    """Here through a link, as the pattern of `name` would stop most."""
+    (tmp_path / "base").symlink_to(place)
+    fields = yaml.safe_load((REPOSITORY / "configs" / "starter.yaml").read_text())
+    file = tmp_path / "base.yaml"
+    file.write_text(yaml.safe_dump(fields | {"name": "base", "folder": str(tmp_path)}))
+    with pytest.raises(PipelineError, match=r"folder: .* (of the checkout|the home folder)"):
+        load(file)
+
+
+@pytest.mark.parametrize(("folder", "root"), [("demos", "demos/run"), ("demos", "demos"), (".", "run/demos")])
+def test_no_run_is_stored_among_demonstrations(
+    folder: str, root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    demos = {"root": root, "tasks": ["libero_goal/*"]}
+    plan = {"axes": {"noise": {}}, "episodes": {"noise": 10}}
+    file = tmp_path / "run.yaml"
+    fields = {"name": "run", "folder": str(tmp_path / "elsewhere" / ".." / folder), "demos": demos, "plan": plan}
+    file.write_text(yaml.safe_dump(fields))
+    with pytest.raises(PipelineError, match=r"is, is in or contains demos\.root"):
+        load(file)
+    file.write_text(yaml.safe_dump(fields | {"folder": "data"}))
+    load(file)
+
+
+@pytest.mark.parametrize("name", ["data", "testset"])
+def test_no_run_is_stored_where_all_runs_store(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "run.yaml"
+    plan = {"axes": {"noise": {}}, "episodes": {"noise": 10}}
+    folder = "." if name == "data" else "data/../data"
+    file.write_text(yaml.safe_dump({"name": name, "folder": folder, "plan": plan}))
+    with pytest.raises(PipelineError, match="all runs share the folder"):
+        load(file)
 
 
 def test_missing_and_broken_files(tmp_path: Path) -> None:

@@ -1,0 +1,79 @@
+"""Files in a run's folder that no stage of the run made, and that a stage would delete."""
+
+import os
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from pipeline.axes import AXES
+from pipeline.errors import PipelineError
+from pipeline.files import is_temporary
+
+_AXIS = rf"({'|'.join(AXES)})"
+_SHEET = rf"{_AXIS}(\+{_AXIS})*\.png"
+_STORED = r"\.(h5|npz|safetensors)"
+
+MADE = {
+    "trajectories": rf"index\.parquet|[0-9a-f]{{16}}{_STORED}",
+    "frames": rf"index\.parquet|[0-9a-f]{{16}}/[0-9a-f]{{16}}{_STORED}",
+    "sheets": _SHEET,
+    "previews": rf"[a-z0-9_]+/{_AXIS}\.png",
+    "card": rf"(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
+    "finetune": r"finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|starvla_data_config\.py|"
+    r"openpi_assets/physical-intelligence/libero/norm_stats\.json",
+}
+"""Folders of a run that stages clear or replace as a whole, to a pattern of the paths that stages write in them.
+
+Stages put datasets in place with a record of their files. ``run/export.py`` compares these with the record.
+"""
+
+SHOWN = 3
+"""So many files are named in an error."""
+
+FILE_IN_USE = re.compile(r"\.nfs[0-9a-f]+")
+"""Name that NFS gives to a deleted file until the last process closes it."""
+
+
+def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(MADE)) -> None:
+    """Stop before a stage, or ``clean``, would delete files that no stage made.
+
+    Args:
+        data: the run's folder.
+        folders: keys of ``MADE``; others are ignored.
+
+    Raises:
+        PipelineError: naming some of the files.
+    """
+    if found := sorted(foreign_files(data, folders)):
+        names = ", ".join(path.relative_to(data).as_posix() for path in found[:SHOWN])
+        more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+        raise PipelineError(
+            f"holds files that no stage of this run made, and that would be deleted: {names}{more}",
+            where=data,
+            expected=f"only the run's own files in {', '.join(MADE)}",
+            remedy="move these files out of these folders; files next to these folders stay as they are",
+        )
+
+
+def foreign_files(data: Path, folders: Iterable[str] = tuple(MADE)) -> Iterator[Path]:
+    """Yield the files and links in ``folders`` of a run's folder that no stage made."""
+    for name in MADE.keys() & {*folders}:
+        made, folder = re.compile(MADE[name]), data / name
+        for entry in _entries(folder):
+            inside = entry.path[len(str(folder)) + 1 :]
+            temporary = any(is_temporary(part) for part in inside.split(os.sep))
+            own = made.fullmatch(inside) and not entry.is_symlink()
+            if not (own or temporary or FILE_IN_USE.fullmatch(entry.name)):
+                yield folder / inside
+
+
+def _entries(folder: Path | str) -> Iterator[os.DirEntry[str]]:
+    """Yield all entries below a folder that are not folders; links are not followed."""
+    if not os.path.isdir(folder):
+        return
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                yield from _entries(entry.path)
+            else:
+                yield entry
