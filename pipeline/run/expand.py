@@ -116,7 +116,10 @@ def expand(out: Path, demos: DemosConfig, rows: Sequence[plan.Row], per_task: in
 
 
 def _refuse_other_demonstrations(file: Path) -> None:
-    if file.exists() and not all(hdf5.expanded(file)):
+    if not file.exists():
+        return
+    expanded = hdf5.expanded(file)
+    if not expanded or not all(expanded):
         raise PipelineError(
             "holds demonstrations that no expansion made, and would be replaced",
             where=file,

@@ -209,3 +209,16 @@ def test_only_what_an_expansion_made_is_replaced(tmp_path: Path, attrs: dict[str
         with pytest.raises(PipelineError, match="that no expansion made"):
             expand(tmp_path, TASKS, [], 1, loop)
         assert file.read_bytes() == before
+
+
+def test_a_file_without_demonstrations_is_not_taken_for_an_expansion(tmp_path: Path) -> None:
+    """As a recorder leaves one that stores demonstrations under other names at its end."""
+    file = tmp_path / STOVE.suite / f"{STOVE.name}_demo.hdf5"
+    file.parent.mkdir()
+    with h5py.File(file, "w") as content:
+        content.create_group("data")
+        content["raw"] = np.arange(10)
+    before = file.read_bytes()
+    with pytest.raises(PipelineError, match="that no expansion made"):
+        expand(tmp_path, TASKS, [], 1, loop)
+    assert file.read_bytes() == before
