@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterator
@@ -158,14 +159,25 @@ def keep_below(folder: Path, files: set[Path]) -> None:
     clear(folder)
 
 
+def is_temporary(name: str, of: str | None = None) -> bool:
+    """Return whether an entry of a folder has the name of a temporary of ``replaced``.
+
+    Args:
+        of: the name of the file or folder that the temporary would replace; any name if `None`.
+    """
+    target = r".+" if of is None else re.escape(of)
+    return re.fullmatch(rf"\.{target}\.[0-9a-f]+\.tmp", name) is not None
+
+
 def remove_leftovers(folder: Path) -> None:
     """Delete what ``replaced`` left beside a folder's files where its process was killed.
 
     Only for who holds a lock that keeps all others, on every host, from writing there: a name does not say whether its
     process still lives on another host.
     """
-    for temporary in folder.glob(".*.tmp"):
-        _discard(temporary)
+    for entry in folder.iterdir():
+        if is_temporary(entry.name):
+            _discard(entry)
 
 
 def _discard(temporary: Path) -> None:

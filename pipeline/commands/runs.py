@@ -56,11 +56,13 @@ def _clean_arguments(command: argparse.ArgumentParser) -> None:
 def clean(arguments: argparse.Namespace) -> None:
     """delete what can be made again of a run, after it was listed with its sizes and you said yes
 
-    Other files in the run's folder stay. Demonstrations, configurations and downloads are not touched.
+    Other files in the run's folder stay. Demonstrations, configurations and downloads are not touched. A folder that no
+    run has marked, and a file that no stage made inside a folder to delete, are errors.
     """
-    from pipeline.run import cleaning
+    from pipeline.run import cleaning, foreign, stage
 
     config = owned(arguments)
+    stage.refuse_unmarked(config.data)
     found = cleaning.found(config.data, arguments.only or tuple(cleaning.PARTS))
     if not found:
         print(f"{config.data} has nothing of this")
@@ -68,6 +70,7 @@ def clean(arguments: argparse.Namespace) -> None:
     for part, size_mb in found.items():
         print(f"{size_mb:10.1f} MB  {part:<13} made again by {cleaning.PARTS[part].made_by}")
     print(f"{sum(found.values()):10.1f} MB  in all, of {config.data}")
+    foreign.refuse_foreign_files(config.data, [name for part in found for name in cleaning.PARTS[part].names])
     if not arguments.yes:
         if not sys.stdin.isatty():
             raise PipelineError("nothing was deleted, as nobody can be asked here", remedy="add --yes")

@@ -8,7 +8,8 @@ from pipeline.config import Config
 from pipeline.files import remove
 from pipeline.formats.registry import FAILURES, failures_of, formats_of
 from pipeline.run.finished import FOLDER
-from pipeline.run.stage import locked
+from pipeline.run.foreign import refuse_foreign_files
+from pipeline.run.stage import locked, refuse_unmarked
 
 
 class Part(NamedTuple):
@@ -68,9 +69,12 @@ def delete(data: Path, parts: Iterable[str]) -> None:
     """Delete parts of a run's folder.
 
     Raises:
-        PipelineError: when a stage of the run is running.
+        PipelineError: when the folder is not marked as that of a run, a stage of the run is running, or a part holds
+            files that no stage made.
     """
+    refuse_unmarked(data)
     with locked(data):
+        refuse_foreign_files(data, [name for part in parts for name in PARTS[part].names])
         for part in parts:
             for name in PARTS[part].names:
                 remove(data / name)

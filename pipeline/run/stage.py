@@ -1,24 +1,30 @@
-"""What the scripts in ``stages/`` share: one argument, the configuration, and errors that a person can act on."""
+"""Run a stage on the configuration that the command line names, in a folder that belongs to this configuration."""
 
 import argparse
 import fcntl
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NamedTuple
 
 import yaml
 
 from pipeline.config import Config, load
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.exit_status import exit_status
-from pipeline.files import remove_leftovers, write_json
+from pipeline.files import is_temporary, read_json, remove_leftovers, write_json
 from pipeline.identity import REMAKE
+from pipeline.run.foreign import refuse_foreign_files
+from pipeline.seeding import digest
+from pipeline.strict_yaml import StrictLoader
 
 OWNER = "configuration.json"
-"""File of a run's folder that says which configuration file the folder belongs to."""
+"""File of a run's folder, its mark: states which configuration file the folder belongs to."""
+
+PLACES = ("name", "folder", "compute")
+"""Fields of a configuration that state where a run is stored and computed. A folder that was moved has others."""
 
 PARAMS = Path("params.yaml")
 """Says which run `dvc repro` makes, and in which folder."""
@@ -39,6 +45,7 @@ def main(stage: Callable[[Config], None], description: str) -> None:
     def run() -> int:
         config = claimed(arguments.config)
         with locked(config.data):
+            refuse_foreign_files(config.data)
             stage(config)
         return 0
 
@@ -46,25 +53,46 @@ def main(stage: Callable[[Config], None], description: str) -> None:
         sys.exit(status)
 
 
-def claimed(file: Path) -> Config:
-    """Load a configuration that is about to be run; a run's folder that is new belongs to it from now on.
+class Mark(NamedTuple):
+    """What a run's folder states about its configuration file.
 
-    A stage deletes what its plan does not name, so two configurations must never share a folder. The same file may
-    change as it likes.
+    Attributes:
+        file: absolute path of the configuration file.
+        content: digest of what the file states, without ``PLACES``; `None` in the mark of an earlier version.
+    """
+
+    file: Path
+    content: str | None
+
+
+def claimed(file: Path) -> Config:
+    """Load a configuration that is about to be run; its run's folder belongs to it from now on.
+
+    A stage deletes finished work that its plan does not name, so two configuration files must never share a folder.
+    The folder's mark records the path of its configuration file, as seen from the folder, and a digest of its content.
+    A configuration file may use the folder in two cases:
+
+    * It is the file at the recorded path. It may have been edited, and file and folder may have moved together.
+    * No file is at the recorded path, and the content is the recorded content: the file or the folder was moved.
+
+    Any other file is rejected. A folder without a mark is claimed only if it is empty.
 
     Raises:
-        PipelineError: when the configuration is not valid, or the folder belongs to another file.
+        PipelineError: when the configuration is not valid, or the folder belongs to another file, or holds files and no
+            mark.
     """
     config = load(file)
     _refuse_other_folder(config, file)
+    _refuse_other_owner(config, file)
     config.data.mkdir(parents=True, exist_ok=True)
-    mark = config.data / OWNER
-    if not mark.exists():
-        with locked(config.data):
-            if not mark.exists():  # Of two stages that start at the same time, the second finds it.
-                write_json(mark, {"configuration": _named(file, config.data.resolve()), "name": config.name})
-    _refuse_foreign(config, file)
     _refuse_links(config.data)
+    wanted = Mark(file.resolve(), _content(file))
+    if _mark(config.data) != wanted:
+        with locked(config.data):
+            _refuse_other_owner(config, file)  # Another stage may have claimed the folder in the meantime.
+            path = os.path.relpath(wanted.file, config.data.resolve())
+            content = {"configuration": path, "name": config.name, "content": wanted.content}
+            write_json(config.data / OWNER, content)
     return config
 
 
@@ -99,15 +127,40 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def owned(file: Path) -> Config:
-    """Load a configuration whose finished run is to be read; nothing is written.
+    """Load a configuration whose run is to be read; nothing is written.
 
     Raises:
-        PipelineError: as ``claimed``.
+        PipelineError: when the configuration is not valid, or the folder belongs to another file.
     """
     config = load(file)
     if (config.data / OWNER).exists():
-        _refuse_foreign(config, file)
+        _refuse_other_owner(config, file)
     return config
+
+
+def refuse_unmarked(folder: Path) -> None:
+    """Reject a folder that holds files and that no configuration has claimed: the files are not of a run.
+
+    Raises:
+        PipelineError: naming the folder and some of its files.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise PipelineError(
+            "not a folder", where=folder, expected="a new or empty folder", remedy="change `name:` or `folder:`"
+        )
+    mark = folder / OWNER
+    if not folder.exists() or mark.exists():
+        return
+    # A killed claim leaves the lock, and a temporary file of the mark.
+    names = [entry.name for entry in folder.iterdir() if entry.name != LOCK and not is_temporary(entry.name, OWNER)]
+    if names:
+        raise PipelineError(
+            f"holds files and is not the folder of a run, as it has no {OWNER}: {', '.join(sorted(names)[:3])}",
+            where=folder,
+            expected="a new or empty folder, or the folder of this run",
+            remedy="change `name:` or `folder:`; if a run made these files and its mark is lost, write "
+            f'{{"configuration": "configs/<name>.yaml"}} into {mark}',
+        )
 
 
 def _refuse_other_folder(config: Config, file: Path) -> None:
@@ -122,26 +175,72 @@ def _refuse_other_folder(config: Config, file: Path) -> None:
         )
 
 
-def _refuse_foreign(config: Config, file: Path) -> None:
-    mark, own = config.data / OWNER, _named(file, config.data.resolve())
-    # In full where the folder was elsewhere and is here now; from here where a link has taken its place.
-    known_as = {own, file.resolve().as_posix(), _named(file, Path(os.path.abspath(config.data)))}
-    try:
-        owner = str(json.loads(mark.read_text())["configuration"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+def _refuse_other_owner(config: Config, file: Path) -> None:
+    """Reject a folder that ``claimed`` must not give to a configuration file."""
+    folder = config.data
+    refuse_unmarked(folder)
+    _refuse_folder_in_run(folder)
+    mark = _mark(folder)
+    if mark is None or mark.file == file.resolve():
+        return
+    this, other = _shown(file.resolve(), mark.file)
+    adopt = f'to have the folder belong to {this}, write {{"configuration": "{this}"}} into {folder / OWNER}'
+    if mark.file.exists():
         raise PipelineError(
-            f"cannot read which configuration the folder belongs to ({error})",
-            where=mark,
-            remedy=f"delete the file if the folder is that of {own}",
-        ) from error
-    if owner not in known_as:
-        raise PipelineError(
-            f"the folder belongs to {owner}, and {own} has the same name: {config.name}",
-            where=config.data,
+            f"the folder belongs to {other}, and {this} has the same name: {config.name}",
+            where=folder,
             expected="a folder for each configuration file, as a run deletes what it did not plan",
-            remedy=f"change `name:` in {own}, or rename or delete the folder; if you moved the folder, or renamed "
-            f"{owner} to {own}, delete {mark}, and the folder goes with {own}",
+            remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
         )
+    if mark.content != _content(file):
+        raise PipelineError(
+            f"the folder belongs to {other}, which is not there, and {this} has another content",
+            where=folder,
+            expected="the content of the last run, where a folder or a configuration file was moved",
+            remedy=f"change `name:` in {this}, or `folder:`; {adopt}",
+        )
+
+
+def _refuse_folder_in_run(folder: Path) -> None:
+    for parent in folder.resolve().parents:
+        if (parent / OWNER).is_file() and (parent / LOCK).is_file():
+            raise PipelineError(
+                f"is inside {parent}, the folder of another run",
+                where=folder,
+                expected="folders of runs next to each other",
+                remedy="change `folder:`",
+            )
+
+
+def _mark(folder: Path) -> Mark | None:
+    """Return the mark of a run's folder, `None` if it has none.
+
+    Raises:
+        PipelineError: when the mark cannot be read.
+    """
+    path = folder / OWNER
+    if not path.exists():
+        return None
+    remedy = f'write {{"configuration": "configs/<name>.yaml"}}, the file that the folder belongs to, into {path}'
+    try:
+        stored = read_json(path, remedy)
+        content = stored.get("content")
+        # A mark of an earlier version, or one that a person wrote, names the file as seen from here.
+        base = Path.cwd() if content is None else folder.resolve()
+        return Mark((base / str(stored["configuration"])).resolve(), content)
+    except (PipelineError, KeyError) as error:
+        raise PipelineError(
+            "cannot read which configuration the folder belongs to",
+            where=path,
+            expected='a JSON object with the field "configuration"',
+            remedy=remedy,
+        ) from error
+
+
+def _content(file: Path) -> str:
+    """Return a digest of what a valid configuration file states, without ``PLACES``."""
+    fields = yaml.load(file.read_text(encoding="utf-8"), StrictLoader)
+    return digest({name: value for name, value in fields.items() if name not in PLACES})
 
 
 def _refuse_links(folder: Path) -> None:
@@ -154,12 +253,8 @@ def _refuse_links(folder: Path) -> None:
         )
 
 
-def _named(file: Path, folder: Path) -> str:
-    """The configuration's path from here where the run's folder is here too, and moves with it; else in full.
-
-    Args:
-        folder: absolute.
-    """
-    file, here = file.resolve(), Path.cwd().resolve()
-    together = file.is_relative_to(here) and folder.is_relative_to(here)
-    return file.relative_to(here).as_posix() if together else file.as_posix()
+def _shown(*files: Path) -> list[str]:
+    """Return absolute paths for a message: as seen from here if all files are below this folder."""
+    here = Path.cwd().resolve()
+    below = all(file.is_relative_to(here) for file in files)
+    return [(file.relative_to(here) if below else file).as_posix() for file in files]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterable
+from contextlib import chdir
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -29,6 +30,7 @@ from pipeline.libero.starts import HOME_RAD
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.planning import leakage, plan
 from pipeline.planning.plan import Draws, Row
+from pipeline.run.stage import claimed
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Task
@@ -290,8 +292,10 @@ def run_stage(folder: Path, rows: list[Row]) -> subprocess.CompletedProcess[str]
     (folder / "data").mkdir(exist_ok=True)
     if not (folder / benchmark.FOLDER).exists():
         (folder / benchmark.FOLDER).symlink_to(FOLDER)
+    (folder / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(folder / "demos")))
+    with chdir(folder):
+        claimed(Path("tiny.yaml"))
     plan.write(rows, folder / "data" / "tiny" / "plan.parquet")
-    (folder / "tiny.yaml").write_text(yaml.safe_dump(tiny_config(folder)))
     command = [sys.executable, str(REPOSITORY / "stages" / "leakage.py"), "tiny.yaml"]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 

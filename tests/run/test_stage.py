@@ -4,6 +4,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import resource
 import shutil
 import subprocess
@@ -70,16 +71,76 @@ def test_an_edited_file_keeps_its_folder_however_it_is_named(clone: Path) -> Non
     assert claimed(file).plan.seed == owned(Path("configs/../configs/tiny.yaml")).plan.seed == 8
 
 
-def test_a_renamed_file_gets_the_folder_when_the_mark_is_deleted(clone: Path) -> None:
+def edit(file: Path, **fields: object) -> None:
+    """Change top-level fields of a configuration."""
+    file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | fields))
+
+
+def test_a_renamed_file_keeps_the_folder_until_it_is_edited(clone: Path) -> None:
+    renamed, mark = Path("configs/renamed.yaml"), clone / "data" / "tiny" / OWNER
     claimed(Path("configs/tiny.yaml"))
-    (clone / "configs" / "tiny.yaml").rename("configs/renamed.yaml")
-    with pytest.raises(PipelineError, match=r"configs/tiny\.yaml, and configs/renamed\.yaml") as caught:
-        claimed(Path("configs/renamed.yaml"))
-    mark = clone / "data" / "tiny" / OWNER
-    assert f"delete {mark.relative_to(clone)}" in str(caught.value.remedy)
-    mark.unlink()
-    claimed(Path("configs/renamed.yaml"))
-    assert json.loads(mark.read_text())["configuration"] == "configs/renamed.yaml"
+    Path("configs/tiny.yaml").rename(renamed)
+    unedited = renamed.read_text()
+    edit(renamed, plan={"seed": 6, "episodes": {"noise": 4}})
+    with pytest.raises(PipelineError, match=r"belongs to configs/tiny\.yaml, which is not there"):
+        claimed(renamed)
+    renamed.write_text(unedited)
+    claimed(renamed)
+    edit(renamed, plan={"seed": 6, "episodes": {"noise": 4}})
+    claimed(renamed)
+
+    mark.write_text('{"configuration": "../../configs/gone.yaml", "content": "another"}')
+    with pytest.raises(PipelineError, match=r"belongs to configs/gone\.yaml") as caught:
+        claimed(renamed)
+    advised = re.search(r"write ({.*}) into (.*)$", str(caught.value.remedy))
+    assert advised is not None
+    Path(advised[2]).write_text(advised[1])
+    claimed(renamed)
+
+
+@pytest.mark.parametrize("edited", [False, True])
+def test_a_checkout_that_was_moved_keeps_its_runs(edited: bool, clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one whose run folders are on another disk, and whose configuration is named from elsewhere."""
+    checkout, disk, file = clone / "checkout", clone / "disk", Path("configs/tiny.yaml")
+    checkout.mkdir()
+    shutil.move("configs", checkout)
+    if not edited:
+        edit(checkout / file, folder=str(disk))
+    monkeypatch.chdir(checkout)
+    finished = claimed(file).data / "trajectories" / "0123456789abcdef.h5"
+    finished.parent.mkdir()
+    finished.write_bytes(b"hours of work")
+    monkeypatch.chdir(clone)
+    checkout.rename(clone / "renamed")
+    monkeypatch.chdir(clone / "renamed")
+    if edited:
+        edit(file, replay={"mode": "open_loop"})
+    data = claimed(file).data
+    assert (data / "trajectories" / finished.name).read_bytes() == b"hours of work"
+
+
+def test_a_file_may_be_named_by_its_absolute_path_and_from_elsewhere(
+    clone: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here with a run's folder inside the checkout that `folder:` names in full."""
+    file = Path("configs/tiny.yaml")
+    edit(file, folder=str(clone / "results"))
+    claimed(file)
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    assert claimed(clone / file).data == owned(clone / file).data == clone / "results" / "tiny"
+    monkeypatch.chdir(clone)
+    claimed(file)
+
+
+def test_marks_of_earlier_versions_count(clone: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    file, mark = Path("configs/tiny.yaml"), clone / "data" / "tiny" / OWNER
+    claimed(file)
+    for owner in ("configs/tiny.yaml", str(clone / "configs" / "tiny.yaml")):
+        mark.write_text(json.dumps({"configuration": owner, "name": "tiny"}))
+        claimed(file)
+    mark.write_text(json.dumps({"configuration": "configs/other.yaml", "name": "tiny"}))
+    with pytest.raises(PipelineError, match=r"belongs to configs/other\.yaml"):
+        claimed(file)
 
 
 def test_a_moved_folder_stays_its_configurations_through_a_link(
@@ -90,22 +151,62 @@ def test_a_moved_folder_stays_its_configurations_through_a_link(
     shutil.move(data, disk)
     data.symlink_to(disk)
     claimed(file)
-    (disk / OWNER).unlink()
-    claimed(file)
     data.unlink()
     shutil.move(disk, data)
     claimed(file)
 
 
-def test_a_folder_that_was_moved_to_where_the_configuration_says_names_the_mark(
+def test_a_folder_that_was_moved_to_where_the_configuration_says_is_found(
     clone: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     file, disk = Path("configs/tiny.yaml"), tmp_path_factory.mktemp("disk")
     claimed(file)
     shutil.move("data/tiny", disk / "tiny")
-    file.write_text(file.read_text() + f"folder: {disk}\n")
-    with pytest.raises(PipelineError, match=f"if you moved the folder, (?s:.*)delete {disk / 'tiny' / OWNER}"):
-        claimed(file)
+    edit(file, folder=str(disk))
+    assert claimed(file).data == owned(file).data == disk / "tiny"
+    edit(file, plan={"seed": 6, "episodes": {"noise": 4}})
+    claimed(file)
+    shutil.move(disk / "tiny", "data/tiny")
+    edit(file, folder="data")
+    claimed(file)
+
+
+def test_a_folder_whose_configuration_is_out_of_sight_is_not_for_another_content(clone: Path) -> None:
+    """As a folder on a shared disk, claimed by a checkout that another machine has on its own disk."""
+    claimed(Path("configs/tiny.yaml"))
+    mark = Path("data/tiny") / OWNER
+    mark.write_text(json.dumps(json.loads(mark.read_text()) | {"configuration": "../../../machine/configs/tiny.yaml"}))
+    edit(Path("configs/tiny.yaml"), plan={"seed": 6, "episodes": {"noise": 4}})
+    with pytest.raises(PipelineError, match=r"which is not there, and .*configs/tiny\.yaml has another content"):
+        claimed(Path("configs/tiny.yaml"))
+
+
+@pytest.mark.parametrize("place", ["frames/1.png", "notes.txt", ".hidden/key", "configuration.yaml"])
+def test_a_folder_with_files_that_no_run_made_is_not_claimed(place: str, clone: Path) -> None:
+    theirs = clone / "data" / "tiny" / place
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"mine")
+    before = {path: path.lstat().st_mtime_ns for path in clone.rglob("*")}
+    with pytest.raises(PipelineError, match=f"data/tiny: holds files and is not the folder of a run.*{place[:6]}"):
+        claimed(Path("configs/tiny.yaml"))
+    assert {path: path.lstat().st_mtime_ns for path in clone.rglob("*")} == before
+
+
+def test_a_file_in_place_of_the_folder_is_named(clone: Path) -> None:
+    (clone / "data").mkdir()
+    (clone / "data" / "tiny").write_bytes(b"mine")
+    with pytest.raises(PipelineError, match="data/tiny: not a folder"):
+        claimed(Path("configs/tiny.yaml"))
+
+
+def test_a_folder_inside_another_runs_is_refused(clone: Path) -> None:
+    claimed(Path("configs/tiny.yaml"))
+    inner = Path("configs/frames.yaml")
+    shutil.copy("configs/tiny.yaml", inner)
+    edit(inner, name="frames", folder="data/tiny")
+    with pytest.raises(PipelineError, match=r"is inside .*data/tiny, the folder of another run"):
+        claimed(inner)
+    assert not Path("data/tiny/frames").exists()
 
 
 def test_of_two_checkouts_with_one_folder_elsewhere_the_second_is_refused(
@@ -125,6 +226,7 @@ def test_a_plan_of_other_replay_settings_is_refused(clone: Path, stage: str) -> 
     """Else their replays would be stored under the ids of the settings before, and stay when these are put back."""
     config = Config.model_validate(yaml.safe_load(Path("configs/tiny.yaml").read_text()))
     rows = plan.twins(config.demos.index().entries, 0, config.replay)
+    claimed(Path("configs/tiny.yaml"))
     plan.write(rows, clone / "data" / "tiny" / "plan.parquet")
     edited = config.model_dump(mode="json") | {"replay": {"mode": "open_loop", "settle_steps": 10}}
     with pytest.raises(AssertionError, match="the section replay has changed since the plan"):
@@ -207,7 +309,7 @@ def test_a_full_disk_leaves_no_half_of_the_mark(clone: Path) -> None:
     with pytest.raises(OSError, match="File too large"), limited(resource.RLIMIT_FSIZE, 10):
         claimed(Path("configs/tiny.yaml"))
     claimed(Path("configs/tiny.yaml"))
-    assert json.loads((clone / "data" / "tiny" / OWNER).read_text())["configuration"] == "configs/tiny.yaml"
+    assert json.loads((clone / "data" / "tiny" / OWNER).read_text())["configuration"] == "../../configs/tiny.yaml"
 
 
 def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
@@ -216,6 +318,58 @@ def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
     (data / "frames").symlink_to(clone / "configs")
     with pytest.raises(PipelineError, match="data/tiny/frames: is a symbolic link"):
         claimed(Path("configs/tiny.yaml"))
+
+
+FOREIGN = (
+    "trajectories/notes.txt",
+    "trajectories/0123456789abcdef (copy).h5",
+    "frames/0123456789abcdef/backup/0123456789abcdef.h5",
+    "frames/mine.png",
+    "sheets/for the paper.png",
+    "previews/libero_goal/LICENSE",
+    "card/rlds/LICENSE",
+    "finetune/checkpoints/last/model.safetensors",
+    "finetune/.env",
+)
+
+
+@pytest.mark.parametrize("place", FOREIGN)
+def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone: Path) -> None:
+    theirs = claimed(Path("configs/tiny.yaml")).data / place
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"mine")
+    with pytest.raises(AssertionError, match=rf"data/tiny: holds files that no stage .* made.*{theirs.name[:9]}"):
+        run_stages(clone, yaml.safe_load(Path("configs/tiny.yaml").read_text()), ["inputs"])
+    assert theirs.read_bytes() == b"mine"
+
+
+def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
+    """What it leads to, an upload would publish."""
+    data = claimed(Path("configs/tiny.yaml")).data
+    link = data / "finetune" / "finetune.yaml"
+    link.parent.mkdir()
+    link.symlink_to(clone / "configs" / "tiny.yaml")
+    with pytest.raises(AssertionError, match=r"no stage of this run made.*finetune/finetune\.yaml"):
+        run_stages(clone, yaml.safe_load(Path("configs/tiny.yaml").read_text()), ["inputs"])
+
+
+def test_clean_needs_a_mark_and_names_foreign_files(
+    clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["pipeline", "clean", "--yes", "configs/tiny.yaml"])
+    theirs = clone / "data" / "tiny" / "frames" / "holiday.jpg"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"mine")
+    assert command_line.main() == 1
+    assert "data/tiny: holds files and is not the folder of a run" in capsys.readouterr().err
+    theirs.rename("holiday.jpg")
+    theirs.parent.rmdir()
+    claimed(Path("configs/tiny.yaml"))
+    theirs.parent.mkdir()
+    Path("holiday.jpg").rename(theirs)
+    assert command_line.main() == 1
+    assert "would be deleted: frames/holiday.jpg" in capsys.readouterr().err
+    assert theirs.read_bytes() == b"mine"
 
 
 def test_a_run_beside_one_whose_command_alone_was_killed_is_refused(clone: Path) -> None:
