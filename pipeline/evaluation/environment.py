@@ -236,7 +236,9 @@ class EpisodeEnvironment:
         scene = None
         if self.task.source == "own":
             planned = None if self.settings.plan is None else own_draws.planned(self.settings.plan)
-            self.perturbations, scene = own_draws.drawn_scene(self.task, self.settings.seed, demo, nominal, planned)
+            self.perturbations, scene = own_draws.drawn_scene(
+                self.task, self.settings.seed, demo, nominal, planned, self._picture.opened
+            )
         if scene is None and not recorded:
             self._start(seed, demo.init_state)
             return

@@ -15,12 +15,14 @@ import numpy as np
 from pipeline import seeding
 from pipeline.axes import AXES, Axis, Perturbation, PhysicsPerturbation, axes_of, from_json, to_json
 from pipeline.errors import PipelineError, RefusedError
+from pipeline.evaluation import held_out_sight
 from pipeline.evaluation.tasks import EvaluationTask
 from pipeline.files import Edition, checksum_of, edition
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task, shared
 from pipeline.physics.replay import roll_out
 from pipeline.planning import plan
+from pipeline.rendering.renderer import LastScene
 from pipeline.seeding import digest
 from pipeline.types import Demo, Scene, Task
 
@@ -28,7 +30,7 @@ OWN_AXES = tuple(name for name, axis in AXES.items() if not axis.not_held_out)
 """The axes with draws of their own to hold out."""
 
 ATTEMPTS = 20
-"""How often a draw that its scene refuses, or that a plan has, is drawn anew."""
+"""How often a draw is sampled again that its scene refuses, that shows too little, or that a plan has."""
 
 
 def drawn_task(task: Task, axis: str, level: int, number: int, seed: int) -> EvaluationTask | None:
@@ -74,17 +76,24 @@ def held_out(name: str) -> Axis:
 
 
 def drawn_scene(
-    task: EvaluationTask, seed: int, demo: Demo, nominal: Callable[[], Scene], planned: PlannedDraws | None
+    task: EvaluationTask,
+    seed: int,
+    demo: Demo,
+    nominal: Callable[[], Scene],
+    planned: PlannedDraws | None,
+    opened: LastScene,
 ) -> tuple[tuple[Perturbation, ...], Scene | None]:
     """What a task draws, in the order in which it applies, and the scene with it; None where physics stay LIBERO's.
 
-    Each axis has the first draw that the scene takes by itself. That is so too where other axes join it, so that a
-    pair has the draws of its singles. They apply one after the other, as those of a plan do.
+    Each axis has the first draw that the scene takes by itself, and that shows as much as a run asks of an episode.
+    That is so too where other axes join it, so that a pair has the draws of its singles. They apply one after the
+    other, as those of a plan do.
 
     Args:
         demo: of the task, in the initial state that the episode begins in.
         nominal: gives the scene without any change.
         planned: what draws must keep clear of.
+        opened: renders what is judged.
 
     Raises:
         RefusedError: when the scene takes no draw of an axis, or not the draws of several together.
@@ -92,21 +101,34 @@ def drawn_scene(
     perturbations: list[Perturbation] = []
     scene = None
     for axis in axes_of(task.axis):
-        for one in (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS)):
-            if planned is not None and planned.overlap(one, demo.task):
-                continue
-            if not isinstance(one, PhysicsPerturbation):
-                break
-            try:
-                alone = one.apply(nominal(), demo, roll_out)
-            except RefusedError:
-                continue
-            scene = alone if scene is None else one.apply(scene, demo, roll_out)
-            break
-        else:
+        draws = (draw(task, seed, attempt, axis) for attempt in range(ATTEMPTS))
+        clear = (one for one in draws if planned is None or not planned.overlap(one, demo.task))
+        alone = next((taken for one in clear if (taken := _taken(one, demo, nominal, opened))), None)
+        if alone is None:
             raise RefusedError(f"no_{axis}_draw_fits")
+        one, moved = alone
+        if isinstance(one, PhysicsPerturbation):
+            scene = moved if scene is None else one.apply(scene, demo, roll_out)
         perturbations.append(one)
+    together = len(perturbations) > 1 and any(map(held_out_sight.can_hide, perturbations))
+    if together and (fault := held_out_sight.fault(scene or nominal(), demo, perturbations, opened)):
+        raise RefusedError(fault)
     return tuple(perturbations), scene
+
+
+def _taken(
+    one: Perturbation, demo: Demo, nominal: Callable[[], Scene], opened: LastScene
+) -> tuple[Perturbation, Scene] | None:
+    """A draw and the scene with it alone; None where the scene refuses it, or too little can be seen."""
+    scene = nominal()
+    if isinstance(one, PhysicsPerturbation):
+        try:
+            scene = one.apply(scene, demo, roll_out)
+        except RefusedError:
+            return None
+    if held_out_sight.can_hide(one) and held_out_sight.fault(scene, demo, (one,), opened):
+        return None
+    return one, scene
 
 
 class PlannedDraws:

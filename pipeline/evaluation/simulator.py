@@ -194,6 +194,11 @@ class Picture:
         self._perturbations: Sequence[Perturbation] = ()
         self._changes: ExitStack | None = None
 
+    @property
+    def opened(self) -> LastScene:
+        """What renders; an episode's looks must be undone before another scene is asked for."""
+        return self._opened
+
     def show(self, scene: mujoco.MjModel | str, perturbations: Sequence[Perturbation]) -> None:
         """Render from here on a model, or a scene's MJCF where the model is without its images, as it is perturbed."""
         self.restore()

@@ -1,14 +1,18 @@
 """No held-out perturbation is near one of a training run's plan: a planted copy is found, in results too."""
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
 
+import mujoco
+import numpy as np
 import pytest
 from conftest import STOVE
 from episode_results import analyse, result
 
 from pipeline.axes import Perturbation, to_json
+from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.noise import NoiseAxis, NoisePerturbation
 from pipeline.errors import PipelineError
 from pipeline.evaluation import own_draws
@@ -94,4 +98,40 @@ def test_draws_that_a_plan_has_are_drawn_anew(tmp_path: Path) -> None:
     environment.settings = EpisodeSettings(plan=tmp_path / "all.parquet")
     progress = environment.reset(task)
     assert (progress.over, progress.success, progress.reason) == (True, False, "refused")
+    environment.close()
+
+
+def pixels_of(thing: str, camera: Perturbation, environment: EpisodeEnvironment) -> int:
+    """How many pixels of the agent view show a thing from a camera, by MuJoCo's own segmentation."""
+    assert isinstance(camera, CameraPerturbation)
+    model = copy.copy(environment.simulator.model)
+    camera.apply(model)
+    data = mujoco.MjData(model)
+    state = environment.simulator.state
+    data.qpos[:], data.qvel[:] = state[1 : 1 + model.nq], state[1 + model.nq :]
+    mujoco.mj_forward(model, data)
+    renderer = mujoco.Renderer(model, 256, 256)
+    renderer.enable_segmentation_rendering()
+    renderer.update_scene(data, "agentview")
+    number, kind = np.moveaxis(renderer.render(), -1, 0)
+    renderer.close()
+    geoms = number[kind == mujoco.mjtObj.mjOBJ_GEOM]
+    return int((model.body_rootid[model.geom_bodyid[geoms]] == model.body(f"{thing}_main").id).sum())
+
+
+@pytest.mark.slow
+def test_a_held_out_camera_that_does_not_show_what_the_task_is_about_is_sampled_again() -> None:
+    """The first draw of this task has the right plate outside of the frame, and was evaluated."""
+    name = "LIVING_ROOM_SCENE5_put_the_white_mug_on_the_left_plate_and_put_the_yellow_and_white_mug_on_the_right_plate"
+    (task,) = select(Selection(source="own", suites=("libero_10",), tasks=(name,), axes=("camera",), levels=(5,)))
+    environment = EpisodeEnvironment()
+    progress = environment.reset(task)
+    assert progress.reason == "running"
+    (used,) = environment.perturbations
+    assert pixels_of("plate_2", draw(task, 0), environment) == 0
+    assert used != draw(task, 0)
+    assert (used.axis, used.level) == ("camera", 5)
+    assert used in [draw(task, 0, attempt) for attempt in range(own_draws.ATTEMPTS)]
+    for thing in ("porcelain_mug_1", "white_yellow_mug_1", "plate_1", "plate_2"):
+        assert pixels_of(thing, used, environment) >= 20
     environment.close()
