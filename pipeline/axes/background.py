@@ -14,6 +14,7 @@ from itertools import product
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.axes.base import Axis, ByLevel, Credit, Frozen, RenderPerturbation, Share, pick
@@ -220,12 +221,21 @@ def _cover(model: mujoco.MjModel, skin: Skin, image: Frame, colour_scale: float)
     own, former = _mean(piece).clip(1), _mean(there)
     wanted = former + colour_scale * (own - former)
     wanted *= np.clip(wanted.mean(), _DARKEST, _BRIGHTEST) / wanted.mean()
-    # Darker by a factor and lighter by a shift: neither cuts the pattern off at black or white.
-    levels = np.arange(256.0)[:, None]
-    changed = np.where(wanted < own, levels * (wanted / own), levels + (wanted - own))
+    changed = _recoloured(own, wanted, piece.max(axis=(0, 1)))
     piece = np.asarray(cv2.LUT(piece, np.rint(changed).clip(0, 255).astype(np.uint8)[None]), np.uint8)
     for top, left in product(range(0, height, size[1]), range(0, width, size[0])):
         there[top : top + size[1], left : left + size[0], :3] = piece[: height - top, : width - left]
+
+
+def _recoloured(own: Floats, wanted: Floats, brightest: NDArray[np.uint8]) -> Floats:
+    """(256, 3) what each grey level of each channel becomes, so that the channel's mean goes from ``own`` to ``wanted``.
+
+    Darker by a factor. Lighter by a shift; where that would take the brightest value beyond white, the contrast falls
+    until it is white. So the pattern is cut off at neither end.
+    """
+    levels = np.arange(256.0)[:, None]
+    contrast = np.clip((255.0 - wanted) / np.maximum(brightest - own, 1e-9), 0.0, 1.0)
+    return np.where(wanted < own, levels * (wanted / own), wanted + contrast * (levels - own))
 
 
 def _mean(image: Frame) -> Floats:

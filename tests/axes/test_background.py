@@ -179,6 +179,27 @@ def test_a_modelled_table_has_the_image_more_often_as_its_top_is_a_small_piece_o
         assert np.corrcoef(tile, image)[0, 1] > 0.99
 
 
+def test_a_lighter_texture_keeps_its_pattern_and_has_the_mean_that_its_level_says() -> None:
+    """On a light table, tiles with white joints go a fifth of the way to their own colour, or to a mean of 205: a shift
+    would cut 39 % of their values off at white."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><asset><texture name="t" type="2d" builtin="flat" rgb1=".9 .9 .9" width="256" height="256"/>
+        <material name="table_texture" texture="t"/></asset>
+        <worldbody><geom type="plane" size="1 1 1" material="table_texture"/></worldbody></mujoco>"""
+    )
+    tiles = next(each for each in catalogue(("procedural",)).values() if each.name == "procedural:tile/039")
+    source = pixels(tiles.name, tiles.sha256)
+    own = source.reshape(-1, 3).mean(axis=0)
+    covering = Covering(part="surface", texture=tiles.name, licence=tiles.licence, sha256=tiles.sha256)
+    BackgroundPerturbation(component="surface", level=1, coverings=(covering,), colour_scale=0.2).apply(model)
+    covered = np.asarray(model.tex_data, float).reshape(-1, 3)
+    wanted = 230 + 0.2 * (own - 230)
+    assert covered.mean(axis=0) == pytest.approx(wanted * 205 / wanted.mean(), abs=1.0)
+    resized = cv2.resize(source, (256, 256), interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    for channel in range(3):
+        assert np.corrcoef(covered[:, channel], resized[:, channel])[0, 1] > 0.999
+
+
 def test_only_what_procedural_offers_is_a_data_map() -> None:
     axis = BackgroundAxis(sources=("libero", "robosuite"), own_colours=1, map_share=1)
     for key in range(20):
