@@ -183,7 +183,7 @@ class Quality:
     path_m: Annotated[float, "length of the end effector's path"]
     jerk_rms_m_s3: Annotated[float, "root mean square of the end effector's jerk, by third differences at 20 Hz"]
     idle_share: Annotated[float, "share of steps in which hand and fingers move less than 0.5 mm and 0.25 degrees"]
-    joint_margin_rad: Annotated[float, "smallest distance of a joint of the arm to its limit"]
+    joint_margin_rad: Annotated[float, "smallest distance of a joint of the arm to its limit; below 0 where it yields"]
     lag_m: Annotated[float, "largest distance between where an action asks the hand to be and where the step takes it"]
 
 

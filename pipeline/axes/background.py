@@ -228,7 +228,7 @@ def _cover(model: mujoco.MjModel, skin: Skin, image: Frame, colour_scale: float)
 
 
 def _recoloured(own: Floats, wanted: Floats, brightest: NDArray[np.uint8]) -> Floats:
-    """(256, 3) what each grey level of each channel becomes, so that the channel's mean goes from ``own`` to ``wanted``.
+    """(256, 3) what each grey level of each channel becomes, so that its mean goes from ``own`` to ``wanted``.
 
     Darker by a factor. Lighter by a shift; where that would take the brightest value beyond white, the contrast falls
     until it is white. So the pattern is cut off at neither end.
