@@ -19,6 +19,7 @@ from pipeline.errors import PipelineError
 from pipeline.export_config import CLEAN, LONGEST_NAME, Count, ExportConfig, known_to_oft
 from pipeline.libero.demonstrations import DemoEntry, DemoIndex, DemoSource, HDF5Source, StarterSource
 from pipeline.libero.tasks import SUITES, select_tasks
+from pipeline.publish_config import PublishConfig
 from pipeline.strict_yaml import StrictLoader
 from pipeline.testset import benchmark
 from pipeline.types import Place, RenderedExtra
@@ -207,6 +208,7 @@ class Config(Frozen):
     render: RenderConfig = RenderConfig()
     export: ExportConfig = Field(default=ExportConfig(), validate_default=True)
     compute: ComputeConfig = ComputeConfig()
+    publish: PublishConfig = PublishConfig()
 
     @field_validator("demos")
     @classmethod

@@ -7,7 +7,8 @@ from pipeline.run.stage import main
 
 
 def run(config: Config) -> None:
-    card.write(config.data, formats_of(config.data, config.export, config.render.extras), config.export.name)
+    formats = formats_of(config.data, config.export, config.render.extras)
+    card.write(config.data, formats, config.export.name, config.publish)
     print(f"{config.data / 'card'} has a README.md for each format; `python -m pipeline push` uploads it with the data")
 
 

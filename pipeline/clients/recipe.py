@@ -14,9 +14,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import ExportConfig
-from pipeline.files import checksum, read_json, replaced
+from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
 from pipeline.formats.rlds_layout import dataset_of, split_of
+from pipeline.generated import generated
 
 TEMPLATES = Path(__file__).parent / "templates"
 OFT_SCRIPT = "run_openvla_oft.py"
@@ -95,14 +96,16 @@ def _filled(template: str, **values: object) -> str:
 
 
 def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
-    """Write ``finetune.yaml``, the clients' scripts and what else they read, replacing what is in ``finetune``.
+    """Generate the folder ``finetune``: ``finetune.yaml``, the clients' scripts and the files that these read.
 
     Args:
-        data: the run's folder with its datasets; the scripts look for ``rlds`` beside theirs.
+        data: the run's folder with its datasets; the scripts look for ``rlds`` next to ``finetune``.
+
+    Raises:
+        PipelineError: if edits in ``finetune`` would be lost.
     """
     wanted = export.lerobot_v21
-    with replaced(data / "finetune") as unfinished:
-        unfinished.mkdir()
+    with generated(data / "finetune") as unfinished:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / "finetune.yaml").write_text(text)

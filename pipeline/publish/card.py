@@ -18,9 +18,11 @@ from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import validating
-from pipeline.files import checksum, read_json, replaced, schema_file
+from pipeline.files import checksum, read_json, schema_file
 from pipeline.formats.base import Format
+from pipeline.generated import generated
 from pipeline.libero.tasks import SUITES
+from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, named, origins, tally, targets, tried
 
@@ -48,16 +50,17 @@ TEMPLATES = jinja2.Environment(
 AnyFormat = Format[Any]
 
 
-def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
-    """Write ``<data>/card/<format>/``: what goes to the root of a repository beside that format's files.
+def write(data: Path, formats: Sequence[AnyFormat], name: str, publish: PublishConfig) -> None:
+    """Write ``<data>/card/<format>/``, the files next to the dataset at the root of a repository.
 
     Args:
         data: the run's folder, with manifest, reports, ``sheets`` and ``finetune``.
         formats: the run's datasets.
         name: what all of them together are called.
+        publish: the publisher's statements.
 
     Raises:
-        PipelineError: when something that it describes cannot be read.
+        PipelineError: when something that it describes cannot be read, or edits of the card would be lost.
     """
     rows = manifest.read(data / "manifest.parquet")
     settings = manifest.settings(data / "manifest.parquet")
@@ -65,7 +68,8 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
     clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)
     sheets = [axis for axis in axes if (data / "sheets" / f"{axis}.png").is_file()]
-    with replaced(data / "card") as folder:
+    made_from = {file: checksum(data / file) for file in ("manifest.parquet", *REPORTS)}
+    with generated(data / "card", made_from) as folder:
         for one in formats:
             (folder / one.name / "pictures").mkdir(parents=True)
             for axis in sheets:
@@ -81,10 +85,11 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str) -> None:
                 name=name,
                 source=settings.source,
                 episodes=settings.episodes,
+                publish=publish,
             )
             (folder / one.name / "README.md").write_text(text)
             sums = {one.repository_path(path): sha256 for path, sha256 in one.record().files.items()}
-            sums["manifest.parquet"] = checksum(data / "manifest.parquet")
+            sums["manifest.parquet"] = made_from["manifest.parquet"]
             lines = [f"{sha256}  {path}\n" for path, sha256 in sorted(sums.items())]
             (folder / one.name / CHECKSUMS).write_text("".join(lines))
 
@@ -100,6 +105,7 @@ def render(
     name: str,
     source: str,
     episodes: Mapping[str, int],
+    publish: PublishConfig,
 ) -> str:
     """The card of one format, with the hub's metadata in front.
 
@@ -110,6 +116,7 @@ def render(
         sheets: the axes that have a picture.
         source: of the demonstrations, ``starter`` or ``hdf5``.
         episodes: ``plan.episodes``, empty where the manifest does not have it.
+        publish: the publisher's statements.
     """
     leakage, validation, statistics = (reports[report] for report in REPORTS)
     kept = [row for row in rows if row["kept"]]
@@ -127,7 +134,8 @@ def render(
         shown=shown,
         loading=shown.loading(name, REPOSITORY, kept),
         clients={client: call for client, call in clients.items() if client in shown.clients},
-        metadata=_metadata(shown, name, free=free, libero=libero).to_yaml(),
+        metadata=_metadata(shown, name, publish, free=free, libero=libero).to_yaml(),
+        publish=publish,
         demos=demos,
         held_out=sum(validating(shown.options.validation, number) for number in of_task.values()),
         others=" and ".join(others),
@@ -183,15 +191,16 @@ def _own_rewrites(kept: Iterable[Mapping[str, Any]]) -> bool:
     )
 
 
-def _metadata(shown: AnyFormat, name: str, *, free: bool, libero: bool) -> DatasetCardData:
+def _metadata(shown: AnyFormat, name: str, publish: PublishConfig, *, free: bool, libero: bool) -> DatasetCardData:
+    licence = publish.licence_metadata() or {"license": "cc-by-4.0" if free else "other"}
     return DatasetCardData(
         language="en",
-        license="cc-by-4.0" if free else "other",
         pretty_name=name,
         task_categories=["robotics"],
         source_datasets=["yifengzhu-hf/LIBERO-datasets"] if libero else None,
         tags=[shown.title, "LIBERO", "LIBERO-Plus", "panda", "simulation"],
         configs=[*shown.viewer(), {"config_name": "manifest", "data_files": "manifest.parquet"}],
+        **licence,
     )
 
 

@@ -104,7 +104,7 @@ def of_previews(config: Config) -> Memory:
 def of_report(config: Config) -> Memory:
     """Of the report."""
     names = ("plan.parquet", "manifest.parquet", "leakage.json", "inputs.json", FRAMES, "sheets", "previews")
-    settings = [settings_of(config, {"compute", "folder"}), checksum(SEEN)]
+    settings = [settings_of(config, {"compute", "folder", "publish"}), checksum(SEEN)]
     return _of_pictures(config, "report", ["report.html"], settings, names)
 
 

@@ -18,8 +18,9 @@ MADE = {
     "frames": rf"index\.parquet|[0-9a-f]{{16}}/[0-9a-f]{{16}}{_STORED}",
     "sheets": _SHEET,
     "previews": rf"[a-z0-9_]+/{_AXIS}\.png",
-    "card": rf"(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
-    "finetune": r"finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|starvla_data_config\.py|"
+    "card": rf"\.generated\.json|(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
+    "finetune": r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|"
+    r"run_openvla_oft\.py|lerobot_train\.json|starvla_data_config\.py|"
     r"openpi_assets/physical-intelligence/libero/norm_stats\.json",
 }
 """Folders of a run that stages clear or replace as a whole, to a pattern of the paths that stages write in them.

@@ -41,7 +41,8 @@ def settings(config: Config) -> dict[str, Any]:
     Of a path the last name, as for ``listing``.
     """
     sections = {
-        name: settings_of(getattr(config, name)) for name in ("demos", "plan", "replay", "filter", "render", "export")
+        name: settings_of(getattr(config, name))
+        for name in ("demos", "plan", "replay", "filter", "render", "export", "publish")
     }
     export = {"where": None, "lerobot_v21": None, "failures": False, **sections["export"]}
     return {**sections, "export": export, "host": host()}

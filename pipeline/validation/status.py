@@ -11,6 +11,7 @@ from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
 from pipeline.formats.registry import failures_of, formats_of
+from pipeline.generated import FOLDERS, edits, edits_in_words
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
 from pipeline.run import cleaning, counts, dropped, export, finished, inputs, machine, outcome, plan_stage
@@ -56,6 +57,7 @@ def told(config: Config) -> Iterator[str | Table]:
     unneeded = dropped.measure(rows, config)
     if unneeded.asks:
         yield f"no longer needed, and deleted by a run with REMAKE=1, without which it stops: {unneeded}"
+    yield from edits_in_words(config.data)
     yield _disk(config)
     # What is not replayed yet is hoped for.
     hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
@@ -118,6 +120,10 @@ def _follow(config: Config) -> Iterator[tuple[str, str]]:
     for stage, names in MADE.items():
         if gone := [name for name in names if not (config.data / name).exists()]:
             yield stage, f"{gone[0]} is not there"
+        elif any(edits(config.data / name) for name in names if name in FOLDERS):
+            yield stage, "stops before it overwrites edits"
+        elif stage == "card" and (stated := _changed_statements(config)):
+            yield stage, f"another configuration: {', '.join(stated)}"
     stale = False
     for one in (*formats_of(*sets), *(failures_of(*sets) if run.missed else ())):
         episodes = export.episodes_of(one, config, run)
@@ -145,6 +151,12 @@ def _why_planned(config: Config) -> str:
         of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
     # The stage `inputs` wrote the new settings down before a plan was rejected.
     return f"another configuration: {', '.join(of_plan)}" if of_plan else "made from other settings, files or versions"
+
+
+def _changed_statements(config: Config) -> list[str]:
+    """Fields of the section ``publish`` that differ from those that the card was generated with."""
+    changed = _changed(config.data / "settings.json", inputs.settings(config))
+    return [name for name in changed if name.split(".")[0] == "publish"]
 
 
 def _changed(file: Path, now: Mapping[str, Any]) -> list[str]:

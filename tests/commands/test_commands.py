@@ -265,7 +265,7 @@ def test_run_elsewhere_with_a_subset_in_one_format(ablation: Ablation) -> None:
     assert [folder.name for folder in (data / "rlds").iterdir()] == ["libero_tiny_goal"]
     recipe = yaml.safe_load((data / "finetune/finetune.yaml").read_text())
     assert list(recipe["clients"]) == ["openvla_oft"]
-    assert [folder.name for folder in (data / "card").iterdir()] == ["rlds"]
+    assert [entry.name for entry in (data / "card").iterdir() if entry.is_dir()] == ["rlds"]
     assert "nothing would run" in call(clone, "status").stdout
 
     found = call(clone, "check")

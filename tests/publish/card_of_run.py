@@ -21,6 +21,7 @@ from pipeline.config import RenderConfig, ReplayConfig
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
 from pipeline.formats.registry import FORMATS, columns, formats_of
 from pipeline.publish import card
+from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.seeding import rng
 from pipeline.types import Extra, Task
@@ -110,6 +111,7 @@ def write_rows(data: Path, rows: list[dict[str, Any]], source: Literal["starter"
     manifest.write(table, data / "manifest.parquet", settings)
 
 
+NO_STATEMENT = PublishConfig()
 OPTIONS = ExportConfig(
     rlds=RldsConfig(name=NAME, shards=1),
     lerobot=LeRobotConfig(name=NAME, shards=1),
@@ -117,12 +119,23 @@ OPTIONS = ExportConfig(
 )
 
 
-def write(data: Path, options: ExportConfig = OPTIONS, extras: Sequence[Extra] = ()) -> None:
-    card.write(data, formats_of(data, options, extras), NAME)
+def write(
+    data: Path,
+    options: ExportConfig = OPTIONS,
+    extras: Sequence[Extra] = (),
+    publish: PublishConfig = NO_STATEMENT,
+) -> None:
+    card.write(data, formats_of(data, options, extras), NAME, publish)
 
 
-def written(data: Path, kind: str, options: ExportConfig = OPTIONS, extras: Sequence[Extra] = ()) -> str:
-    write(data, options, extras)
+def written(
+    data: Path,
+    kind: str,
+    options: ExportConfig = OPTIONS,
+    extras: Sequence[Extra] = (),
+    publish: PublishConfig = NO_STATEMENT,
+) -> str:
+    write(data, options, extras, publish)
     return (data / "card" / kind / "README.md").read_text()
 
 

@@ -1,0 +1,179 @@
+"""Folders that a stage generates and a person may edit (``card/``, ``finetune/``): no edit is overwritten silently.
+
+The SHA-256 of every generated file is recorded in the folder itself, so that one rename puts both in place.
+"""
+
+import os
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.files import checksum, read_json, remove, replaced, write_json
+from pipeline.identity import ALLOW, REMAKE
+
+RECORD = ".generated.json"
+"""File of a generated folder that lists its other files."""
+
+FOLDERS = ("finetune", "card")
+"""The generated folders of a run."""
+
+MAX_NAMED = 20
+
+
+@dataclass(frozen=True)
+class Generated:
+    """The record of a generated folder.
+
+    Attributes:
+        files: path below the folder to SHA-256.
+        made_from: name of each file of the run that the content was generated from, to SHA-256.
+    """
+
+    files: Mapping[str, str]
+    made_from: Mapping[str, str]
+
+
+@contextmanager
+def generated(folder: Path, made_from: Mapping[str, str] | None = None) -> Iterator[Path]:
+    """Yield an empty folder to write into; on success record its files and give it the place of ``folder``.
+
+    A killed process leaves the old folder, the new one or none.
+
+    Args:
+        made_from: as in ``Generated``.
+
+    Raises:
+        PipelineError: if edits would be lost and ``REMAKE=1`` does not allow it; ``folder`` is then unchanged.
+    """
+    old = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.tmp")  # Deleted by the next stage after a kill.
+    with replaced(folder) as unfinished:
+        unfinished.mkdir()
+        yield unfinished
+        files = {path: checksum(file) for path, file in _files(unfinished).items()}
+        _refuse_loss(folder, files)
+        write_json(unfinished / RECORD, {"files": files, "made_from": dict(made_from or {})})
+        if folder.exists():
+            os.replace(folder, old)
+    remove(old)
+
+
+def record(folder: Path) -> Generated:
+    """Read the record of a generated folder.
+
+    Raises:
+        PipelineError: if the record is missing or damaged.
+    """
+    file = folder / RECORD
+    content = read_json(file)
+    try:
+        return Generated(dict(content["files"]), dict(content["made_from"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise PipelineError(f"damaged ({error!r})", where=file, expected="files and made_from") from error
+
+
+def edits(folder: Path) -> dict[str, str]:
+    """List the files that are not as the folder's record has them.
+
+    Returns:
+        Path below the folder to ``changed``, ``added``, ``a link`` or ``without a record``. A deleted file is no edit:
+        generating it again loses nothing.
+    """
+    if folder.is_symlink() or folder.is_file():
+        return {folder.name: "not a folder"}
+    try:
+        recorded = dict(record(folder).files)
+        unknown = "added"
+    except PipelineError:
+        recorded, unknown = {}, "without a record"
+    found: dict[str, str] = {}
+    for path, file in _files(folder).items():
+        if file.is_symlink():
+            found[path] = "a link"
+        elif path not in recorded:
+            found[path] = unknown
+        elif not file.is_file() or checksum(file) != recorded[path]:
+            found[path] = "changed"
+    return found
+
+
+def unchanged(folder: Path, below: str = "") -> dict[str, Path]:
+    """Return the recorded files of a folder if they are all that it has.
+
+    Args:
+        below: subfolder to look at, such as ``rlds`` of ``card``; all of the folder when left out.
+
+    Returns:
+        Path below the folder to file.
+
+    Raises:
+        PipelineError: naming files that were changed, added, linked or deleted since the folder was generated.
+    """
+    if folder.is_symlink():
+        raise PipelineError("is a symbolic link", where=folder, expected="the folder that a stage generated")
+    recorded = [path for path in record(folder).files if PurePosixPath(path).is_relative_to(below)]
+    faults = {path: how for path, how in edits(folder).items() if PurePosixPath(path).is_relative_to(below)}
+    faults |= {path: "not there" for path in recorded if not os.path.lexists(folder / path)}
+    if faults:
+        raise PipelineError(
+            f"{len(faults)} files are not as they were generated: {in_words(faults)}",
+            where=folder,
+            expected=f"the files of {folder / RECORD}, and no others",
+            remedy=f"{REMEDY}; for files that are not there `{MAKE_AGAIN}`",
+        )
+    return {path: folder / path for path in recorded}
+
+
+REMEDY = (
+    "put a change into the configuration (`publish:` has licence, author and notes), or keep a copy of these files "
+    f"outside of the folder and allow to generate it again: {ALLOW}"
+)
+"""The two ways to keep an edit."""
+
+
+def edits_in_words(data: Path) -> Iterator[str]:
+    """Say which generated folders of a run have edits, one sentence each."""
+    for name in FOLDERS:
+        if found := edits(data / name):
+            yield f"edited in {data / name}: {in_words(found)}. A run stops before it overwrites them: {REMEDY}"
+
+
+def in_words(found: Mapping[str, str]) -> str:
+    """Join paths and states, at most ``MAX_NAMED`` of them."""
+    named = [f"{path} ({how})" for path, how in sorted(found.items())]
+    further = [f"and {len(named) - MAX_NAMED} more"] if len(named) > MAX_NAMED else []
+    return ", ".join(named[:MAX_NAMED] + further)
+
+
+def _refuse_loss(folder: Path, files: Mapping[str, str]) -> None:
+    """Stop if edits would be lost, by which the files to come differ from those in the folder."""
+    lost: dict[str, str] = {}
+    for path, how in edits(folder).items():
+        file = folder / path
+        same = file.is_file() and not file.is_symlink() and checksum(file) == files.get(path)
+        if not same:
+            lost[path] = how
+    if not lost:
+        return
+    if os.environ.get(REMAKE) == "1":
+        print(f"generated again in {folder}, edits included: {in_words(lost)}")
+        return
+    raise PipelineError(
+        f"{len(lost)} edited files would be overwritten or deleted: {in_words(lost)}",
+        where=folder,
+        expected=f"the files of {folder / RECORD}, as they were generated",
+        remedy=REMEDY,
+    )
+
+
+def _files(folder: Path) -> dict[str, Path]:
+    """Map paths to files and links below a folder: hidden ones too, without the record and compiled Python."""
+    found: dict[str, Path] = {}
+    for file in sorted(folder.rglob("*")):
+        path = file.relative_to(folder)
+        compiled = path.parent.name == "__pycache__" and path.suffix == ".pyc"
+        if (file.is_symlink() or not file.is_dir()) and not compiled and path != Path(RECORD):
+            found[path.as_posix()] = file
+    return found
