@@ -66,7 +66,7 @@ def of_an_earlier_version(folder: Path) -> None:
     (folder / ".generated.json").unlink()
 
 
-EDITS = {
+EDITS: dict[Callable[[Path], None], str] = {
     changed: "one.txt (changed)",
     added: "one.txt.bak (added)",
     hidden: ".git/config (added)",

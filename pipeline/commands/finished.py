@@ -32,7 +32,10 @@ def add_commands(commands: Any) -> None:
         value("repository", "REPOSITORY", "owner/name on the hub", str),
         add_config,
         argument("--really", action="store_true", help="send it"),
-        argument("--private", action="store_true", help="make a new repository private"),
+        argument("--private", action="store_true", help="create a private repository; refuse a public one"),
+        argument(
+            "--replace", action="store_true", help="delete what is not an earlier upload of the same run and format"
+        ),
     )
 
 
@@ -120,8 +123,9 @@ def push(arguments: argparse.Namespace) -> None:
     """upload a run's dataset with its card to the Hugging Face hub; without --really, say what would go
 
     Sends one of the datasets of a finished and validated run: its files, the card, the manifest and finetune/, in one
-    commit. Cut off, it goes on where it was. A token is read from HF_TOKEN or `hf auth login`, the address of
-    another hub from HF_ENDPOINT.
+    commit; only files as they were recorded. A repository with anything but an earlier upload of the same run and
+    format is refused. Cut off, it resumes. A token is read from HF_TOKEN or `hf auth login`, the address of another
+    hub from HF_ENDPOINT.
     """
     from pipeline.formats.registry import formats_of
 
@@ -135,9 +139,11 @@ def push(arguments: argparse.Namespace) -> None:
     from pipeline.publish import push
 
     formats = {one.name: one for one in formats_of(config.data, config.export, config.render.extras)}
-    upload = push.prepare(formats[arguments.format])
+    upload = push.prepare(formats[arguments.format], config.name)
     print(upload.summary())
-    if not arguments.really:
-        print(f"nothing was sent: with --really this goes to {arguments.repository}")
+    options = {"private": arguments.private, "replace": arguments.replace}
+    if arguments.really:
+        print(push.send(upload, arguments.repository, **options))
         return
-    print(push.send(upload, arguments.repository, private=arguments.private))
+    print(push.compare(upload, arguments.repository, **options))
+    print(f"nothing was sent: with --really this goes to {arguments.repository}")

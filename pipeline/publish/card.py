@@ -192,7 +192,8 @@ def _own_rewrites(kept: Iterable[Mapping[str, Any]]) -> bool:
 
 
 def _metadata(shown: AnyFormat, name: str, publish: PublishConfig, *, free: bool, libero: bool) -> DatasetCardData:
-    licence = publish.licence_metadata() or {"license": "cc-by-4.0" if free else "other"}
+    licence: dict[str, Any] = {"license": "cc-by-4.0" if free else "other"}
+    licence |= publish.licence_metadata()
     return DatasetCardData(
         language="en",
         pretty_name=name,

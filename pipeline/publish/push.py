@@ -1,5 +1,8 @@
 """Upload a dataset to the Hugging Face hub: its files, its card, and what it was made and checked with.
 
+Only files that a stage recorded are sent, with the recorded content. ``upload.json`` records the upload itself in the
+repository, by which the next one knows which files it may replace.
+
 Everything goes into one commit, so that a reader finds all of a dataset or none of it. Large files are sent before that
 and stay there if the upload is cut off: run again, only the rest is sent. (``upload_large_folder`` of huggingface_hub
 leaves notes among the files, shows half a dataset meanwhile, and tries for ever where a token may not write.)
@@ -16,15 +19,15 @@ from typing import Any
 import httpx
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, errors, get_token
 from huggingface_hub.errors import HfHubHTTPError, RevisionNotFoundError
+from huggingface_hub.hf_api import RepoFile
 
 from pipeline.errors import MAKE_AGAIN, PipelineError
-from pipeline.files import read_json
+from pipeline.files import checksum, read_json
 from pipeline.formats.base import Format
+from pipeline.generated import record, unchanged
 from pipeline.grouping import grouped
-from pipeline.publish.card import REPORTS, REPOSITORY
-
-SCRIPTS = {".py", ".yaml", ".json"}
-"""What of ``finetune/`` is uploaded; trying it leaves compiled Python there."""
+from pipeline.publish.card import REPOSITORY
+from pipeline.publish.repository import UPLOAD, Content, LastUpload, Repository, content_of, deletions, files_of, read
 
 OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]{64}\.json")
 """What OpenVLA-OFT's loader writes beside the shards when it trains without ``finetune/run_openvla_oft.py``."""
@@ -35,62 +38,118 @@ FAILURES = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, 
 
 @dataclass(frozen=True)
 class Upload:
-    """What would be sent.
+    """The files of an upload.
 
     Attributes:
-        files: path in the repository to file here.
-        folders: top folders of the repository in which nothing else may lie.
-        tag: what the commit is tagged, where a client's loader wants that.
+        run: name of the run.
+        format: of the dataset.
+        dataset: path in the repository to file here, of the dataset.
+        others: the same of all other files.
+        sha256: path in the repository to the recorded checksum.
+        folders: top folders of the repository in which only the dataset may lie.
+        tag: name that the commit gets, if a client's loader asks for it.
     """
 
-    files: Mapping[str, Path]
+    run: str
+    format: str
+    dataset: Mapping[str, Path]
+    others: Mapping[str, Path]
+    sha256: Mapping[str, str]
     folders: Set[str]
     tag: str | None
 
+    @property
+    def files(self) -> dict[str, Path]:
+        """All files, by path in the repository."""
+        return dict(sorted({**self.dataset, **self.others}.items()))
+
     def summary(self) -> str:
-        """Files and megabytes of each folder, the total, and the tag."""
+        """Run and format, files and megabytes of each folder, the names of files outside the dataset, and the tag."""
         folders = grouped((f"{Path(path).parent}/", file.stat().st_size) for path, file in self.files.items())
         folders["in all"] = [size for sizes in folders.values() for size in sizes]
-        lines = [f"{len(sizes):6,} files {sum(sizes) / 1e6:10,.1f} MB  {name}" for name, sizes in folders.items()]
-        return "\n".join([*lines, f"tag: {self.tag or 'none'}"])
+        return "\n".join(
+            [
+                f"run {self.run}, format {self.format}",
+                *(f"{len(sizes):6,} files {sum(sizes) / 1e6:10,.1f} MB  {name}" for name, sizes in folders.items()),
+                "outside the dataset:",
+                *(f"  {path}" for path in sorted([*self.others, UPLOAD])),
+                f"tag: {self.tag or 'none'}",
+            ]
+        )
 
 
-def prepare(target: Format[Any]) -> Upload:
+def prepare(target: Format[Any], run: str) -> Upload:
     """Gather what belongs to a dataset; nothing is sent.
 
+    Args:
+        run: the run's name.
+
     Raises:
-        PipelineError: when files are missing, foreign, not validated, or failed validation.
+        PipelineError: when files are missing, foreign, not as recorded, not validated, or failed validation.
     """
     data = target.data
-    dataset = _exactly(target.folder, set(target.record().files))
-    files = {target.repository_path(path): file for path, file in dataset.items()}
-    _refuse_unvalidated(data, files, target.name)
+    recorded = target.record().files
+    dataset = {target.repository_path(path): file for path, file in _exactly(target.folder, {*recorded}).items()}
+    _refuse_unvalidated(data, dataset, target.name)
     for fault in (fault for file in target.written() for fault in file.faults()):
         raise PipelineError(fault.what, expected=fault.expected)
-    card = data / "card" / target.name
-    files |= {file.relative_to(card).as_posix(): file for file in card.rglob("*") if file.is_file()}
-    files |= {name: data / name for name in ("manifest.parquet", *REPORTS)}
-    scripts = (file for file in (data / "finetune").rglob("*") if file.suffix in SCRIPTS)
-    files |= {file.relative_to(data).as_posix(): file for file in scripts}
+    sha256 = {target.repository_path(path): sha256 for path, sha256 in recorded.items()}
+    others: dict[str, Path] = {}
+    for folder, below, inside in (("card", target.name, ""), ("finetune", "", "finetune/")):
+        checksums = record(data / folder).files
+        for path, file in unchanged(data / folder, below).items():
+            name = inside + path.removeprefix(f"{below}/")
+            others[name], sha256[name] = file, checksums[path]
+    for name, of_file in record(data / "card").made_from.items():
+        if (data / name).is_symlink() or checksum(data / name) != of_file:
+            raise PipelineError(
+                "is a link, or has changed since the card was generated from it", where=data / name, remedy=MAKE_AGAIN
+            )
+        others[name], sha256[name] = data / name, of_file
     # Its own folders too where it has nothing in them now, such as videos.
-    folders = target.repository_folders() | {path.partition("/")[0] for path in files if "/" in path}
-    return Upload(dict(sorted(files.items())), folders, target.tag())
+    folders = target.repository_folders() | {path.partition("/")[0] for path in dataset if "/" in path}
+    return Upload(run, target.name, dataset, dict(sorted(others.items())), sha256, folders, target.tag())
 
 
-def send(upload: Upload, repository: str, *, private: bool = False) -> str:
+def compare(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
+    """Read the repository on the hub, and say what an upload would delete there; nothing is sent.
+
+    Returns:
+        Words: the state of the repository, and every file that would be deleted.
+
+    Raises:
+        PipelineError: if the repository has files of another origin, or a file here has changed.
+    """
+    api = HfApi()
+    try:
+        name = _full_name(api, repository)
+        there = read(api, name)
+    except FAILURES as error:
+        return f"not known what {repository} has, and what would be deleted there: {' '.join(str(error).split())}"
+    if there is None:
+        return f"{name} is not there, or your token may not see it: it would be created"
+    _, new = _contents(upload, name)
+    gone = _deleted(there, new, upload.folders, private=private, replace=replace)
+    kind = "private" if there.private else "public"
+    return "\n".join([f"{name} ({kind}) has {len(there.files)} files; deleted: {len(gone)}", *(f"  {x}" for x in gone)])
+
+
+def send(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
     """Create the repository on the hub (of HF_ENDPOINT) if need be, send what it does not have, and tag it.
 
     Files of an earlier upload that the dataset no longer has are deleted by the same commit.
 
     Args:
         repository: ``owner/name``, or ``name`` for one of your own.
-        private: whether a new repository is private; one that exists stays as it is.
+        private: create a private repository; one that is there must be private.
+        replace: overwrite or delete files that are not of an earlier upload of the same run and format.
 
     Returns:
         The address of the commit.
 
     Raises:
-        PipelineError: without a token, without the right to write, or when the network or the hub fails.
+        PipelineError: without a token, without the right to write, if the repository has files of another origin, if
+            a file has changed, or when the network or the hub fails.
     """
     api = HfApi()
     try:
@@ -98,20 +157,28 @@ def send(upload: Upload, repository: str, *, private: bool = False) -> str:
             raise PipelineError(
                 f"no token for {api.endpoint}", remedy="hf auth login, or HF_TOKEN=..., with a token that may write"
             )
-        # With the owner in front, where it was left out.
-        repository = api.create_repo(repository, repo_type="dataset", private=private, exist_ok=True).repo_id
-        there = api.list_repo_files(repository, repo_type="dataset")
-        stale = [path for path in there if path.partition("/")[0] in upload.folders and path not in upload.files]
-        # In the card, with the repository's name in the commands that load it.
-        card = upload.files["README.md"].read_text().replace(REPOSITORY, repository).encode()
-        contents: dict[str, Path | bytes] = {**upload.files, "README.md": card}
+        repository = _full_name(api, repository)
+        contents, sent = _contents(upload, repository)
+        there = read(api, repository)
+        if there is None:
+            api.create_repo(repository, repo_type="dataset", private=private)
+            there = read(api, repository)
+        if there is None:
+            raise PipelineError("was created, but cannot be read", where=repository, remedy="a token that may read it")
+        stale = _deleted(there, sent, upload.folders, private=private, replace=replace)
+        contents[UPLOAD] = (sent.model_dump_json(indent=1) + "\n").encode()
         operations: list[CommitOperationAdd | CommitOperationDelete] = [
             *(CommitOperationAdd(path, content) for path, content in contents.items()),
             *(CommitOperationDelete(path, is_folder=False) for path in stale),
         ]
         commit = api.create_commit(
-            repository, operations, repo_type="dataset", commit_message=f"Upload {len(upload.files)} files"
+            repository,
+            operations,
+            repo_type="dataset",
+            commit_message=f"Upload run {upload.run} as {upload.format}: {len(contents)} files",
+            parent_commit=there.commit,
         )
+        _refuse_other_content(files_of(api, repository, str(commit.oid)), sent, repository)
         if upload.tag is not None:  # moved, where it stands on an earlier upload
             with suppress(RevisionNotFoundError):
                 api.delete_tag(repository, tag=upload.tag, repo_type="dataset")
@@ -119,6 +186,56 @@ def send(upload: Upload, repository: str, *, private: bool = False) -> str:
     except FAILURES as error:
         raise _explained(error, repository, api.endpoint) from error
     return commit.commit_url
+
+
+def _full_name(api: HfApi, repository: str) -> str:
+    """Put the owner in front, if it was left out."""
+    return repository if "/" in repository else f"{api.whoami()['name']}/{repository}"
+
+
+def _deleted(there: Repository, new: LastUpload, folders: Set[str], *, private: bool, replace: bool) -> list[str]:
+    """List the paths that an upload deletes, if it is not refused."""
+    if private and not there.private:
+        raise PipelineError(
+            "is public, and --private asks for a private repository",
+            where=there.name,
+            remedy="make it private in its settings on the hub, use another name, or leave --private out",
+        )
+    return deletions(there, new, folders, replace=replace)
+
+
+def _contents(upload: Upload, repository: str) -> tuple[dict[str, Path | bytes], LastUpload]:
+    """Collect what is sent: the dataset as paths, all other files as bytes, and the checksums.
+
+    The card gets the repository's name in the commands that load it.
+
+    Raises:
+        PipelineError: when a file has changed since ``prepare``.
+    """
+    contents: dict[str, Path | bytes] = dict(upload.dataset)
+    for path, file in upload.others.items():
+        contents[path] = file.read_bytes()
+    checksums: dict[str, Content] = {}
+    for path, content in contents.items():
+        checksums[path] = content_of(content)
+        if checksums[path].sha256 != upload.sha256[path]:
+            raise PipelineError(
+                "has changed since it was checked", where=upload.files[path], remedy="run the command again"
+            )
+    card = upload.files["README.md"].read_text().replace(REPOSITORY, repository).encode()
+    contents["README.md"], checksums["README.md"] = card, content_of(card)
+    return contents, LastUpload(run=upload.run, format=upload.format, files=dict(sorted(checksums.items())))
+
+
+def _refuse_other_content(files: Mapping[str, RepoFile], sent: LastUpload, repository: str) -> None:
+    """Stop if the hub has other content than was meant, as of a file that changed while it was sent."""
+    wrong = [path for path, content in sent.files.items() if path not in files or not content.is_of(files[path])]
+    if wrong:
+        raise PipelineError(
+            f"{len(wrong)} files on the hub are not as recorded, such as {wrong[0]}",
+            where=repository,
+            remedy="make the repository private if they are not to be seen, and run the command again",
+        )
 
 
 def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
@@ -135,7 +252,7 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
             f"{len(foreign)} files that are not of the dataset, {len(linked)} that lie elsewhere, such as "
             f"{(foreign + linked)[0]}",
             where=root,
-            remedy=f"move them away (training may leave files), or delete the dataset and `{MAKE_AGAIN}`",
+            remedy=f"move them away (training may leave files), and `{MAKE_AGAIN}`",
         )
     if missing := sorted(wanted - found.keys()):
         raise PipelineError(f"lacks {len(missing)} files, such as {missing[0]}", where=root, remedy=MAKE_AGAIN)
@@ -177,7 +294,10 @@ def _explained(error: Exception, repository: str, endpoint: str) -> PipelineErro
         cause = cause.__cause__
     response = None if cause is None else cause.response
     status = 0 if response is None else response.status_code
-    if status in (401, 403, 404):
+    if status in (409, 412):
+        what = f"{repository} has changed, or was created, since it was read"
+        remedy = "run the command again: it reads the repository first"
+    elif status in (401, 403, 404):
         what = f"{repository} does not let you write"
         remedy = "hf auth login with a token that has the right to, and mind the owner's name"
     elif 400 <= status < 500 or not isinstance(error, OSError | RuntimeError | httpx.HTTPError):

@@ -7,9 +7,12 @@ import re
 import threading
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import PurePosixPath
 from typing import Any
 
 REPOSITORY = "somebody/tiny"
+ATTRIBUTES = b"*.parquet filter=lfs diff=lfs merge=lfs -text\n"
+"""Of the file .gitattributes, with which the hub creates a repository."""
 LARGE = (".parquet", ".mp4", ".png")
 
 
@@ -25,6 +28,8 @@ class Hub:
         sent: SHA-256 of every object that was sent whole.
         cuts: how many more transfers of an object break off half way.
         allowed: how many transfers go well before that.
+        before_transfer: called before it says how a file is to be sent, as what happens here meanwhile.
+        before_commit: called before a commit is looked at, as what others do meanwhile.
         failing: how many more commits are answered with an error of the server.
     """
 
@@ -37,12 +42,17 @@ class Hub:
         self.sent: list[str] = []
         self.cuts, self.allowed = 0, 0
         self.failing = 0
+        self.before_transfer: Callable[[], None] = lambda: None
+        self.before_commit: Callable[[], None] = lambda: None
         self.lock = threading.Lock()
         hub = self
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 self._route("GET")
+
+            def do_HEAD(self) -> None:
+                self._route("HEAD")
 
             def do_POST(self) -> None:
                 self._route("POST")
@@ -57,13 +67,19 @@ class Hub:
                 if method == "PUT":
                     self._object(self.path.rpartition("/")[2])
                     return
-                if self.headers.get("Authorization") != "Bearer writer":
+                token = self.headers.get("Authorization")
+                if method not in ("GET", "HEAD") and token != "Bearer writer":
                     self._answer(403, {"error": "this token may not write"})
+                    return
+                of_repository = f"/{REPOSITORY}" in self.path
+                if of_repository and (hub.private is None or (hub.private and token is None)):
+                    self._answer(404 if token else 401, {"error": "Repository not found"}, "RepoNotFound")
                     return
                 body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
                 for pattern, answer in ROUTES.items():
                     if found := re.fullmatch(pattern, f"{method} {self.path.partition('?')[0]}"):
-                        self._answer(*answer(hub, body, *found.groups()))
+                        status, content = answer(hub, body, *found.groups())
+                        self._answer(status, content)
                         return
                 self._answer(404, {"error": f"{method} {self.path}"})
 
@@ -82,15 +98,18 @@ class Hub:
                 hub.sent.append(oid)
                 self._answer(200, {})
 
-            def _answer(self, status: int, body: object) -> None:
-                text = json.dumps(body).encode()
+            def _answer(self, status: int, body: object, code: str = "RevisionNotFound") -> None:
+                text = body if isinstance(body, bytes) else json.dumps(body).encode()
                 self.send_response(status)
-                if status == 404:
-                    self.send_header("X-Error-Code", "RevisionNotFound")
+                if status in (401, 404):
+                    self.send_header("X-Error-Code", code)
                 self.send_header("Content-Type", "application/json")
                 self.send_header("Content-Length", str(len(text)))
+                self.send_header("X-Repo-Commit", hub.head())
+                self.send_header("ETag", f'"{hashlib.sha1(text).hexdigest()}"')
                 self.end_headers()
-                self.wfile.write(text)
+                if self.command != "HEAD":
+                    self.wfile.write(text)
 
             def log_message(self, format: str, *args: object) -> None:
                 pass
@@ -104,24 +123,49 @@ class Hub:
             return 409, answer
         asked = json.loads(body)
         self.private = asked.get("private", asked.get("visibility") == "private")  # the second since huggingface-hub 1
+        self.files[".gitattributes"] = ATTRIBUTES
         return 200, answer
 
-    def tree(self, body: bytes) -> tuple[int, object]:
-        return 200, [{"type": "file", "path": path, "size": len(data), "oid": ""} for path, data in self.files.items()]
+    def head(self) -> str:
+        """The last commit."""
+        return f"{self.commits:040x}"
+
+    def whoami(self, body: bytes) -> tuple[int, object]:
+        return 200, {"type": "user", "name": REPOSITORY.partition("/")[0]}
+
+    def tree(self, body: bytes, revision: str) -> tuple[int, object]:
+        if revision not in ("main", self.head()):
+            return 404, {"error": "no such revision"}
+        folders = {str(parent) for path in self.files for parent in PurePosixPath(path).parents} - {"."}
+        listed = [{"type": "directory", "path": folder, "size": 0, "oid": "0" * 40} for folder in sorted(folders)]
+        return 200, listed + [self._entry(path, content) for path, content in self.files.items()]
+
+    def _entry(self, path: str, content: bytes) -> dict[str, Any]:
+        entry = {"type": "file", "path": path, "size": len(content), "oid": git_oid(content)}
+        if is_large(path):
+            oid = hashlib.sha256(content).hexdigest()
+            pointer = f"version https://git-lfs.github.com/spec/v1\noid sha256:{oid}\nsize {len(content)}\n".encode()
+            entry |= {"oid": git_oid(pointer), "lfs": {"oid": oid, "size": len(content), "pointerSize": len(pointer)}}
+        return entry
+
+    def resolve(self, body: bytes, revision: str, path: str) -> tuple[int, object]:
+        if revision not in ("main", self.head()) or path not in self.files:
+            return 404, {"error": "no such file"}
+        return 200, self.files[path]
 
     def info(self, body: bytes) -> tuple[int, object]:
-        return 200, {"id": REPOSITORY, "sha": f"{self.commits:040x}", "xetEnabled": False}
+        return 200, {"id": REPOSITORY, "sha": self.head(), "private": self.private, "xetEnabled": False}
 
     def modes(self, body: bytes) -> tuple[int, object]:
+        self.before_transfer()
         return 200, {"files": [self._mode(file["path"]) for file in json.loads(body)["files"]]}
 
     def _mode(self, path: str) -> dict[str, Any]:
-        large = path.endswith(LARGE) or "tfrecord" in path
+        large = is_large(path)
         mode = {"path": path, "uploadMode": "lfs" if large else "regular", "shouldIgnore": False}
         if path in self.files:
             content = self.files[path]
-            blob = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
-            mode["oid"] = hashlib.sha256(content).hexdigest() if large else blob
+            mode["oid"] = hashlib.sha256(content).hexdigest() if large else git_oid(content)
         return mode
 
     def batch(self, body: bytes) -> tuple[int, object]:
@@ -135,8 +179,13 @@ class Hub:
         if self.failing:
             self.failing -= 1
             return 500, {"error": "out of order"}
-        for line in body.splitlines():
-            operation = json.loads(line)
+        self.before_commit()
+        operations = [json.loads(line) for line in body.splitlines()]
+        if operations[0]["value"].get("parentCommit", self.head()) != self.head():
+            return 412, {"error": "A commit has happened since. Please refresh and try again."}
+        if any(one["key"] == "lfsFile" and one["value"]["oid"] not in self.objects for one in operations):
+            return 400, {"error": "LFS pointer pointed to a file that does not exist"}
+        for operation in operations:
             value = operation["value"]
             if operation["key"] == "file":
                 self.files[value["path"]] = base64.b64decode(value["content"])
@@ -147,7 +196,7 @@ class Hub:
         self.commits += 1
         return 200, {
             "commitUrl": f"{self.endpoint}/datasets/{REPOSITORY}/commit/{self.commits}",
-            "commitOid": f"{self.commits:040x}",
+            "commitOid": self.head(),
         }
 
     def tag(self, body: bytes) -> tuple[int, object]:
@@ -161,10 +210,21 @@ class Hub:
         return 200, {}
 
 
+def is_large(path: str) -> bool:
+    """Whether the hub keeps the file outside of git."""
+    return path.endswith(LARGE) or "tfrecord" in path
+
+
+def git_oid(content: bytes) -> str:
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+
+
 ROUTES: dict[str, Callable[..., tuple[int, object]]] = {
     "POST /api/repos/create": Hub.create,
     "POST /api/validate-yaml": Hub.validate,
-    f"GET /api/datasets/{REPOSITORY}/tree/main": Hub.tree,
+    "GET /api/whoami-v2": Hub.whoami,
+    f"GET /api/datasets/{REPOSITORY}/tree/([^/]+)": Hub.tree,
+    f"(?:GET|HEAD) /datasets/{REPOSITORY}/resolve/([^/]+)/(.+)": Hub.resolve,
     f"GET /api/datasets/{REPOSITORY}(?:/revision/main)?": Hub.info,
     f"POST /api/datasets/{REPOSITORY}/preupload/main": Hub.modes,
     f"POST /datasets/{REPOSITORY}.git/info/lfs/objects/batch": Hub.batch,

@@ -12,7 +12,7 @@ from conftest import IN_SCRIPTS, REPOSITORY, in_a_clone
 from pipeline.errors import PipelineError
 from pipeline.publish_config import PublishConfig
 
-CONFIG = {
+CONFIG: dict[str, object] = {
     "name": "tiny",
     "demos": {"tasks": ["libero_goal/turn_on_the_stove"]},
     "plan": {"episodes": {"camera": 1}},

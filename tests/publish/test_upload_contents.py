@@ -90,6 +90,52 @@ def folder_elsewhere(data: Path) -> None:
     (data / "lerobot" / NAME / "more").symlink_to(data / "rlds")
 
 
+def key_in_card(data: Path) -> None:
+    (data / "card" / "lerobot" / ".env").write_text("HF_TOKEN=secret")
+
+
+def key_in_finetune(data: Path) -> None:
+    (data / "finetune" / "wandb_key.json").write_text("secret")
+
+
+def repository_in_card(data: Path) -> None:
+    (data / "card" / "lerobot" / ".git").mkdir()
+    (data / "card" / "lerobot" / ".git" / "config").write_text("secret")
+
+
+def link_in_card(data: Path) -> None:
+    (data.parent / "id_rsa").write_text("secret")
+    (data / "card" / "lerobot" / "pictures" / "key.png").symlink_to(data.parent / "id_rsa")
+
+
+def picture_elsewhere(data: Path) -> None:
+    picture = data / "card" / "lerobot" / "pictures" / "camera.png"
+    picture.rename(data.parent / "camera.png")
+    picture.symlink_to(data.parent / "camera.png")
+
+
+def folder_in_finetune(data: Path) -> None:
+    (data / "finetune" / "assets").symlink_to(data.parent)
+
+
+def edited_card(data: Path) -> None:
+    with (data / "card" / "lerobot" / "README.md").open("a") as card:
+        card.write("mine")
+
+
+def edited_recipe(data: Path) -> None:
+    (data / "finetune" / "finetune.yaml").write_text("mine: {}")
+
+
+def report_exchanged(data: Path) -> None:
+    (data / "leakage.json").write_text("{}")
+
+
+def report_elsewhere(data: Path) -> None:
+    (data / "leakage.json").rename(data.parent / "leakage.json")
+    (data / "leakage.json").symlink_to(data.parent / "leakage.json")
+
+
 def incomplete(data: Path) -> None:
     next((data / "lerobot" / NAME / "videos").rglob("*.mp4")).unlink()
 
@@ -112,6 +158,16 @@ def rotten(data: Path) -> None:
         (hidden, r"not of the dataset.*\.cache/note"),
         (elsewhere, r"1 that lie elsewhere, such as tiny/meta/stats\.json"),
         (folder_elsewhere, "such as tiny/more"),
+        (key_in_card, r"card: 1 files are not as they were generated: lerobot/\.env \(added\)"),
+        (key_in_finetune, r"finetune: .*: wandb_key\.json \(added\)"),
+        (repository_in_card, r"lerobot/\.git/config \(added\)"),
+        (link_in_card, r"lerobot/pictures/key\.png \(a link\)"),
+        (picture_elsewhere, r"lerobot/pictures/camera\.png \(a link\)"),
+        (folder_in_finetune, r"finetune: .*: assets \(a link\)"),
+        (edited_card, r"lerobot/README\.md \(changed\)"),
+        (edited_recipe, r"finetune\.yaml \(changed\)"),
+        (report_exchanged, r"leakage\.json: is a link, or has changed"),
+        (report_elsewhere, r"leakage\.json: is a link, or has changed"),
         (incomplete, r"lacks 1 files, such as tiny/videos/.*\.mp4"),
     ],
 )
@@ -120,6 +176,11 @@ def test_refuses(data: Path, spoil: Callable[[Path], None], complaint: str) -> N
     spoil(data)
     with pytest.raises(PipelineError, match=complaint):
         prepare(data, "lerobot")
+
+
+def test_files_beside_the_card_of_another_format_stop_nothing(data: Path) -> None:
+    (data / "card" / "rlds" / "notes.txt").write_text("mine")
+    assert "notes.txt" not in prepare(data, "lerobot").files
 
 
 def test_passes_by_the_statistics_that_openvla_oft_leaves_in_rlds(data: Path) -> None:

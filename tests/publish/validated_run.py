@@ -8,12 +8,15 @@ import pyarrow.parquet as pq
 from synthetic import write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.export_config import ExportConfig, LeRobotConfig, LeRobotV21Config, RldsConfig
+from pipeline.files import checksum
 from pipeline.formats.registry import formats_of
+from pipeline.generated import generated
 from pipeline.publish import push
 from pipeline.publish.card import REPORTS
 from pipeline.publish.push import Upload
 
 NAME = "tiny"
+RUN = "tiny_run"
 
 
 def prepare(data: Path, kind: str) -> Upload:
@@ -22,7 +25,7 @@ def prepare(data: Path, kind: str) -> Upload:
         lerobot=LeRobotConfig(name=NAME, shards=3),
         lerobot_v21=LeRobotV21Config(name="synthetic", convention="ipec"),
     )
-    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind))
+    return push.prepare(next(target for target in formats_of(data, options) if target.name == kind), RUN)
 
 
 def write_run(data: Path) -> None:
@@ -31,12 +34,19 @@ def write_run(data: Path) -> None:
     write_lerobot(data, name=NAME)
     write_lerobot_v21(data)
     pq.write_table(pa.Table.from_pylist([{"kept": True}, {"kept": False}]), data / "manifest.parquet")
-    (data / "finetune" / "__pycache__").mkdir(parents=True)
-    (data / "finetune" / "finetune.yaml").write_text("recipe: {}\n")
+    with generated(data / "finetune") as finetune:
+        (finetune / "finetune.yaml").write_text("recipe: {}\n")
+    (data / "finetune" / "__pycache__").mkdir()
     (data / "finetune" / "__pycache__" / "run.pyc").write_bytes(b"compiled")
     for name in REPORTS:
         (data / name).write_text(json.dumps({"counts": {"checked": 6, "findings": []}}))
-    for kind in ("rlds", "lerobot", "lerobot_v21"):
-        (data / "card" / kind / "pictures").mkdir(parents=True)
-        (data / "card" / kind / "README.md").write_text(f"---\nlicense: mit\n---\n{kind}: hf download OWNER/NAME\n")
-        (data / "card" / kind / "pictures" / "camera.png").write_bytes(b"picture")
+    write_card(data)
+
+
+def write_card(data: Path) -> None:
+    made_from = {name: checksum(data / name) for name in ("manifest.parquet", *REPORTS)}
+    with generated(data / "card", made_from) as card:
+        for kind in ("rlds", "lerobot", "lerobot_v21"):
+            (card / kind / "pictures").mkdir(parents=True)
+            (card / kind / "README.md").write_text(f"---\nlicense: mit\n---\n{kind}: hf download OWNER/NAME\n")
+            (card / kind / "pictures" / "camera.png").write_bytes(b"picture")
