@@ -355,7 +355,7 @@ def test_the_command_says_all_of_it_and_sends_it_when_asked(hub: Hub, data: Path
 
     told = push()
     assert told.returncode == 0, told.stderr
-    assert hub.private is None
+    assert hub.files == {}
     lines = told.stdout.splitlines()
     assert lines[0] == f"run {data.name}, format lerobot"
     outside = lines[lines.index("outside the dataset:") + 1 : -3]
