@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from pipeline import origins
 from pipeline.axes import AXES, Axes, Axis, axes_of, components_of
 from pipeline.axes.base import Frozen
 from pipeline.axes.language import load_bank
@@ -302,6 +303,7 @@ def load(path: Path) -> Config:
     Raises:
         PipelineError: naming the file, every field that is wrong, and what would have worked.
     """
+    origins.check_module("libero")  # Tasks are looked up in its list.
     try:
         return Config.model_validate(yaml.load(path.read_text(encoding="utf-8"), StrictLoader))
     except (OSError, UnicodeDecodeError) as error:

@@ -20,6 +20,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Literal
 
+from pipeline import origins
 from pipeline.errors import PipelineError
 from pipeline.machine_code import fixed_machine_code
 from pipeline.seeding import digest
@@ -111,7 +112,8 @@ def fingerprint(step: Step, *settings: object) -> str:
         settings: JSON-serialisable, what else the bytes depend on.
 
     Raises:
-        PipelineError: when NumPy computes with other machine code than is fixed.
+        PipelineError: when NumPy computes with other machine code than is fixed, or a clone is imported in place of
+            a package.
     """
     return digest(_parts(step), *settings)[:16]
 
@@ -157,6 +159,7 @@ def refuse_unasked(found: Counter[str], where: Path, allow: str = ALLOW) -> None
 
 @cache
 def _parts(step: Step) -> tuple[dict[str, int], dict[str, str], str]:
+    origins.check()
     steps = (*AFTER.get(step, ()), step)
     packages = {name: version(name) for each in steps for name in PACKAGES.get(each, ())}
     return {each: RECIPES[each] for each in steps}, packages, fixed_machine_code()

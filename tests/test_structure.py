@@ -46,6 +46,7 @@ FLOORS = (
     "rotations",
     "types",
     "exit_status",
+    "origins",
     "machine_code",
     "errors",
 )

@@ -10,10 +10,9 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
+from pipeline import origins
 from pipeline.errors import PipelineError
-
-REINSTALL = "rm -rf .venv && bash setup.sh"
-"""What brings back all packages as they are pinned; to install one again by pip may change the others."""
+from pipeline.origins import REINSTALL
 
 # Elements that make MuJoCo open or run something by a name of the document's choosing.
 _REFUSED = {"include", "model", "attach", "plugin", "extension"}
@@ -27,8 +26,10 @@ def package_folder(package: str) -> Path:
     """The folder of an installed package; the package is not imported.
 
     Raises:
-        PipelineError: when it is not installed.
+        PipelineError: when it is not installed, or a clone would be imported in its place.
     """
+    if package in origins.DISTRIBUTIONS:
+        origins.check_module(package)
     spec = find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         raise PipelineError(f"the package {package} is not installed", remedy=REINSTALL)

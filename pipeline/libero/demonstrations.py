@@ -18,8 +18,9 @@ import yaml
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
-from pipeline.libero.assets import REINSTALL, package_folder, relocate
+from pipeline.libero.assets import package_folder, relocate
 from pipeline.libero.tasks import SUITES, find_task, suites, tasks
+from pipeline.origins import REINSTALL
 from pipeline.types import Demo, Floats, Task
 
 LARGEST_STATE = 1e10

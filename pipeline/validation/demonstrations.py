@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from glob import glob
 from pathlib import Path
 
+from pipeline import origins
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
@@ -45,8 +46,9 @@ def check(root: Path, replays: int, run: Workers) -> Found:
         run: spreads the work; one call for each file.
 
     Raises:
-        PipelineError: when there is no file.
+        PipelineError: when there is no file, or a clone is imported in place of a package.
     """
+    origins.check()
     files = [root / name for name in sorted(glob("**/*.hdf5", root_dir=root, recursive=True))]
     if not files:
         raise PipelineError("there is no HDF5 file", where=root, expected=LAYOUT)

