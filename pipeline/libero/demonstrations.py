@@ -19,7 +19,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.assets import package_folder, relocate
-from pipeline.libero.tasks import SUITES, find_task, suites, tasks
+from pipeline.libero.tasks import SUITES, base_of_test, find_task, suites, tasks
 from pipeline.origins import REINSTALL
 from pipeline.types import Demo, Floats, Task
 
@@ -207,6 +207,13 @@ class HDF5Source:
             # Of the places that name the task, only this one was corrected for publication; the tasks' earlier names
             # stay in env_args. A name that no task has counts as one of those.
             recorded = PurePosixPath(hdf5.text(data, "bddl_file_name", f"{path} data")).stem
+            if base_of_test(recorded):
+                raise PipelineError(
+                    f"recorded in the test task {recorded!r} of LIBERO-Plus (bddl_file_name)",
+                    where=path,
+                    expected="recordings in scenes that the benchmark does not test",
+                    remedy="leave it out of demos.tasks: a policy that is trained on it cannot be tested",
+                )
             if recorded != task.name and any(recorded == other.name for suite in suites() for other in tasks(suite)):
                 raise PipelineError(
                     f"named after one task but recorded for another, {recorded!r} (bddl_file_name)",

@@ -23,6 +23,12 @@ _OF_FILES = ("scene", "suite", "libero", "bddl", "benchmark", "hdf", "demo")
 _DEBRIS = re.compile(rf"[_\d/\\]|\b({'|'.join(_OF_FILES)})\b", re.IGNORECASE)
 WITHOUT_DEBRIS = f"an instruction without digits, _, /, \\ and the words {', '.join(_OF_FILES)}, as of a file's name"
 
+_TESTED = re.compile(
+    r"(?P<base>.+?)(?:_language_\d+|_view(?:_\d+){5}_initstate_\d+|_noise_\d+|_table_\d+|_tb_\d+|_light_\d+|_add_\d+"
+    r"|(?:_moved)?_level\d_sample\d)+"
+)
+"""Names of LIBERO-Plus's test tasks: that of a LIBERO task, and what is changed."""
+
 OWN = Path("tasks")
 """Tasks of one's own: ``<suite>/<task>.bddl`` below this folder of the one that a run is started in, as workers are."""
 
@@ -61,20 +67,47 @@ def tasks(suite: str) -> tuple[Task, ...]:
     files = sorted((OWN / suite).absolute().glob("*.bddl"))
     own = tuple(Task(suite, file.stem, bddl.read(file).language, file) for file in files)
     for task in own:
-        if found := debris(task.instruction):
-            raise PipelineError(
-                f"the instruction {task.instruction!r} has {found!r}",
-                where=task.bddl_file,
-                expected=WITHOUT_DEBRIS,
-                remedy="write numbers as words, and others in place of these, in (:language ...)",
-            )
+        _reject_unusable(task)
     return own
+
+
+def _reject_unusable(task: Task) -> None:
+    """Check the name and the instruction of a task of one's own.
+
+    Raises:
+        PipelineError: when the name is that of a test task, or the instruction is empty or has debris.
+    """
+    if base := base_of_test(task.name):
+        raise PipelineError(
+            f"is called as a test task of LIBERO-Plus, which perturbs {base}",
+            where=task.bddl_file,
+            expected="a task that the benchmark does not test",
+            remedy="leave test tasks out of the suite: a policy that is trained on them cannot be tested",
+        )
+    if not task.instruction.strip():
+        raise PipelineError(
+            "the instruction is empty", where=task.bddl_file, expected="(:language <a sentence>)", remedy="write one"
+        )
+    if found := debris(task.instruction):
+        raise PipelineError(
+            f"the instruction {task.instruction!r} has {found!r}",
+            where=task.bddl_file,
+            expected=WITHOUT_DEBRIS,
+            remedy="write numbers as words, and others in place of these, in (:language ...)",
+        )
 
 
 def debris(instruction: str) -> str | None:
     """What an instruction has only when it was made from a file's name; None where there is nothing."""
     found = _DEBRIS.search(instruction)
     return found and found[0]
+
+
+def base_of_test(name: str) -> str | None:
+    """The LIBERO task that a test task of LIBERO-Plus perturbs, by the test task's name; `None` for other names."""
+    match = _TESTED.fullmatch(name)
+    known = match is not None and any(match["base"] in _names()[suite] for suite in SUITES)
+    return match["base"] if match and known else None
 
 
 @cache

@@ -28,6 +28,7 @@ from pipeline.libero.demonstrations import DemoEntry
 from pipeline.seeding import digest, rng
 from pipeline.tables import read_table, write_table
 from pipeline.testset.benchmark import TestSet
+from pipeline.testset.own_tasks import reject_test_tasks
 from pipeline.types import Task
 
 _ATTEMPTS = 100
@@ -76,9 +77,11 @@ def make(demos: Sequence[DemoEntry], plan: PlanConfig, replay: ReplayConfig, tes
     perturbs one axis at a time, but so must each part of a combination keep clear.
 
     Raises:
-        PipelineError: when there is nothing to plan from for an axis, or a level of it has no draw that keeps clear.
+        PipelineError: when there is nothing to plan from for an axis, or a level of it has no draw that keeps clear, or
+            a task of one's own is a test task.
     """
     by_task = grouped((demo.task, demo) for demo in demos)
+    reject_test_tasks(by_task)
     rows = [row for group in by_task.values() for row in twins(group, plan.seed, replay)]
     for name, episodes in plan.episodes.items():
         draws = Draws(name, plan.drawn_from(name), plan.seed, test)
