@@ -77,7 +77,10 @@ def relocate(xml: str, where: str) -> str:
     try:
         root = ET.fromstring(xml)
     except (ET.ParseError, ValueError) as error:
-        raise refuse(f"the model is not XML ({error})", "download the demonstration again") from error
+        raise refuse(
+            f"the model is not XML ({error})",
+            "compare the file with the one that it was copied from, and copy or download it again into another folder",
+        ) from error
     if root.tag != "mujoco":
         raise refuse(f"the model is a <{root.tag}>, not a <mujoco>")
     for element in root.iter():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -19,12 +19,16 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.libero.assets import package_folder, relocate
+from pipeline.libero.recorder import reject_other_rate, reject_other_settings
 from pipeline.libero.tasks import SUITES, base_of_test, find_task, suites, tasks
 from pipeline.origins import REINSTALL
 from pipeline.types import Demo, Floats, Task
 
 LARGEST_STATE = 1e10
 """MuJoCo calls a simulation unstable when a position or a velocity passes this (``mjMAXVAL`` in ``mjmodel.h``)."""
+
+ROUNDING = 1e-6
+"""What a number may miss by that was stored in single precision."""
 
 HUMAN, EXPANDED = "human", "expanded"
 """Who made a demonstration."""
@@ -69,10 +73,15 @@ class Problem(NamedTuple):
 
 
 class DemoIndex(NamedTuple):
-    """What a source holds. Every entry was read and checked once, so it can be loaded."""
+    """What a source holds. Every entry was read and checked once, so it can be loaded.
+
+    Attributes:
+        notes: what is used otherwise than its author may expect, by file.
+    """
 
     entries: list[DemoEntry]
     problems: list[Problem]
+    notes: tuple[str, ...] = ()
 
 
 class DemoSource(Protocol):
@@ -140,9 +149,10 @@ class HDF5Source:
         wanted, entries = list(wanted), []
         suites_of_them = dict.fromkeys(task.suite for task in wanted)
         problems = [stray for suite in suites_of_them for stray in self._files_of_no_task(suite)]
+        notes: list[str] = []
         first_with: dict[str, DemoEntry] = {}
         for task in wanted:
-            usable = 0
+            usable, clipped = 0, {}
             try:
                 with self._data(task) as data:
                     for key in hdf5.names(data, str(self._path(task))):
@@ -155,15 +165,18 @@ class HDF5Source:
                                 raise PipelineError(
                                     f"holds the same actions, states and model as {first.demo_id}",
                                     where=f"{self._path(task)} data/{key}",
-                                    remedy="delete one of the two",
+                                    remedy="nothing has to be done: of two copies a run uses the first",
                                 )
                             entries.append(entry)
                             usable += 1
+                            if outside := _outside(data, key, str(self._path(task))):
+                                clipped[key] = outside
                         except PipelineError as error:
                             problems.append(Problem(f"{task}/{key}", error))
+                notes += self._notes(task, clipped)
             except PipelineError as error:
                 problems.append(Problem(str(task), error))
-        return DemoIndex(entries, problems)
+        return DemoIndex(entries, problems, tuple(notes))
 
     def load(self, demo_id: str) -> Demo:
         task, key = _parse(demo_id)
@@ -220,7 +233,24 @@ class HDF5Source:
                     where=path,
                     remedy=f"rename it to {recorded}_demo.hdf5",
                 )
+            reject_other_settings(data, f"{path} data")
             yield data
+
+    def _notes(self, task: Task, clipped: Mapping[str, int]) -> Iterator[str]:
+        """What is used otherwise of a task's file.
+
+        Args:
+            clipped: demonstration to the number of its actions that are limited to [-1, 1].
+        """
+        path = self._path(task)
+        with hdf5.opened(path) as file:
+            if masks := hdf5.masks(file):
+                yield f"{path}: mask/ ({', '.join(masks)}) is ignored: all demonstrations of data/ are used"
+        if clipped:
+            yield (
+                f"{path}: {sum(clipped.values())} actions of {len(clipped)} demonstrations are limited to [-1, 1], as "
+                f"robosuite does when it executes them, such as of {next(iter(clipped))}"
+            )
 
     def _read(self, task: Task, key: str, data: h5py.Group) -> Demo:
         path = self._path(task)
@@ -230,13 +260,14 @@ class HDF5Source:
         group = hdf5.member(data, key, h5py.Group, where)
         actions, states = hdf5.array(group, "actions", where), hdf5.array(group, "states", where)
         init_state = hdf5.numbers(group, "init_state", where)
-        if len(states) != len(actions) or not (init_state is None or np.array_equal(init_state, states[0])):
+        if len(states) != len(actions) or not (init_state is None or _same_state(init_state, states[0])):
             raise PipelineError(
                 f"actions {actions.shape}, states {states.shape} and the attribute init_state do not agree",
                 where=where,
                 expected="one state for each action, the first of them equal to init_state",
-                remedy=hdf5.DOWNLOAD_AGAIN,
+                remedy=hdf5.AS_RECORDED,
             )
+        reject_other_rate(states, where)
         # Named within the set, not on this machine: provenance must not change from machine to machine.
         source = f"{task.suite}/{path.name} {key}"
         origin = EXPANDED if hdf5.EXPANDED_FROM in group.attrs else HUMAN
@@ -272,20 +303,19 @@ class _Recorded(NamedTuple):
             fault = f"states have shape {states.shape}"
         elif not (np.isfinite(actions).all() and np.isfinite(states).all()):
             fault = "actions or states hold NaN or infinity"
-        elif np.abs(actions).max() > 1 + 1e-6:
-            fault = f"actions reach {np.abs(actions).max():.6g}"
         elif np.abs(states).max() > LARGEST_STATE:
             fault = f"states reach {np.abs(states).max():.6g}"
         if fault:
-            expected = f"actions (T, 7) in [-1, 1] and states (T, S), all finite and none beyond {LARGEST_STATE:.0e}"
-            raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.DOWNLOAD_AGAIN)
+            expected = f"actions (T, 7) and states (T, S), all finite and no state beyond {LARGEST_STATE:.0e}"
+            raise PipelineError(fault, where=where, expected=expected, remedy=hdf5.AS_RECORDED)
         told = SCHEMA.action.gripper
-        if other := told.others(actions[:, 6]):
+        executed = _as_executed(actions)
+        if other := told.others(executed[:, 6]):
             raise PipelineError(
                 f"the gripper is told {min(other):g}",
                 where=where,
                 expected=f"{told.open:g} (open) or {told.close:g} (close) as the last number of each action",
-                remedy="set each to the nearer of the two, or delete the demonstration",
+                remedy="set each to the nearer of the two in a copy of the file",
             )
         # Hash the model as recorded: relocated, it would differ from machine to machine.
         content = hashlib.sha256()
@@ -297,7 +327,28 @@ class _Recorded(NamedTuple):
             content.update(self.task.bddl_file.read_bytes())
         model_xml = None if self.model_file is None else relocate(self.model_file, where=f"{where} model_file")
         whole = states if len(states) == len(actions) else None
-        return Demo(*self[:4], content.hexdigest(), actions, states[0].copy(), whole, model_xml)
+        return Demo(*self[:4], content.hexdigest(), executed, states[0].copy(), whole, model_xml)
+
+
+def _outside(data: h5py.Group, key: str, where: str) -> int:
+    """How many actions of a demonstration robosuite limits."""
+    actions = hdf5.array(data[key], "actions", where)
+    return int((np.abs(actions).max(axis=1) > 1 + ROUNDING).sum())
+
+
+def _as_executed(actions: Floats) -> Floats:
+    """Actions (T, 7) as robosuite executes them: limited to [-1, 1], and a gripper's command that rounding left within
+    ``ROUNDING`` of one of the two is that one."""
+    executed = np.clip(actions, -1.0, 1.0)
+    gripper, nearest = executed[:, 6], np.sign(executed[:, 6])
+    executed[:, 6] = np.where(np.abs(gripper - nearest) <= ROUNDING, nearest, gripper)
+    return executed
+
+
+def _same_state(one: Floats, other: Floats) -> bool:
+    """Whether two states (S,) are equal in single precision, which recorders that save space store them in."""
+    with np.errstate(over="ignore"):
+        return np.array_equal(one.astype(np.float32), other.astype(np.float32))
 
 
 def _parse(demo_id: str) -> tuple[Task, str]:

@@ -17,7 +17,28 @@ from pipeline.files import replaced
 from pipeline.libero.assets import package_folder
 from pipeline.types import Floats, Task
 
-DOWNLOAD_AGAIN = "delete the file and download it again; the starter set needs no download"
+GET_AGAIN = (
+    "compare the file with its source, and copy or download it again into another folder; the starter set needs no file"
+)
+"""What may help where a file is not as it was written. It may be its owner's only copy: nothing says to delete it."""
+
+AS_RECORDED = (
+    "write it as LIBERO's create_dataset.py does, into a new file; or leave it as it is: a run does without it, if its "
+    "task has another demonstration"
+)
+"""What may help where a file is whole, but its content has another form."""
+
+_REPACK = (
+    "write a copy without compression, `h5repack -f NONE FILE COPY` (package hdf5-tools), where the filter's plugin is "
+    "installed: HDF5 has filters such as blosc not built in"
+)
+REMEDIES = {
+    "consistency flags": "copy the file, and clear the mark in the copy by `h5clear -s COPY` (package hdf5-tools): its "
+    "recorder was killed while the file was open",
+    "plugin": _REPACK,
+    "filter": _REPACK,
+}
+"""Words of HDF5's own messages to what helps."""
 
 EXPANDED_FROM = "expanded_from"
 """Attribute of a demonstration that was made from another: that one's id."""
@@ -33,8 +54,9 @@ def _undamaged(where: str) -> Iterator[None]:
     try:
         yield
     except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
+        remedy = next((help for words, help in REMEDIES.items() if words in str(error)), GET_AGAIN)
         raise PipelineError(
-            f"not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=DOWNLOAD_AGAIN
+            f"not readable as HDF5 ({error})", where=where, expected="a whole HDF5 file", remedy=remedy
         ) from error
 
 
@@ -69,7 +91,7 @@ def member(group: h5py.Group, name: str, kind: type[_Node], where: str) -> _Node
         node = group[name] if isinstance(link, h5py.HardLink) else link
     if not isinstance(node, kind):
         what = "missing" if node is None else f"a {type(node).__name__}"
-        raise PipelineError(f"{name!r} is {what}", where=where, expected=f"a {kind.__name__}", remedy=DOWNLOAD_AGAIN)
+        raise PipelineError(f"{name!r} is {what}", where=where, expected=f"a {kind.__name__}", remedy=AS_RECORDED)
     return node
 
 
@@ -78,13 +100,13 @@ def array(group: h5py.Group, name: str, where: str) -> Floats:
     dataset = member(group, name, h5py.Dataset, where)
     with _undamaged(where):
         if dataset.external or dataset.is_virtual:
-            raise PipelineError(f"{name!r} takes its numbers from another file", where=where, remedy=DOWNLOAD_AGAIN)
+            raise PipelineError(f"{name!r} takes its numbers from another file", where=where, remedy=AS_RECORDED)
         if dataset.dtype.kind != "f" or dataset.ndim != 2 or not 0 < dataset.size <= _MAX_NUMBERS:
             raise PipelineError(
                 f"{name!r} holds {dataset.dtype} of shape {dataset.shape}",
                 where=where,
                 expected="floating-point numbers of shape (T, N)",
-                remedy=DOWNLOAD_AGAIN,
+                remedy=AS_RECORDED,
             )
         return np.asarray(dataset[()], np.float64)
 
@@ -93,6 +115,11 @@ def numbers(group: h5py.Group, name: str, where: str) -> Floats | None:
     """A group's attribute as floating-point numbers, None when there is none."""
     with _undamaged(where):
         return np.asarray(group.attrs[name], np.float64) if name in group.attrs else None
+
+
+def masks(file: h5py.File) -> list[str]:
+    """The names of robomimic's lists of demonstrations, such as ``train``, which are not read."""
+    return names(file["mask"], str(file.filename)) if isinstance(file.get("mask"), h5py.Group) else []
 
 
 def text(group: h5py.Group, name: str, where: str) -> str:
@@ -110,7 +137,7 @@ def text(group: h5py.Group, name: str, where: str) -> str:
         )
     # h5py reads bytes that are not UTF-8 as lone surrogates, which nothing can encode again.
     if not value.isascii() and any("\ud800" <= character <= "\udfff" for character in value):
-        raise PipelineError(f"attribute {name!r} is not UTF-8", where=where, remedy=DOWNLOAD_AGAIN)
+        raise PipelineError(f"attribute {name!r} is not UTF-8", where=where, remedy=AS_RECORDED)
     return value
 
 

@@ -58,6 +58,7 @@ def recording(model_file: str, steps: int = 12, seed: int = 0) -> hdf5.Recording
     start = StarterSource().load(demo.demo_id)
     rng = np.random.default_rng(seed)
     states = start.init_state + np.cumsum(rng.normal(scale=0.01, size=(steps, len(start.init_state))), axis=0)
+    states[:, 0] = start.init_state[0] + 0.05 * np.arange(steps)
     pose = np.zeros((steps, 9))
     images = rng.integers(0, 256, (steps, 8, 8, 3), dtype=np.uint8)
     return hdf5.Recording(
