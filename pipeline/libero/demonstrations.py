@@ -18,6 +18,7 @@ import yaml
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
+from pipeline.libero.aliases import as_defined
 from pipeline.libero.assets import package_folder, relocate
 from pipeline.libero.recorder import reject_other_rate, reject_other_settings
 from pipeline.libero.tasks import SUITES, base_of_test, find_task, suites, tasks
@@ -325,7 +326,9 @@ class _Recorded(NamedTuple):
         content.update((self.model_file or "").encode())
         if self.task.suite not in SUITES:  # LIBERO's own tasks change with its package only.
             content.update(self.task.bddl_file.read_bytes())
-        model_xml = None if self.model_file is None else relocate(self.model_file, where=f"{where} model_file")
+        model_xml = None
+        if self.model_file is not None:
+            model_xml = as_defined(relocate(self.model_file, where=f"{where} model_file"), self.task)
         whole = states if len(states) == len(actions) else None
         return Demo(*self[:4], content.hexdigest(), executed, states[0].copy(), whole, model_xml)
 

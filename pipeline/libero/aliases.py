@@ -1,0 +1,44 @@
+"""Objects that LIBERO called otherwise when its demonstrations were recorded than its BDDL files do now."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping
+
+from pipeline.libero import bddl
+from pipeline.types import Task
+
+RECORDED_AS = {"new_salad_dressing": "salad_dressing"}
+"""Category in BDDL files to the category in recordings, of LIBERO-90's LIVING_ROOM_SCENE4."""
+
+
+def as_defined(model_xml: str, task: Task) -> str:
+    """Name the objects of a recorded scene as the task's BDDL file does: ``new_salad_dressing_1`` instead of
+    ``salad_dressing_1``. Files of assets keep their names. A scene without such an object is returned as it is."""
+    renamed = {old: new for old, new in _recorded_names(task).items() if f'"{old}_main"' in model_xml}
+    if not renamed:
+        return model_xml
+    root = ET.fromstring(model_xml)
+    for element in root.iter():
+        for attribute, value in element.items():
+            if not attribute.startswith("file"):
+                element.set(attribute, _renamed(value, renamed))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _recorded_names(task: Task) -> dict[str, str]:
+    """Name of an object in recordings to its name in the task's BDDL file, where the two differ."""
+    objects = bddl.read(task.bddl_file).objects
+    names = {}
+    for name, category in objects.items():
+        if category in RECORDED_AS:
+            recorded = RECORDED_AS[category] + name.removeprefix(category)
+            if recorded not in objects:
+                names[recorded] = name
+    return names
+
+
+def _renamed(value: str, names: Mapping[str, str]) -> str:
+    """A name in MJCF, which begins with that of its object."""
+    for old, new in names.items():
+        if f"{value}_".startswith(f"{old}_"):
+            return new + value.removeprefix(old)
+    return value
