@@ -227,7 +227,7 @@ def read(path: Path) -> Bddl:
         PipelineError: when it cannot be read or does not define a task.
     """
     try:
-        return parse(path.read_text(), path)
+        return parse(path.read_text(encoding="utf-8"), path)
     except (OSError, UnicodeDecodeError) as error:
         raise PipelineError(f"cannot be read ({error})", where=path, expected="a BDDL file") from error
 
@@ -239,8 +239,23 @@ def parse(text: str, where: object) -> Bddl:
         PipelineError: when it does not define a task.
     """
     expected = "a BDDL problem with :language, :objects, :init and :goal"
+    if text.startswith("\ufeff"):
+        raise PipelineError(
+            "begins with a byte order mark (BOM), which LIBERO cannot read",
+            where=where,
+            expected=expected,
+            remedy="save the file as UTF-8 without BOM",
+        )
     try:
-        _, (_, problem), *rest = scan_tokens(string=text)
+        tokens = scan_tokens(string=text)
+        if section := _section_with_empty(tokens):
+            raise PipelineError(
+                f"has empty parentheses `()` in {section}",
+                where=where,
+                expected=expected,
+                remedy="remove them; a section without content is written as `(:fixtures)`",
+            )
+        _, (_, problem), *rest = tokens
         sections: dict[str, Any] = {name: content for name, *content in rest}
         return Bddl(
             problem=problem,
@@ -252,6 +267,8 @@ def parse(text: str, where: object) -> Bddl:
             start=tuple(map(_fact, sections[":init"])),
             goal=tuple(map(_fact, goal[1:] if (goal := sections[":goal"][0])[0] == "and" else [goal])),
         )
+    except PipelineError:
+        raise
     except KeyError as error:
         raise PipelineError(f"has no {error.args[0]}", where=where, expected=expected) from error
     except Exception as error:  # the tokeniser raises nothing more specific
@@ -286,6 +303,18 @@ def arena(problem: str) -> Arena:
             expected=f"libero_<arena>_[tabletop_]manipulation, <arena> being one of {', '.join(get_args(Arena))}",
         )
     return cast(Arena, match[1])
+
+
+def _section_with_empty(tokens: list[Any]) -> str | None:
+    """The first section of a BDDL file's expressions that has an empty one; `None` if none has."""
+    for section in tokens:
+        if isinstance(section, list) and (section == [] or _has_empty(section)):
+            return str(section[0]) if section and isinstance(section[0], str) else "the problem itself"
+    return None
+
+
+def _has_empty(expression: list[Any]) -> bool:
+    return any(isinstance(part, list) and (part == [] or _has_empty(part)) for part in expression)
 
 
 def _regions(listed: list[Any]) -> list[tuple[str, tuple[float, float]]]:

@@ -82,6 +82,33 @@ def test_what_defines_no_task_is_refused_by_name(text: str, fault: str, tmp_path
     assert "expected: a BDDL problem with" in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("section", "with_empty"),
+    [
+        (":obj_of_interest", "(:obj_of_interest ()"),
+        (":init", "(:init ()"),
+        (":regions", "(:regions ()"),
+        (":fixtures", "(:fixtures ()"),
+        ("the problem itself", "() (:goal"),
+    ],
+)
+def test_empty_parentheses_are_named_with_their_section(section: str, with_empty: str, tmp_path: Path) -> None:
+    file, text = tmp_path / "task.bddl", STOVE.bddl_file.read_text()
+    file.write_text(text.replace(with_empty.replace(" ()", "").removeprefix("() "), with_empty, 1))
+    assert file.read_text() != text
+    with pytest.raises(PipelineError, match=re.escape(f"has empty parentheses `()` in {section}")) as caught:
+        bddl.read(file)
+    assert str(file) in str(caught.value)
+
+
+def test_a_byte_order_mark_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "task.bddl"
+    file.write_bytes(b"\xef\xbb\xbf" + STOVE.bddl_file.read_bytes())
+    with pytest.raises(PipelineError, match="begins with a byte order mark") as caught:
+        bddl.read(file)
+    assert "without BOM" in str(caught.value)
+
+
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(PipelineError, match=r"gone\.bddl: cannot be read"):
         bddl.read(tmp_path / "gone.bddl")

@@ -59,3 +59,14 @@ def test_own_tasks_stand_beside_liberos(tmp_path: Path, monkeypatch: pytest.Monk
         with pytest.raises(PipelineError, match=f"a suite cannot be called '{name}'"):
             suites()
         shutil.rmtree(tmp_path / "tasks" / name)
+
+
+@pytest.mark.parametrize("language", ["", "  "])
+def test_an_own_task_without_an_instruction_is_rejected_when_it_is_read(
+    language: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = own_task(tmp_path / "tasks" / "my_suite", language)
+    with pytest.raises(PipelineError, match="the instruction is empty") as caught:
+        select_tasks(["my_suite/*"])
+    assert str(file) in str(caught.value)
