@@ -43,6 +43,18 @@ def normalise(text: str) -> str:
     return " ".join(re.sub(r"[^a-z0-9]+", " ", text.lower().replace("'", "")).split())
 
 
+def too_long(instruction: str) -> str | None:
+    """A warning for an instruction that SmolVLA and pi0 may cut; ``None`` for a shorter one."""
+    words_and_marks = len(instruction.split()) + len(_MARK.findall(instruction.lower()))
+    if words_and_marks <= MAX_WORDS_AND_MARKS and len(instruction) <= MAX_CHARACTERS:
+        return None
+    return (
+        f"the instruction has {words_and_marks} words and marks and {len(instruction)} characters: SmolVLA and pi0 "
+        f"read 48 tokens and cut the rest, which may happen beyond {MAX_WORDS_AND_MARKS} words and marks, or "
+        f"{MAX_CHARACTERS} characters"
+    )
+
+
 def lint(text: str, task: Task, component: Component) -> str | None:
     """The reason why ``text`` cannot replace the task's instruction; None when it can.
 

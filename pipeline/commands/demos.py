@@ -37,6 +37,7 @@ def add_commands(commands: Any) -> None:
         check,
         value("folder", "DIR", "folder with <suite>/<task>_demo.hdf5"),
         value("--replay", "N", replays, at_least_zero, default=2),
+        value("--config", "CONFIG", "configuration of the run that they are for; its replay settings are used"),
     )
 
 
@@ -85,17 +86,19 @@ def expand(arguments: argparse.Namespace) -> int:
 def check(arguments: argparse.Namespace) -> int:
     """open every file of a folder of demonstrations (HDF5), replay two of each, and name file and fault
 
-    Every demonstration is read and checked. Of each file two are also replayed as a run would, open-loop and, where
-    that misses the goal, tracked. A miss is a fault where all of a file miss, and else is listed. The last line is
-    JSON. Ends with 1 where there is a fault.
+    Every demonstration is read and checked. Of each file two are also replayed as the run of --config would, or by the
+    default settings: open-loop and, where that misses the goal, tracked. A miss is listed. If all of a file miss, each
+    is a fault, and other settings are tried. The last line is JSON. Ends with 1 where there is a fault.
     """
     from pipeline.compute.pool import runner
     from pipeline.compute_config import ComputeConfig
+    from pipeline.config import ReplayConfig, load
     from pipeline.validation.demonstrations import check
 
+    replay = load(arguments.config).replay if arguments.config else ReplayConfig()
     with runner(ComputeConfig(), arguments.folder) as run:
-        found = check(arguments.folder, arguments.replay, run)
-    for fault in found.faults:
-        print(fault)
+        found = check(arguments.folder, arguments.replay, run, replay)
+    for line in (*found.notes, *found.faults):
+        print(line)
     print(json.dumps(asdict(found)))
     return int(bool(found.faults))

