@@ -4,8 +4,8 @@ The goal is that of the BDDL file, the words for it are those of ``language_word
 thing and each place must be called by a word that nothing else in the scene shares, the relation is given by the words
 right before a place, and where two things go to different places, the first goes to the first. What LIBERO's own
 wording does not say by these words is not asked of a rewrite. So a goal that is left out is found, where things are
-named and where they are described. What is asked for beside it is not, such as a second goal or the opposite ("do
-not"), nor whether a description fits one thing only: writers check that.
+named and where they are described. A second goal is found by ``language_extra.py``. The opposite ("do not") is not
+found, nor whether a description fits one thing only: writers check that.
 """
 
 import re
@@ -54,10 +54,19 @@ class Thing(Frozen):
 
 
 class State(Frozen):
-    """How a state is asked for, and how its opposite is."""
+    """How a state is asked for, and how its opposite is.
+
+    Attributes:
+        asked: how it is asked for with the thing, for which ``IT`` stands, or a pronoun.
+        wished: how its result is wished for; ``THING`` stands for the thing without an article.
+        of: kinds that can be in the state.
+    """
 
     said: Entries
     opposite: Entries
+    asked: Entries
+    wished: Entries
+    of: Entries
 
 
 class Words(Frozen):
@@ -68,6 +77,11 @@ class Words(Frozen):
     relations: dict[str, Entries]
     states: dict[str, State]
     both: Entries
+    moves: Entries
+    sides: Entries
+    shelves: Entries
+    top: Entries
+    drawer: Entries
 
 
 @cache
@@ -114,12 +128,13 @@ class Mention(NamedTuple):
     """A word for a thing.
 
     Attributes:
-        at: where it begins.
+        at, end: where it begins and ends.
         kinds: those in the scene that share the word.
         relation: how something stands to it, by the words right before.
     """
 
     at: int
+    end: int
     kinds: tuple[str, ...]
     relation: str | None
 
@@ -147,12 +162,18 @@ class Reading:
             near = [
                 relation for start, end, relation in relations if start >= before and self._leads(end, match.start())
             ]
-            self.mentions.append(Mention(match.start(), kinds, near[-1] if near else None))
+            relation = near[-1] if near else None
+            if self.mentions and self.mentions[-1].relation == "between" and self._joins(before, match.start()):
+                relation = "between"
+            self.mentions.append(Mention(match.start(), match.end(), kinds, relation))
             before = match.end()
 
     def _leads(self, end: int, start: int) -> bool:
         between = self.plain[end:start]
         return end <= start and not re.search(r"[,.;:?!]", between) and len(between.split()) <= NEAR_WORDS
+
+    def _joins(self, end: int, start: int) -> bool:
+        return end <= start and re.fullmatch(r" and( \w+){0,3} ", self.plain[end:start]) is not None
 
     def has(self, patterns: Sequence[str]) -> bool:
         return pattern(tuple(patterns)).search(self.plain) is not None
@@ -167,6 +188,14 @@ class Reading:
         others = DRAWERS - {part} if part in DRAWERS and self.hints else {part}
         return self.has(words().parts[part]) or all(self.has(words().parts[other]) for other in others)
 
+    def tells_top(self, top: bool) -> bool:
+        """Whether it says on top of a shelf, or does not, as ``top`` demands: LIBERO says ``on`` of its boards too."""
+        return self.has(words().top) == top
+
+    def keeps_outside(self) -> bool:
+        """Whether it names no drawer, where things are called by their names and the top is meant."""
+        return self.hints or not self.has(words().drawer)
+
     def tells_state(self, state: str) -> bool:
         return self.has(words().states[state].said) and not self.has(words().states[state].opposite)
 
@@ -180,6 +209,13 @@ class Reading:
         if accepted & back:
             return WAYS.issuperset(unexplained)
         return bool(unexplained) and UNTOLD.issuperset(unexplained)
+
+    def starts(self, aim: Aim, accepted: frozenset[str], others: frozenset[str]) -> bool:
+        """Whether it says next to or between which things something starts: in so many words if things have names."""
+        if self.hints:
+            return self.relates(aim, accepted, others)
+        told = {mention.relation for mention in self.mentions if aim.place in mention.kinds}
+        return aim.relation in told | {relation for _, relation in self.back}
 
     def in_order(self, aims: Sequence[Aim]) -> bool:
         """Whether the places come in the order of the things that go there."""
@@ -234,6 +270,7 @@ def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
     for kind in dict.fromkeys([*kinds, *(change.thing for change in goal.changes)]):
         yield Demand(f"has no word for the {_name(kind)} alone", partial(Reading.tells, kind=kind, moved=moved))
     parts = [aim.part for aim in located] + [change.part for change in goal.changes]
+    parts += _sides(goal, original)
     for part in dict.fromkeys(part for part in parts if part):
         yield Demand(f"does not say which, {part}", partial(Reading.tells_part, part=part))
     for kind in goal.pairs:
@@ -243,11 +280,27 @@ def _of_goal(goal: TaskGoal, original: Reading) -> Iterator[Demand]:
             yield Demand(
                 f"does not keep the relation {aim.relation!r} to the {_name(aim.place)}", _relation(aim, goal, original)
             )
+            if aim.relation == "on" and not aim.part and aim.place in words().states["open"].of:
+                yield Demand(f"names the inside of the {_name(aim.place)}", Reading.keeps_outside)
+            if aim.place in words().shelves:
+                top = original.has(words().top)
+                yield Demand(_on_shelf(top), partial(Reading.tells_top, top=top))
     states = {change.state for change in goal.changes} | {*words().states} & {*original.plain.split()}
     for state in sorted(states):
         yield Demand(f"does not say to {state}", partial(Reading.tells_state, state=state))
     if len({aim.thing for aim in goal.aims}) > 1 and len({aim._replace(thing="") for aim in goal.aims}) > 1:
         yield Demand("lets the things change places", partial(Reading.in_order, aims=goal.aims))
+
+
+def _sides(goal: TaskGoal, original: Reading) -> list[str]:
+    """List the sides in LIBERO's wording, where no name tells a moved thing from the others of its kind or name."""
+    moved = frozenset(aim.thing for aim in goal.aims)
+    named = all(original.tells(kind, moved) for kind in moved) and not goal.pairs
+    return [] if named else [side for side in words().sides if side in original.plain.split()]
+
+
+def _on_shelf(top: bool) -> str:
+    return "does not say on top of the shelf" if top else "says on top of the shelf, which is another place"
 
 
 def _relation(aim: Aim, goal: TaskGoal, original: Reading) -> Callable[[Reading], bool]:
@@ -257,7 +310,10 @@ def _relation(aim: Aim, goal: TaskGoal, original: Reading) -> Callable[[Reading]
     worded = {one.relation for one in original.mentions if one.relation and aim.place in one.kinds} - others
     also = {"off"} if aim in goal.starts else worded
     others |= {"off"} if any(one.place == aim.place for one in goal.starts) else frozenset()
-    return partial(Reading.relates, aim=aim, accepted=frozenset({str(aim.relation), *also}), others=others)
+    accepted = frozenset({str(aim.relation), *also})
+    if aim in goal.starts and aim.relation in ("next to", "between"):
+        return partial(Reading.starts, aim=aim, accepted=accepted, others=others)
+    return partial(Reading.relates, aim=aim, accepted=accepted, others=others)
 
 
 def _name(kind: str) -> str:

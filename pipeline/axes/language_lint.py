@@ -3,6 +3,7 @@
 import re
 from typing import Literal, get_args
 
+from pipeline.axes.language_extra import extra_request
 from pipeline.axes.language_goal import changed_goal
 from pipeline.libero.tasks import debris
 from pipeline.types import Task
@@ -79,4 +80,5 @@ def lint(text: str, task: Task, component: Component) -> str | None:
         return f"{len(text)} characters, wanted {LENGTH}"
     if normalise(text) == normalise(task.instruction):
         return "equal to the original"
-    return changed_goal(text, task, hints=component not in NAMED)
+    hints = component not in NAMED
+    return changed_goal(text, task, hints) or extra_request(text, task, hints)

@@ -2,12 +2,14 @@
 
 import re
 from collections.abc import Callable
+from itertools import permutations
 
 import pytest
 
 from pipeline.axes.language import load_bank
+from pipeline.axes.language_extra import extra_request
 from pipeline.axes.language_goal import changed_goal, demands
-from pipeline.axes.language_lint import NAMED, lint
+from pipeline.axes.language_lint import CLASSES, NAMED, lint
 from pipeline.libero.task_goal import Aim, StateChange, read_goal
 from pipeline.libero.tasks import SUITES, find_task, tasks
 from pipeline.types import Task
@@ -145,6 +147,73 @@ def test_a_word_that_fits_two_things_of_the_scene_tells_neither() -> None:
     # Next to tomato sauce, but to no other dairy product:
     assert lint("the dairy product and the soup, both in the basket", TWO, "common_sense") is None
     assert lint("put the tin in the basket", SOUP, "common_sense") is not None
+
+
+def by_scene() -> dict[str, list[Task]]:
+    """LIBERO's tasks by the scene that they share, by the names of suites and scenes alone."""
+    groups: dict[str, list[Task]] = {}
+    for suite in SUITES:
+        for task in tasks(suite):
+            scene = re.match(r"[A-Z_]+SCENE\d+", task.name)
+            groups.setdefault(scene[0] if scene else suite, []).append(task)
+    return groups
+
+
+def test_no_other_task_of_a_scene_is_taken_for_a_rewrite() -> None:
+    """Each instruction as a rewrite of every other task that can be given in the same scene, in every class."""
+    pairs = [pair for group in by_scene().values() for pair in permutations(group, 2)]
+    pairs = [(task, other) for task, other in pairs if task.instruction != other.instruction]
+    accepted = [
+        (task.name, other.instruction, component)
+        for task, other in pairs
+        for component in CLASSES
+        if lint(other.instruction, task, component) is None
+    ]
+    assert len(pairs) > 500
+    assert accepted == []
+
+
+def test_rewrites_of_another_task_of_the_scene_are_refused_where_things_have_their_names() -> None:
+    """The shipped rewrites that call things by their names, as rewrites of the scene's other tasks."""
+    groups = {task: group for group in by_scene().values() for task in group}
+    checked, accepted = 0, []
+    for suite, of_suite in load_bank().items():
+        for name, classes in of_suite.items():
+            task = find_task(suite, name)
+            for other in groups[task]:
+                if other.instruction == task.instruction:
+                    continue
+                texts = [(component, text) for component in NAMED for text in classes[component]]
+                checked += len(texts)
+                accepted += [(other.name, text) for component, text in texts if lint(text, other, component) is None]
+    assert checked > 4000
+    assert len(accepted) / checked < 0.002
+
+
+@pytest.mark.parametrize("suite", SUITES)
+def test_no_instruction_of_libero_asks_for_more_than_its_task(suite: str) -> None:
+    assert {task.name: extra_request(task.instruction, task, hints=False) for task in tasks(suite)} == {
+        task.name: None for task in tasks(suite)
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ("turn on the stove and put the wine bottle on the rack", "another thing too, wine bottle"),
+        ("turn on the stove, then open the middle drawer of the cabinet", "open the wooden cabinet too"),
+    ],
+)
+def test_a_second_request_is_refused(text: str, fault: str) -> None:
+    assert fault in str(lint(text, STOVE, "paraphrase"))
+    assert fault in str(lint(text, STOVE, "reasoning_chain"))
+
+
+def test_things_that_are_to_stay_may_be_named_where_one_reasons() -> None:
+    assert (
+        lint("leave the wine where it is, do not touch the plate, but turn on the stove", STOVE, "reasoning_chain")
+        is None
+    )
 
 
 def swapped(one: str, other: str) -> Callable[[str], str]:
