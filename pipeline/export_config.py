@@ -28,7 +28,7 @@ def too_few(share: float, where: str) -> PipelineError:
     return PipelineError(
         f"no task has enough demonstrations for {share:g} of them to go into the split val",
         where=where,
-        expected=f"{least} or more demonstrations of a task",
+        expected=f"{least} or more demonstrations of a task, where all that `demos expand` made from one count as one",
         remedy="use more demonstrations, a larger share, or 0",
     )
 

@@ -96,6 +96,7 @@ class Demo:
         model_xml: MJCF of the recorded scene with asset paths of this machine, or None when the source did
             not record it (then fixtures are placed by LIBERO's own reset under a fixed seed).
         perturbations: JSON of what an expansion changed; an empty list if nothing.
+        expanded_from_sha256: ``sha256`` of the human demonstration that it was made from; None for a human one.
     """
 
     task: Task
@@ -108,6 +109,7 @@ class Demo:
     states: Floats | None
     model_xml: str | None
     perturbations: str = "[]"
+    expanded_from_sha256: str | None = None
 
     @property
     def demo_id(self) -> str:

@@ -42,6 +42,7 @@ class Known(NamedTuple):
     Attributes:
         content: changes with anything that ``load`` would return.
         demo: its demonstration, ``<suite>/<task>/<key>``.
+        origin: the same for all demonstrations that were made from one human demonstration.
         instruction: the text that the policy is prompted with.
     """
 
@@ -50,6 +51,7 @@ class Known(NamedTuple):
     demo: str = ""
     instruction: str = ""
     steps: int = 0
+    origin: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,10 +74,11 @@ class Episodes:
         """``train``, and ``val`` where a share is for validation, to their episodes in the order of ``ids``.
 
         A demonstration goes there with all of its episodes, so that no perturbed episode has its clean twin, or the
-        same actions, on the other side. Of each task at least one demonstration stays to train on.
+        same actions, on the other side. So do all demonstrations that were made from one: their actions may be equal.
+        Of each task at least one origin stays to train on.
 
         Args:
-            validation: share of each task's demonstrations, by number, rounded; drawn by a hash of its name.
+            validation: share of each task's origins, by number, rounded; chosen by a hash of a demonstration's name.
 
         Raises:
             PipelineError: when there is nothing to write, or the demonstrations are too few for a validation split.
@@ -88,16 +91,25 @@ class Episodes:
             )
         if not validation:
             return {"train": self.ids}
-        every = {known.demo for known in self.known.values()}
-        chosen = {
-            demo
-            for demos in grouped((demo.rpartition("/")[0], demo) for demo in every).values()
-            for demo in sorted(demos, key=lambda demo: digest("validation", demo))[: validating(validation, len(demos))]
-        }
+        chosen = self._origins_for(validation)
         if not chosen:
             raise too_few(validation, "export.<format>.validation")
-        splits = grouped(("val" if known.demo in chosen else "train", one) for one, known in self.known.items())
+        splits = grouped(("val" if _origin(known) in chosen else "train", one) for one, known in self.known.items())
         return {split: splits[split] for split in ("train", "val")}
+
+    def _origins_for(self, validation: float) -> set[tuple[str, str]]:
+        """Choose the given share of each task's origins."""
+        places = grouped((_origin(known), digest("validation", known.demo)) for known in self.known.values())
+        by_task = grouped((task, (min(digests), (task, origin))) for (task, origin), digests in places.items())
+        chosen: set[tuple[str, str]] = set()
+        for origins in by_task.values():
+            chosen |= {origin for _, origin in sorted(origins)[: validating(validation, len(origins))]}
+        return chosen
+
+
+def _origin(known: Known) -> tuple[str, str]:
+    """A task, and which of its human demonstrations an episode comes from."""
+    return known.demo.rpartition("/")[0], known.origin or known.demo
 
 
 def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:

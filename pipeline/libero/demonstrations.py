@@ -40,7 +40,7 @@ class DemoEntry:
     """A demonstration in a source's index: all that planning needs, without its arrays.
 
     Attributes:
-        task, key, source, origin, sha256, perturbations: as in ``Demo``.
+        task, key, source, origin, sha256, perturbations, expanded_from_sha256: as in ``Demo``.
         steps: number of actions, 20 a second.
     """
 
@@ -51,6 +51,7 @@ class DemoEntry:
     sha256: str
     steps: int
     perturbations: str = "[]"
+    expanded_from_sha256: str | None = None
 
     @property
     def demo_id(self) -> str:
@@ -58,7 +59,16 @@ class DemoEntry:
 
     @classmethod
     def of(cls, demo: Demo) -> DemoEntry:
-        return cls(demo.task, demo.key, demo.source, demo.origin, demo.sha256, len(demo.actions), demo.perturbations)
+        return cls(
+            demo.task,
+            demo.key,
+            demo.source,
+            demo.origin,
+            demo.sha256,
+            len(demo.actions),
+            demo.perturbations,
+            demo.expanded_from_sha256,
+        )
 
 
 class Problem(NamedTuple):
@@ -276,7 +286,8 @@ class HDF5Source:
         demo = _Recorded(task, key, source, origin, actions, states, model_file).checked(where)
         if origin == HUMAN:
             return demo
-        return replace(demo, perturbations=hdf5.text(group, "perturbations", where))
+        changes = hdf5.text(group, "perturbations", where)
+        return replace(demo, perturbations=changes, expanded_from_sha256=hdf5.origin_sha256(group))
 
 
 class _Recorded(NamedTuple):

@@ -40,7 +40,7 @@ REMEDIES = {
 }
 """Words of HDF5's own messages to what helps."""
 
-EXPANDED_FROM = "expanded_from"
+EXPANDED_FROM, EXPANDED_FROM_SHA256, ORIGIN_SHA256 = "expanded_from", "expanded_from_sha256", "origin_sha256"
 """Attribute of a demonstration that was made from another: that one's id."""
 
 # LIBERO's longest demonstrations have some 500 steps; without a limit a few bytes of header could ask for all memory.
@@ -233,6 +233,17 @@ def _write_demo(group: h5py.Group, recording: Recording) -> None:
         group.create_dataset(name, data=values)
     group.attrs.update(num_samples=steps, model_file=recording.model_file, init_state=recording.states[0])
     group.attrs.update(recording.attrs)
+
+
+def origin_sha256(group: h5py.Group) -> str | None:
+    """Read the content hash of the human demonstration that an expansion was made from; ``None`` for a human one.
+
+    Expansions by earlier versions name their direct source alone, which may be an expansion too.
+    """
+    for name in (ORIGIN_SHA256, EXPANDED_FROM_SHA256):
+        if name in group.attrs:
+            return str(group.attrs[name])
+    return None
 
 
 def expanded(file: Path) -> list[bool]:

@@ -51,6 +51,7 @@ class Row:
     demo_sha256: Annotated[str, "hash of the recorded content of the source demonstration"]
     demo_source: Annotated[str, "where the demonstration was published"]
     demo_origin: Annotated[str, "human, or expanded: made from a human demonstration by `demos expand`"]
+    demo_origin_sha256: Annotated[str, "demo_sha256 of the human demonstration that it was made from, or its own"]
     demo_steps: Annotated[int, "recorded actions, no-ops included"]
     axis: Annotated[str, "perturbed axis, several joined by +, or clean"]
     component: Annotated[str, "component of the axis, several joined by +, or clean"]
@@ -140,9 +141,10 @@ def refuse_other_settings(rows: Sequence[Row], replay: ReplayConfig) -> None:
 
 
 def demonstrations(rows: Sequence[Row]) -> dict[str, int]:
-    """Suite to the number of demonstrations of its task that has most of them."""
+    """Suite to the number of demonstrations of its task that has most of them; all that have one origin count once."""
     most: dict[str, int] = {}
-    for (suite, _), number in Counter((row.suite, row.task) for row in rows if row.role == "twin").items():
+    origins = {(row.suite, row.task, row.demo_origin_sha256) for row in rows if row.role == "twin"}
+    for (suite, _), number in Counter((suite, task) for suite, task, _ in origins).items():
         most[suite] = max(number, most.get(suite, 0))
     return most
 
@@ -274,6 +276,7 @@ def _row(demo: DemoEntry, perturbations: Sequence[Perturbation], seed: int, repl
         demo_sha256=demo.sha256,
         demo_source=demo.source,
         demo_origin=demo.origin,
+        demo_origin_sha256=demo.expanded_from_sha256 or demo.sha256,
         demo_steps=demo.steps,
         axis="+".join(p.axis for p in perturbations) or "clean",
         component="+".join(p.component for p in perturbations) or "clean",

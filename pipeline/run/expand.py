@@ -226,7 +226,8 @@ def _recording(trajectory: Trajectory, row: plan.Row) -> hdf5.Recording:
         },
         attrs={
             hdf5.EXPANDED_FROM: row.demo_id,
-            "expanded_from_sha256": row.demo_sha256,
+            hdf5.EXPANDED_FROM_SHA256: row.demo_sha256,
+            hdf5.ORIGIN_SHA256: row.demo_origin_sha256,
             "expanded_by": f"{DISTRIBUTION} {version(DISTRIBUTION)}",
             "perturbations": row.perturbations,
             "resolved": trajectory.resolved,

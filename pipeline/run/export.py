@@ -128,7 +128,7 @@ def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Epis
             rewrites[one] = wordings(config.plan.axes.language, row.suite, row.task, row.axis)
             content = digest(content, rewrites[one])[:16]
         steps = run.trajectories[row.trajectory_id]["steps"]
-        known[one] = Known(row.suite, content, row.demo_id, row.instruction, steps)
+        known[one] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
     extras: tuple[Extra, ...] = ("outcome",) if failures else ()
     return Episodes(known, EpisodeLoader(config.data, config.render, extras, rewrites))
 

@@ -56,6 +56,19 @@ def test_a_demonstration_is_on_one_side(episodes: Episodes) -> None:
         episodes.by_split(0.1)
 
 
+def test_all_that_was_made_from_one_demonstration_is_on_one_side(episodes: Episodes) -> None:
+    """Expanded demonstrations may have bit-identical actions, such as the second and the third here."""
+    origins = dict(zip(IDS, ("a", "a", "b", "b", "b", "b"), strict=True))
+    known = {one: value._replace(origin=origins[one]) for one, value in episodes.known.items()}
+    for share in (0.3, 0.4, 0.5):
+        splits = Episodes(known, episode).by_split(share)
+        sides = [{origins[one] for one in ids} for ids in splits.values()]
+        assert sorted(map(len, sides)) == [1, 1]
+        assert not sides[0] & sides[1]
+    with pytest.raises(PipelineError, match="made from one count as one"):
+        Episodes({one: value._replace(origin="a") for one, value in known.items()}, episode).by_split(0.5)
+
+
 def test_split_keeps_order_and_balance() -> None:
     ids = [str(k) for k in range(11)]
     pieces = split(ids, 4)

@@ -85,6 +85,7 @@ def row(task: Task, perturbations: Iterable[Perturbation], name: str) -> Row:
         demo_sha256="0",
         demo_source="test",
         demo_origin="human",
+        demo_origin_sha256="0",
         demo_steps=100,
         axis="+".join(p.axis for p in changed),
         component="+".join(p.component for p in changed),

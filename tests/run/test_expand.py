@@ -26,6 +26,7 @@ from pipeline.libero.demonstrations import HDF5Source
 from pipeline.physics.control_env import control_env
 from pipeline.physics.environment import Environment
 from pipeline.physics.replay import replay
+from pipeline.planning import plan
 from pipeline.run.expand import APART_RAD, Expansion, candidates, expand, resets
 from pipeline.testset import benchmark
 
@@ -98,8 +99,17 @@ def test_the_file_says_what_was_changed(expanded: tuple[Path, Expansion]) -> Non
     with h5py.File(expanded[1].files[0]) as file:
         attributes = dict(file["data/demo_0"].attrs)
     assert attributes["expanded_from"] == starter_demo(STOVE).demo_id
+    assert attributes["origin_sha256"] == starter_demo(STOVE).sha256
     assert [change["axis"] for change in json.loads(attributes["perturbations"])] == ["robot"]
     assert attributes["replay_mode"] in ("open_loop", "tracked")
+
+
+def test_what_is_expanded_twice_still_has_the_origin_of_the_human_one(expanded: tuple[Path, Expansion]) -> None:
+    entries = HDF5Source(expanded[0]).index([STOVE]).entries
+    assert len({entry.sha256 for entry in entries}) == 2
+    rows = plan.twins(entries, 1, ReplayConfig())
+    assert {row.demo_origin_sha256 for row in rows} == {starter_demo(STOVE).sha256}
+    assert plan.demonstrations(rows) == {STOVE.suite: 1}
 
 
 def test_the_file_tells_nobody_s_folders_and_liberos_own_reader_finds_its_assets(
