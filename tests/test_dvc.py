@@ -47,6 +47,14 @@ def test_every_script_has_a_stage_and_no_output_lies_in_another() -> None:
     assert not [(one, other) for one in made for other in made if one in other.parents]
 
 
+@pytest.mark.parametrize("name", ["manifest", "validate", "recipe", "card"])
+def test_a_stage_that_writes_names_of_datasets_depends_on_the_options_of_every_format(name: str) -> None:
+    """Such as ``dataset_statistics.json``, which names its entries by the only format that a run may have."""
+    depends_on = sections(name)
+    formats = {"export.rlds", "export.lerobot", "export.lerobot_v21"}
+    assert "export" in depends_on or formats <= depends_on
+
+
 def test_a_run_that_goes_on_elsewhere_is_compared_first() -> None:
     assert "host" in sections("doctor")
     assert DATA + "machine.json" in STAGES["plan"]["deps"]
