@@ -123,6 +123,13 @@ class Perturbation(Frozen):
         """
         return np.array([float(self != other) for other in others])
 
+    def named_in(self, instruction: str) -> bool:
+        """Whether an instruction that the same episode is prompted with has a word for what this adds.
+
+        Such a perturbation is sampled again, as the instruction would no longer mean one thing only.
+        """
+        return False
+
     def credits(self) -> frozenset[Credit]:
         """What this shows that has a licence of its own."""
         return frozenset()
@@ -152,9 +159,13 @@ class Axis(Frozen):
     def sample(self, rng: np.random.Generator, task: Task, place: int) -> Perturbation:
         """One draw for a task that the axis applies to; what is random comes from ``rng`` alone.
 
-        ``place`` counts a demonstration's draws, for axes that take the entries of a list in turn.
+        ``place`` is that of an entry in ``entries``, for axes that take the entries of a list; others ignore it.
         """
         raise NotImplementedError
+
+    def entries(self, task: Task) -> Sequence[str]:
+        """The list that the axis takes its perturbations of a task from; empty where it samples them from ranges."""
+        return ()
 
     def refuse_tested(self, test: TestSet, task: Task) -> None:
         """Refuse a level of which no draw keeps clear of the test tasks, where the ranges tell.

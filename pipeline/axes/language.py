@@ -101,10 +101,18 @@ class LanguageAxis(Axis):
         """By the edit distance to the instruction of the LIBERO task, as rewrites."""
         return level_of(str(tested.parameters["text"]), find_task(tested.suite, tested.base).instruction)
 
-    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
-        """The rewrite at ``place`` of the task's list, which starts again once all were drawn.
+    def entries(self, task: Task) -> tuple[str, ...]:
+        """The task's rewrites.
 
-        Independent draws would repeat, so neighbouring places are different wordings and ``rng`` is left alone.
+        Raises:
+            PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.
+        """
+        return tuple(rewrite.text for rewrite in deal(task, self.classes, self.levels, self.bank))
+
+    def sample(self, rng: np.random.Generator, task: Task, place: int) -> LanguagePerturbation:
+        """The rewrite at ``place`` of the task's list, which starts again at its end.
+
+        Independent draws would repeat, so whoever samples deals out the places and ``rng`` is left alone.
 
         Raises:
             PipelineError: when the task has no rewrites, or one of them does not pass ``lint``.

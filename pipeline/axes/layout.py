@@ -13,7 +13,7 @@ from pydantic import Field
 from pipeline.axes.base import Axis, Credit, Frozen, PhysicsPerturbation
 from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.object_sources import Source
-from pipeline.catalogue.objects import find, goes_with, models, taken
+from pipeline.catalogue.objects import find, goes_with, models, nouns_of, taken, words_in
 from pipeline.errors import PipelineError
 from pipeline.libero.tasks import Same
 from pipeline.testset.benchmark import TestSet, TestTask
@@ -62,6 +62,11 @@ class LayoutPerturbation(PhysicsPerturbation):
         from pipeline.scenes.placement import place
 
         return place(scene, demo, [find(added.name, added.sha256) for added in self.objects], self.seed, roll_out)
+
+    def named_in(self, instruction: str) -> bool:
+        """Whether the instruction has a word for an added object, or for one that looks alike."""
+        words = words_in(instruction)
+        return any(nouns_of(added.category) & words for added in self.objects)
 
     same: ClassVar[Same | None] = "scene"
 

@@ -73,11 +73,21 @@ def taken(task: Task) -> frozenset[str]:
     """Categories that are in a task's scene, and words that its scene and instruction use."""
     scene = bddl.read(task.bddl_file)
     types = [*scene.objects.values(), *scene.fixtures.values()]
-    words = re.findall(r"[a-z]+", " ".join([*types, task.instruction.lower()]).replace("_", " "))
-    return frozenset({*map(category_in, types), *words, *(word.removesuffix("s") for word in words)})
+    return frozenset(map(category_in, types)) | words_in(" ".join([*types, task.instruction]).replace("_", " "))
+
+
+def words_in(text: str) -> frozenset[str]:
+    """The words of a text in lower case, those that end in s without it too."""
+    words = re.findall(r"[a-z]+", text.lower())
+    return frozenset({*words, *(word.removesuffix("s") for word in words)})
 
 
 def goes_with(model: ObjectModel, names: frozenset[str]) -> bool:
     """Whether an object is of another category than everything in ``names``, and cannot be meant by another's noun."""
-    noun = model.category.split("_of_")[0].split("_")[-1]
-    return not {model.category, noun}.union(*(alike for alike in ALIKE if noun in alike)) & names
+    return not nouns_of(model.category) & names
+
+
+def nouns_of(category: str) -> frozenset[str]:
+    """A category, its noun, and the nouns of objects that look alike."""
+    noun = category.split("_of_")[0].split("_")[-1]
+    return frozenset({category, noun}).union(*(alike for alike in ALIKE if noun in alike))

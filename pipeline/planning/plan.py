@@ -155,6 +155,28 @@ def shortage(rows: Sequence[Row], plan: PlanConfig) -> dict[str, int]:
     return {axis: wanted - there[axis] for axis, wanted in plan.episodes.items() if wanted != there[axis]}
 
 
+class Dealt:
+    """How often the candidates of one task have each entry of the lists that its axes take perturbations from.
+
+    A candidate takes one of the entries that fewest candidates before it have. Which of these is the choice of its key.
+    So all entries come once before one comes again, and another demonstration changes few of the others' entries.
+    """
+
+    def __init__(self) -> None:
+        self._times: Counter[str] = Counter()
+
+    def in_turn(self, entries: Sequence[str], key: str) -> list[int]:
+        """The places of the entries in the order in which a candidate takes them; a single place for an empty list."""
+        if not entries:
+            return [0]
+        return sorted(range(len(entries)), key=lambda place: (self._times[entries[place]], digest(key, entries[place])))
+
+    def give(self, entries: Sequence[str], place: int) -> None:
+        """Count the entry that a candidate has."""
+        if entries:
+            self._times[entries[place]] += 1
+
+
 @dataclass(frozen=True)
 class Draws:
     """What a plan draws for its episodes of one axis or combination.
@@ -171,10 +193,13 @@ class Draws:
     seed: int
     test: TestSet
 
-    def of(self, demo_id: str, task: Task, expanded_by: str = "[]") -> Iterator[tuple[Perturbation, ...]]:
-        """Draws for one demonstration, variant after variant: all different, and clear of the test set.
+    def of(
+        self, demo_id: str, task: Task, dealt: Dealt | None = None, expanded_by: str = "[]"
+    ) -> Iterator[tuple[Perturbation, ...]]:
+        """Sample for one demonstration, variant after variant: all different, and clear of the test set.
 
         Args:
+            dealt: the entries of lists that other demonstrations of the task have; by default none.
             expanded_by: JSON of the perturbations by which an expansion made the demonstration.
 
         Yields:
@@ -183,61 +208,88 @@ class Draws:
         Raises:
             PipelineError: when another version with other perturbations made the demonstration.
         """
-        try:
-            earlier = from_json(expanded_by)
-        except PipelineError as error:
-            raise PipelineError(
-                f"the perturbations of this expanded demonstration cannot be read ({error.what})",
-                where=demo_id,
-                expected="perturbations of this version",
-                remedy="expand the human demonstrations again into another folder",
-            ) from error
-        place = int(rng(self.seed, self.name, demo_id).integers(2**31))
+        earlier = _earlier(demo_id, expanded_by)
+        dealt = dealt or Dealt()
         drawn: set[tuple[str, ...]] = set()
         for variant in count():
+            key = (demo_id, variant)
+            turns = [dealt.in_turn(axis.entries(task), digest(self.seed, self.name, *key)) for axis in self.axes]
             for attempt in range(_ATTEMPTS):
-                key = rng(self.seed, self.name, demo_id, variant, attempt)
-                # All from one generator, before any is drawn anew from one of its own.
-                sampled = [axis.sample(key, task, place).after(earlier) for axis in self.axes]
-                found = [
-                    self._clear(first, axis, task, place, earlier, (demo_id, variant, attempt, number))
-                    for number, (first, axis) in enumerate(zip(sampled, self.axes, strict=True))
-                ]
-                place += 1
-                perturbations = tuple(one for one in found if one is not None)
-                content = tuple(one.model_dump_json() for one in perturbations)
-                if len(content) == len(found) and content not in drawn:
+                places = [places_of_axis[attempt % len(places_of_axis)] for places_of_axis in turns]
+                perturbations = self._sampled(task, places, earlier, (*key, attempt))
+                content = tuple(one.model_dump_json() for one in perturbations or ())
+                if perturbations and content not in drawn:
                     break
             else:
                 return
             drawn.add(content)
+            for axis, place in zip(self.axes, places, strict=True):
+                dealt.give(axis.entries(task), place)
             yield perturbations
+
+    def _sampled(
+        self, task: Task, places: Sequence[int], earlier: Sequence[Perturbation], key: tuple[str | int, ...]
+    ) -> tuple[Perturbation, ...] | None:
+        """One perturbation of each axis, ``None`` where one of them finds none that is clear."""
+        random = rng(self.seed, self.name, *key)
+        # All from one generator, before any is drawn anew from one of its own.
+        sampled = [
+            axis.sample(random, task, place).after(earlier) for axis, place in zip(self.axes, places, strict=True)
+        ]
+        instruction = " ".join(one.apply("") for one in sampled if isinstance(one, TextPerturbation))
+        perturbations = []
+        for number, (first, axis) in enumerate(zip(sampled, self.axes, strict=True)):
+            clear = self._clear(first, axis, task, instruction, earlier, (*key, number))
+            if clear is None:
+                return None
+            perturbations.append(clear)
+        return tuple(perturbations)
 
     def _clear(
         self,
         first: Perturbation,
         axis: Axis,
         task: Task,
-        place: int,
+        instruction: str,
         earlier: Sequence[Perturbation],
         key: tuple[str | int, ...],
     ) -> Perturbation | None:
-        """The ``first`` draw of an axis where it keeps clear of the test set, else another of its component and level.
+        """The ``first`` draw of an axis where it is clear, else another of its component and level.
 
-        Or strengths near the test set's would become rare. None where none of many keeps clear.
+        Or strengths near the test set's would become rare. None where none of many is clear: far enough from the test
+        set, and not named by the ``instruction``. A list has its next entry for that.
         """
 
         def clear(one: Perturbation) -> bool:
-            return one.nearest(self.test, task).distance >= one.clearance
+            return one.nearest(self.test, task).distance >= one.clearance and not one.named_in(instruction)
 
         if clear(first):
             return first
+        if axis.entries(task):
+            return None
         again, alike = rng(self.seed, self.name, *key), axis.model_copy(update={"levels": (first.level,)})
         for _ in range(_ATTEMPTS):
-            one = alike.sample(again, task, place).after(earlier)
+            one = alike.sample(again, task, 0).after(earlier)
             if (one.component, one.level) == (first.component, first.level) and clear(one):
                 return one
         return None
+
+
+def _earlier(demo_id: str, expanded_by: str) -> tuple[Perturbation, ...]:
+    """Read the perturbations by which an expansion made a demonstration.
+
+    Raises:
+        PipelineError: when another version with other perturbations made it.
+    """
+    try:
+        return tuple(from_json(expanded_by))
+    except PipelineError as error:
+        raise PipelineError(
+            f"the perturbations of this expanded demonstration cannot be read ({error.what})",
+            where=demo_id,
+            expected="perturbations of this version",
+            remedy="expand the human demonstrations again into another folder",
+        ) from error
 
 
 def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[DemoEntry, tuple[Perturbation, ...], int]]:
@@ -246,7 +298,8 @@ def _candidates(draws: Draws, group: Sequence[DemoEntry]) -> Iterator[tuple[Demo
     A demonstration of which no more different draws are left that keep clear of the test set is passed over; the
     candidates end when none is left of any.
     """
-    left = {demo: draws.of(demo.demo_id, demo.task, demo.perturbations) for demo in group}
+    dealt = Dealt()
+    left = {demo: draws.of(demo.demo_id, demo.task, dealt, demo.perturbations) for demo in group}
     for variant in count():
         for demo, drawn in [*left.items()]:
             if (perturbations := next(drawn, None)) is None:

@@ -17,6 +17,7 @@ from pipeline.axes.background import BackgroundAxis
 from pipeline.axes.base import LEVELS
 from pipeline.axes.camera import CameraAxis
 from pipeline.axes.language import LanguageAxis, LanguagePerturbation, deal
+from pipeline.axes.layout import LayoutAxis, LayoutPerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis
 from pipeline.config import PlanConfig, ReplayConfig
@@ -229,6 +230,54 @@ def test_a_rewrite_stays_where_what_is_beside_it_is_drawn_anew() -> None:
     assert sum(camera != other for (camera, _), (other, _) in zip(first, again, strict=True)) >= len(planted)
     assert [text for _, text in again] == [text for _, text in first]
     assert len({text for _, text in again}) == number
+
+
+def rewrites_of_demonstrations(names: list[str]) -> dict[str, str]:
+    """Demonstration to its rewrite, where each of a task's has one."""
+    task = TASKS[0]
+    demos = [DemoEntry(task, name, "test", "human", f"{task.name}/{name}", steps=100) for name in names]
+    one_each = config(axes=Axes(language=LanguageAxis()), episodes={"language": len(demos)}, reserve=0.0)
+    rows = plan.make(demos, one_each, REPLAY, NO_TESTS)
+    return {row.demo_id: row.instruction for row in rows if row.axis == "language"}
+
+
+def test_fifty_demonstrations_have_fifty_different_rewrites() -> None:
+    names = [f"demo_{number}" for number in range(50)]
+    dealt = rewrites_of_demonstrations(names)
+    assert len(dealt) == len(set(dealt.values())) == 50
+    assert rewrites_of_demonstrations(names[::-1]) == dealt
+    assert len(deal(TASKS[0])) < 70
+    times = Counter(rewrites_of_demonstrations([f"demo_{number}" for number in range(140)]).values())
+    assert max(times.values()) - min(times.values()) == 1, "each comes twice before one comes a third time"
+    assert set(times) == {card.text for card in deal(TASKS[0])}
+
+
+def test_another_demonstration_changes_few_rewrites_of_the_others() -> None:
+    names = [f"demo_{number}" for number in range(41)]
+    whole = rewrites_of_demonstrations(names)
+    changed = []
+    for left_out in names[::4]:
+        fewer = rewrites_of_demonstrations([name for name in names if name != left_out])
+        changed.append(sum(whole[demo_id] != text for demo_id, text in fewer.items()))
+    assert sum(changed) / len(changed) < 4
+
+
+def test_no_object_is_added_that_the_rewrite_has_a_word_for() -> None:
+    """Such as a glass where the talk around the request is of one."""
+    known = [task for suite in ("libero_spatial", "libero_object", "libero_goal", "libero_10") for task in tasks(suite)]
+    demos = [DemoEntry(task, f"demo_{n}", "test", "human", f"{task}/{n}", steps=100) for task in known for n in (0, 1)]
+    both = Axes(layout=LayoutAxis(levels=(5,)), language=LanguageAxis())
+    wanted = config(axes=both, episodes={"layout+language": 1000}, reserve=0.0)
+    rows = [row for row in plan.make(demos, wanted, REPLAY, NO_TESTS) if row.role == "perturbed"]
+    assert len(rows) == 1000
+    confused = []
+    for row in rows:
+        layout = next(p for p in from_json(row.perturbations) if isinstance(p, LayoutPerturbation))
+        for added in layout.objects:
+            noun = added.category.split("_of_")[0].split("_")[-1]
+            if re.search(rf"\b{noun}s?\b", row.instruction):
+                confused.append((added.category, row.instruction))
+    assert confused == []
 
 
 def test_small_numbers_of_each_axis_are_of_other_demonstrations() -> None:
