@@ -91,7 +91,8 @@ class PlanConfig(Frozen):
         axes: the ranges each axis draws from; the default ones where an axis of ``episodes`` is not named.
         episodes: how many kept episodes are wanted, spread evenly over the tasks: for an axis of ``axes``, or for
             several that perturb each episode together, joined by + in any order, such as ``camera+light+language``.
-        reserve: share of further candidates to draw of each task, rounded up, used in order where an episode fails.
+        reserve: share of further candidates to draw of each task, rounded up. The one that is most like an episode that
+            fails, by level and component, replaces it.
     """
 
     seed: int = Field(default=0, ge=-(2**63), lt=2**63)

@@ -1,6 +1,7 @@
 """What became of each planned episode, and what has to be replayed next to know it."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 
 from pipeline.grouping import grouped
 from pipeline.planning.plan import Row
@@ -8,6 +9,8 @@ from pipeline.types import Verdict
 
 NOT_NEEDED = "reserve_not_needed"
 """The reason of a reserve for whose quota others were kept."""
+
+NOT_USED = Verdict(False, NOT_NEEDED)
 
 NOT_REPLAYED = "not_replayed"
 """The reason of what is needed, as far as is known, and has no trajectory yet."""
@@ -42,17 +45,33 @@ def _verdicts(
 ) -> Iterator[tuple[Row, Verdict | None]]:
     """Every row with what became of it: None for one that is needed, as far as is known, and not replayed.
 
-    The twins, and each axis or combination, have a quota for each task, which candidates fill in order of rank.
+    The twins, and each axis or combination, have a quota for each task. A wanted candidate that fails is replaced by
+    the reserve that is most like it, so that what fails more often does not become rarer among kept episodes.
     """
+
+    def judged(row: Row) -> Verdict | None:
+        verdict = verdicts.get(row.trajectory_id)
+        if rejected and verdict and verdict.kept and row.episode_id in rejected:
+            return Verdict(False, rejected[row.episode_id])
+        return verdict
+
     for quota in grouped(((row.axis, row.suite, row.task), row) for row in rows).values():
         group = sorted(quota, key=lambda row: row.rank)
-        need = sum(row.wanted for row in group)
+        reserves = [row for row in group if not row.wanted]
+        results: dict[str, Verdict | None] = {}
+        for wanted in (row for row in group if row.wanted):
+            results[wanted.episode_id] = verdict = judged(wanted)
+            # Count undecided candidates as kept until they are replayed.
+            while verdict and not verdict.kept and reserves:
+                replacement = min(reserves, key=partial(_unlike, wanted))
+                reserves.remove(replacement)
+                results[replacement.episode_id] = verdict = judged(replacement)
         for row in group:
-            verdict = verdicts.get(row.trajectory_id)
-            if not need:
-                verdict = Verdict(False, NOT_NEEDED)
-            elif rejected and verdict and verdict.kept and row.episode_id in rejected:
-                verdict = Verdict(False, rejected[row.episode_id])
-            # Until it is known, it is hoped for.
-            need -= verdict is None or verdict.kept
-            yield row, verdict
+            yield row, results.get(row.episode_id, NOT_USED)
+
+
+def _unlike(failed: Row, reserve: Row) -> tuple[int, bool, int]:
+    """How far a reserve's levels and components are from those of the candidate that it replaces; then its rank."""
+    levels = zip(failed.level.split("+"), reserve.level.split("+"), strict=True)
+    apart = sum(abs(int(one) - int(other)) for one, other in levels)
+    return apart, failed.component != reserve.component, reserve.rank
