@@ -137,7 +137,7 @@ def edits_in_words(data: Path) -> Iterator[str]:
     """Say which generated folders of a run have edits, one sentence each."""
     for name in FOLDERS:
         if found := edits(data / name):
-            yield f"edited in {data / name}: {in_words(found)}. A run stops before it overwrites them: {REMEDY}"
+            yield f"edited in {data / name}: {in_words(found)}. Before a run overwrites them, it stops: {REMEDY}"
 
 
 def in_words(found: Mapping[str, str]) -> str:

@@ -59,6 +59,7 @@ def clean(arguments: argparse.Namespace) -> None:
     Other files in the run's folder stay. Demonstrations, configurations and downloads are not touched. A folder that no
     run has marked, and a file that no stage made inside a folder to delete, are errors.
     """
+    from pipeline.generated import edits_in_words
     from pipeline.run import cleaning, foreign, stage
 
     config = owned(arguments)
@@ -70,6 +71,8 @@ def clean(arguments: argparse.Namespace) -> None:
     for part, size_mb in found.items():
         print(f"{size_mb:10.1f} MB  {part:<13} made again by {cleaning.PARTS[part].made_by}")
     print(f"{sum(found.values()):10.1f} MB  in all, of {config.data}")
+    for edit in edits_in_words(config.data) if "uploads" in found else ():
+        print(edit)
     foreign.refuse_foreign_files(config.data, [name for part in found for name in cleaning.PARTS[part].names])
     if not arguments.yes:
         if not sys.stdin.isatty():

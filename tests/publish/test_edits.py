@@ -25,6 +25,7 @@ def call(clone: Path, *command: str) -> subprocess.CompletedProcess[str]:
         [sys.executable, *command],
         cwd=clone,
         env=IN_SCRIPTS | {"PYTHONPATH": str(clone)},
+        stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
         check=False,
@@ -54,6 +55,8 @@ def test_dvc_and_the_stage_leave_an_edit_as_it_is(tmp_path: Path) -> None:
     told = call(clone, "-m", "pipeline", "status").stdout
     assert "finetune.yaml (changed)" in told
     assert "REMAKE=1" in told
+    assert "finetune.yaml (changed)" in call(clone, "-m", "pipeline", "clean", "--only", "uploads").stdout
+    assert recipe.read_bytes() == edited
 
 
 def test_a_correction_of_the_card_is_not_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
