@@ -195,7 +195,7 @@ def test_a_lighter_texture_keeps_its_pattern_and_has_the_mean_that_its_level_say
     covered = np.asarray(model.tex_data, float).reshape(-1, 3)
     wanted = 230 + 0.2 * (own - 230)
     assert covered.mean(axis=0) == pytest.approx(wanted * 205 / wanted.mean(), abs=1.0)
-    resized = cv2.resize(source, (256, 256), interpolation=cv2.INTER_AREA).reshape(-1, 3)
+    resized = np.asarray(cv2.resize(source, (256, 256), interpolation=cv2.INTER_AREA), float).reshape(-1, 3)
     for channel in range(3):
         assert np.corrcoef(covered[:, channel], resized[:, channel])[0, 1] > 0.999
 
