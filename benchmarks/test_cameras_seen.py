@@ -26,7 +26,6 @@ import numpy as np
 
 gl.prepare()
 
-from pipeline.axes import level_of_test  # noqa: E402
 from pipeline.config import ReplayConfig  # noqa: E402
 from pipeline.evaluation.libero_plus import camera  # noqa: E402
 from pipeline.libero import bddl  # noqa: E402
@@ -70,7 +69,7 @@ def measure(task: Task) -> list[dict[str, Any]]:
         with renderer.perturbed([camera(test)]):
             renderer.restore(trajectory.states[0], trajectory.site_alpha[0])
             line = {"task": str(task), "arena": arena, "component": test.component, **sight(renderer, task, hand_m)}
-            lines.append(line | {"test": test.name, "level": level_of_test(test)})
+            lines.append(line | {"test": test.name})
     renderer.close()
     return lines
 

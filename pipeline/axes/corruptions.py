@@ -124,8 +124,7 @@ class Zoom(Frozen):
         """(copies,) the magnifications, as ``np.arange`` computes them from the step between two."""
         # Without rounding, the step from 1 to 1.36 in 37 copies would not be the benchmark's 0.01.
         step = round((self.max_scale - 1) / (self.copies - 1), 12)
-        scales: Floats = np.arange(1, self.max_scale + step / 2, step, dtype=np.float64)
-        return scales
+        return np.asarray(np.arange(1, self.max_scale + step / 2, step), float)
 
 
 def _diamond_square(jitter: Floats, roughness_decay: float) -> Floats:

@@ -9,9 +9,10 @@ with several counts for each of its axes: the benchmark perturbs one at a time, 
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich import box
@@ -76,7 +77,8 @@ class AxisDistance:
         overlaps: episodes that are closer than that.
         verdict: ``overlap``, ``disjoint``, ``disjoint where compared`` when some episodes were not compared, or
             ``unknown`` when none was.
-        coverage: component of the test tasks to how far these are from the wanted episodes, reserves left out.
+        coverage: component of the test tasks to how far these are from the wanted episodes, reserves left out; the
+            report has it of the kept ones (``covered_by``).
     """
 
     rows: int
@@ -129,6 +131,26 @@ def coverage(axis: str, least: Floats, test: TestSet) -> dict[str, Coverage]:
         figures = np.quantile(compared, (0.0, 0.5, 0.9, 1.0)).tolist() if len(compared) else (None,) * 4
         summaries[component] = Coverage(len(of_component), len(compared), *figures)
     return summaries
+
+
+def covered_by(
+    kept: Iterable[Mapping[str, Any]], findings: Mapping[str, Mapping[str, Any]], test: TestSet
+) -> dict[str, dict[str, Any]]:
+    """The findings of ``leakage.json`` with the coverage of kept episodes in place of the planned ones'.
+
+    Args:
+        kept: rows of the manifest.
+    """
+    draws: dict[str, list[tuple[Perturbation, Task]]] = {axis: [] for axis in findings}
+    for row in kept:
+        task = find_task(row["suite"], row["task"])
+        for perturbation in from_json(row["perturbations"]):
+            draws[perturbation.axis].append((perturbation, task))
+    covered = {}
+    for axis, finding in findings.items():
+        components = coverage(axis, distances(axis, draws[axis], test), test)
+        covered[axis] = {**finding, "coverage": {name: asdict(figures) for name, figures in components.items()}}
+    return covered
 
 
 def _finding(

@@ -18,6 +18,7 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.files import read_json
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
+from pipeline.planning import leakage
 from pipeline.planning.streams import streams_of
 from pipeline.report import coverage, figures, pages, seen, yields
 from pipeline.report.coverage import AxisPlots, Draw
@@ -60,10 +61,10 @@ def page(config: Config, test: TestSet) -> str:
     """
     data = config.data
     rows: Rows = manifest.read(data / "manifest.parquet")
-    leakage = read_json(data / "leakage.json")
     load = EpisodeLoader(data, config.render)
     tried = counts.tried(rows)
     kept = [row for row in tried if row["kept"]]
+    distances = leakage.covered_by(kept, read_json(data / "leakage.json"), test)
     twins = counts.twins(rows)
     actions = _actions([*kept, *twins.values()], FrameStore(data / "frames", config.render))
     axes = list(dict.fromkeys(row["axis"] for row in kept))
@@ -85,7 +86,7 @@ def page(config: Config, test: TestSet) -> str:
         sample=seen.SAMPLE,
         coverage=_coverage(tried, test),
         rewrites=_rewrites(kept),
-        leakage=leakage,
+        leakage=distances,
         videos=_videos(kept, twins, load),
         sheets={axis: sheets[axis] for axis in axes if axis in sheets},
         previews={folder.name: _pictures(folder) for folder in sorted((data / "previews").glob("*"))},

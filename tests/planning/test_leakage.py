@@ -8,7 +8,7 @@ import sys
 import zipfile
 from collections.abc import Callable, Iterable
 from contextlib import chdir
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from conftest import REPOSITORY, tiny_config
 
 from pipeline import seeding
 from pipeline.axes import AXES, Perturbation, from_json, to_json
+from pipeline.axes.camera import CameraPerturbation
 from pipeline.axes.language import LanguagePerturbation
 from pipeline.axes.noise import NoiseAxis
 from pipeline.axes.pose import PoseAxis, displacements
@@ -144,6 +145,22 @@ def test_a_test_scene_is_found_on_every_task_that_begins_in_it(test: TestSet) ->
 
     bowl = repeated(test.on(find_task("libero_goal", "put_the_bowl_on_the_plate"), "pose")[0])
     assert bowl.nearest(test, find_task("libero_goal", "put_the_bowl_on_the_stove")).distance == 0
+
+
+def test_coverage_counts_the_episodes_that_were_kept(test: TestSet) -> None:
+    """Of two cameras, on either side of the test camera at an azimuth of 30 degrees, the nearer one is dropped."""
+    bowl = find_task("libero_goal", "put_the_bowl_on_the_plate")
+    cameras = [
+        CameraPerturbation(component="spherical", level=3, azimuth_deg=azimuth_deg, yaw_deg=yaw_deg)
+        for azimuth_deg, yaw_deg in ((30.0, 6.0), (30.0, 9.0))
+    ]
+    planned = leakage.check([row(bowl, [camera], str(camera.yaw_deg)) for camera in cameras], test)
+    findings = json.loads(json.dumps({axis: asdict(finding) for axis, finding in planned.items()}))
+    kept = [{"suite": bowl.suite, "task": bowl.name, "perturbations": to_json([cameras[1]])}]
+    covered = leakage.covered_by(kept, findings, test)["camera"]
+    assert findings["camera"]["coverage"]["spherical"]["smallest"] == pytest.approx(6.0)
+    assert covered["coverage"]["spherical"]["smallest"] == pytest.approx(9.0)
+    assert {**covered, "coverage": None} == {**findings["camera"], "coverage": None}
 
 
 @pytest.mark.slow
