@@ -128,6 +128,7 @@ def test_a_held_out_camera_that_does_not_show_what_the_task_is_about_is_sampled_
     progress = environment.reset(task)
     assert progress.reason == "running"
     (used,) = environment.perturbations
+    environment.image("agentview")  # which sets OpenGL up
     assert pixels_of("plate_2", draw(task, 0), environment) == 0
     assert used != draw(task, 0)
     assert (used.axis, used.level) == ("camera", 5)
