@@ -5,7 +5,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from hashlib import file_digest
@@ -140,23 +140,24 @@ def _sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def keep_below(folder: Path, files: set[Path]) -> None:
-    """Delete what lies below ``folder`` and is none of ``files``, nor inside one of them, nor on the way to one.
+def keep_below(folder: Path, files: set[Path], made: Callable[[Path], bool] = lambda path: True) -> None:
+    """Delete every file below ``folder`` that is none of ``files``, nor inside one of them, and the folders left empty.
 
     Such as shards of an earlier plan, and temporaries of a killed run.
+
+    Args:
+        made: returns whether the program made a file. Other files stay.
     """
     if not folder.is_dir():
         return
-    on_the_way = {parent for file in files for parent in file.parents}
-
-    def clear(below: Path) -> None:
-        for entry in below.iterdir():
-            if entry in on_the_way and not entry.is_symlink():
-                clear(entry)
-            elif entry not in files:
-                remove(entry)
-
-    clear(folder)
+    for entry in folder.iterdir():
+        if entry in files:
+            continue
+        if entry.is_dir() and not entry.is_symlink() and not is_temporary(entry.name):
+            keep_below(entry, files, made)
+            remove_if_empty(entry)
+        elif is_temporary(entry.name) or made(entry):
+            remove(entry)
 
 
 def is_temporary(name: str, of: str | None = None) -> bool:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from conftest import limited
 
-from pipeline.files import replaced
+from pipeline.files import keep_below, replaced
 
 
 def test_two_that_write_the_same_file_do_not_disturb_each_other(tmp_path: Path) -> None:
@@ -28,3 +28,17 @@ def test_what_fails_leaves_what_was_there(tmp_path: Path) -> None:
         temporary.write_text("half")
     assert path.read_text() == "whole"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_files_that_the_program_did_not_make_stay(tmp_path: Path) -> None:
+    """As where a person stores one while a stage runs, which looked for such files when it began."""
+    places = ("a/kept.npz", "a/old.npz", "b/old.npz", "c/old.npz", "c/notes.txt", ".a.npz.01ef.tmp", "d/.x.0a.tmp/y")
+    for place in places:
+        (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / place).touch()
+    keep_below(tmp_path, {tmp_path / "a/kept.npz"}, lambda file: file.suffix == ".npz")
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")) == [
+        *("a", "a/kept.npz", "c", "c/notes.txt")
+    ]
+    keep_below(tmp_path, {tmp_path / "a"})
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "kept.npz"]

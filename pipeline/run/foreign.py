@@ -8,25 +8,28 @@ from pathlib import Path
 from pipeline.axes import AXES
 from pipeline.errors import PipelineError
 from pipeline.files import is_temporary
+from pipeline.stores.store import EARLIER_SUFFIX, SUFFIX, TABLE
 
 _AXIS = rf"({'|'.join(AXES)})"
 _SHEET = rf"{_AXIS}(\+{_AXIS})*\.png"
-_STORED = r"\.(h5|npz|safetensors)"
+_STORED = rf"({re.escape(SUFFIX)}|{re.escape(EARLIER_SUFFIX)})"
+_ID = "[0-9a-f]{16}"
 
-MADE = {
-    "trajectories": rf"index\.parquet|[0-9a-f]{{16}}{_STORED}",
-    "frames": rf"index\.parquet|[0-9a-f]{{16}}/[0-9a-f]{{16}}{_STORED}",
+CLEARED = {
+    "trajectories": rf"{re.escape(TABLE)}|{_ID}{_STORED}",
+    "frames": rf"{re.escape(TABLE)}|{_ID}/{_ID}{_STORED}",
     "sheets": _SHEET,
     "previews": rf"[a-z0-9_]+/{_AXIS}\.png",
-    "card": rf"\.generated\.json|(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
-    "finetune": r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|"
-    r"run_openvla_oft\.py|lerobot_train\.json|starvla_data_config\.py|"
-    r"openpi_assets/physical-intelligence/libero/norm_stats\.json",
 }
-"""Folders of a run that stages clear or replace as a whole, to a pattern of the paths that stages write in them.
+"""Folders of a run that stages clear, to a pattern of the paths that stages write in them."""
 
-Stages put datasets in place with a record of their files. ``run/export.py`` compares these with the record.
-"""
+MADE = {
+    **CLEARED,
+    "card": rf"\.generated\.json|(rlds|lerobot|lerobot_v21)/(README\.md|SHA256SUMS|pictures/{_SHEET})",
+    "finetune": r"\.generated\.json|__pycache__/[^/]+\.pyc|finetune\.yaml|run_openvla_oft\.py|lerobot_train\.json|"
+    r"starvla_data_config\.py|openpi_assets/physical-intelligence/libero/norm_stats\.json",
+}
+"""The same, with the folders whose stages look for edits themselves. ``clean`` deletes all."""
 
 SHOWN = 3
 """So many files are named in an error."""
@@ -35,7 +38,7 @@ FILE_IN_USE = re.compile(r"\.nfs[0-9a-f]+")
 """Name that NFS gives to a deleted file until the last process closes it."""
 
 
-def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(MADE)) -> None:
+def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> None:
     """Stop before a stage, or ``clean``, would delete files that no stage made.
 
     Args:
@@ -56,7 +59,7 @@ def refuse_foreign_files(data: Path, folders: Iterable[str] = tuple(MADE)) -> No
         )
 
 
-def foreign_files(data: Path, folders: Iterable[str] = tuple(MADE)) -> Iterator[Path]:
+def foreign_files(data: Path, folders: Iterable[str] = tuple(CLEARED)) -> Iterator[Path]:
     """Yield the files and links in ``folders`` of a run's folder that no stage made."""
     for name in MADE.keys() & {*folders}:
         made, folder = re.compile(MADE[name]), data / name

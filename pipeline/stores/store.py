@@ -196,8 +196,12 @@ class Store(ABC):
         return rows
 
     def keep(self, names: Iterable[str]) -> None:
-        """Delete every other file, and what a killed worker left; write the table anew."""
-        keep_below(self.root, {self.root / TABLE, *map(self.path, names)})
+        """Delete every other file of the store and what a killed worker left; write the table again."""
+
+        def made(file: Path) -> bool:
+            return file.suffix in (SUFFIX, EARLIER_SUFFIX)
+
+        keep_below(self.root, {self.root / TABLE, *map(self.path, names)}, made)
         rows = self.refresh()
         if self._known().keys() - {self.made_by} and len(rows) == len(self.names()):
             self._write(rows, {self.made_by: self._made_with})

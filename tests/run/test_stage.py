@@ -322,15 +322,16 @@ def test_a_link_in_place_of_a_runs_folder_is_refused(clone: Path) -> None:
 
 FOREIGN = (
     "trajectories/notes.txt",
-    "trajectories/0123456789abcdef (copy).h5",
-    "frames/0123456789abcdef/backup/0123456789abcdef.h5",
+    "trajectories/0123456789abcdef (copy).npz",
+    "frames/0123456789abcdef/backup/0123456789abcdef.npz",
     "frames/mine.png",
     "sheets/for the paper.png",
     "previews/libero_goal/LICENSE",
-    "card/rlds/LICENSE",
-    "finetune/checkpoints/last/model.safetensors",
-    "finetune/.env",
 )
+
+
+CLEAN_ALONE = ("card/rlds/LICENSE", "finetune/checkpoints/last/model.safetensors", "finetune/.env")
+"""What stages do not delete, and `clean` would."""
 
 
 @pytest.mark.parametrize("place", FOREIGN)
@@ -344,13 +345,25 @@ def test_a_file_that_no_stage_made_stops_every_stage_and_stays(place: str, clone
 
 
 def test_a_link_among_a_runs_files_is_foreign(clone: Path) -> None:
-    """What it leads to, an upload would publish."""
     data = claimed(Path("configs/tiny.yaml")).data
-    link = data / "finetune" / "finetune.yaml"
+    link = data / "trajectories" / "0123456789abcdef.npz"
     link.parent.mkdir()
     link.symlink_to(clone / "configs" / "tiny.yaml")
-    with pytest.raises(AssertionError, match=r"no stage of this run made.*finetune/finetune\.yaml"):
+    with pytest.raises(AssertionError, match=r"no stage of this run made.*trajectories/0123456789abcdef\.npz"):
         run_stages(clone, yaml.safe_load(Path("configs/tiny.yaml").read_text()), ["inputs"])
+
+
+@pytest.mark.parametrize("place", [*FOREIGN, *CLEAN_ALONE])
+def test_clean_names_a_file_that_no_stage_made(
+    place: str, clone: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    theirs = claimed(Path("configs/tiny.yaml")).data / place
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"mine")
+    monkeypatch.setattr(sys, "argv", ["pipeline", "clean", "--yes", "configs/tiny.yaml"])
+    assert command_line.main() == 1
+    assert f"would be deleted: {place}" in capsys.readouterr().err
+    assert theirs.read_bytes() == b"mine"
 
 
 def test_clean_needs_a_mark_and_names_foreign_files(
