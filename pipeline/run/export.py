@@ -7,6 +7,7 @@ Only then is anything deleted, so that a kill at any moment leaves what the same
 
 import json
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
@@ -44,6 +45,9 @@ from pipeline.testset import benchmark
 from pipeline.types import Extra
 
 AnyFormat = Format[Any]
+
+OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]+\.json")
+"""File that OpenVLA-OFT's loader stores next to the shards; it would take it for those of a later dataset."""
 
 FINISHED = "record.json"
 """File of a work folder: the record of its dataset, which is whole; later the record beside the dataset."""
@@ -88,17 +92,22 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> 
 
 
 def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
-    """Stop where the format's folder has an entry that is no set of its own, as what is written takes its place.
+    """Stop where the format's folder has entries that no export wrote, as a dataset is replaced as a whole.
 
     Raises:
-        PipelineError: when it is neither a set of the dataset there, nor one of the dataset to write.
+        PipelineError: when an entry is no set of the dataset there and none of the dataset to write, or when a set has
+            a file that its record does not list.
     """
     own = target.sets(target.pieces(episodes)) if episodes.ids else set()
-    with suppress(PipelineError):  # There is none, or it has changed since.
-        own |= _sets(target.record())
-    for record_file in target.work.glob(f"*/{FINISHED}"):  # A killed call put this dataset in place, perhaps.
-        own |= _sets(Export(**read_json(record_file)))
+    records = [Export(**read_json(file)) for file in target.work.glob(f"*/{FINISHED}")]  # of killed calls
+    with suppress(PipelineError):  # There is none, or the dataset has changed since.
+        records.append(target.record())
+    for record in records:
+        own |= {name.partition("/")[0] for name in record.files}
     foreign = sorted(entry for entry in target.folder.glob("*") if entry.name not in own)
+    if records and not foreign:
+        written = {name for record in records for name in record.files}
+        foreign = [path for path in _files(target.folder) if path.relative_to(target.folder).as_posix() not in written]
     if foreign:
         raise PipelineError(
             f"not of this run's {target.title}, and would be deleted ({len(foreign)} such)",
@@ -108,9 +117,10 @@ def refuse_foreign(target: AnyFormat, episodes: Episodes) -> None:
         )
 
 
-def _sets(record: Export) -> set[str]:
-    """Names of the datasets whose files a record lists, each a folder of the format's folder."""
-    return {name.partition("/")[0] for name in record.files}
+def _files(folder: Path) -> list[Path]:
+    """List files and links below a dataset's folder, without the statistics that OpenVLA-OFT stores when it trains."""
+    paths = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path for path in paths if not OFT_STATISTICS.fullmatch(path.name))
 
 
 def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Episodes:
@@ -184,8 +194,8 @@ def _made_with(target: AnyFormat) -> dict[str, str]:
 def is_current(target: AnyFormat, episodes: Episodes) -> bool:
     """Whether the dataset is there, whole and of these episodes.
 
-    Every file must be there and no younger than the record. What else lies in its sets, such as the statistics that a
-    client left, is removed then.
+    Every file must be there and no younger than the record. Statistics that a client stored in its sets are removed
+    then.
     """
     if not untouched(target) or target.record().identity != identity(target, episodes):
         return False

@@ -47,3 +47,15 @@ def test_sets_of_the_run_are_no_foreign_ones(tmp_path: Path) -> None:
     renamed.record_file.unlink()
     _bring_up_to_date(renamed, episodes(), CONFIG)
     assert [path.name for path in renamed.folder.iterdir()] == ["other_spatial"]
+
+
+@pytest.mark.parametrize("write", [write_rlds, write_lerobot, write_lerobot_v21])
+@pytest.mark.parametrize("content", ["first", "second"], ids=["nothing to do", "another dataset to write"])
+def test_a_file_inside_a_set_is_refused_and_stays(content: str, write: Any, tmp_path: Path) -> None:
+    """As a card that the user wrote, or a checkpoint that a training stored there."""
+    target = write(tmp_path)
+    theirs = next(path for path in target.folder.rglob("*.json")).parent / "README.md"
+    theirs.write_text("mine")
+    with pytest.raises(PipelineError, match=r"README\.md: not of this run's"):
+        _bring_up_to_date(target, episodes(content=content), CONFIG)
+    assert theirs.read_text() == "mine"
