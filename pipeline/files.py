@@ -87,6 +87,25 @@ def write(file: Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def refuse_other_file(path: Path, mark: str) -> None:
+    """Reject a file that a command would overwrite and that it has not written itself.
+
+    Args:
+        mark: text that all files of the command contain.
+
+    Raises:
+        PipelineError: naming the file.
+    """
+    if not os.path.lexists(path) or (path.is_file() and mark.encode() in path.read_bytes()):
+        return
+    raise PipelineError(
+        "is another file, and would be overwritten",
+        where=path,
+        expected="a new name, or a file that the same command wrote",
+        remedy="name another file, or move this one",
+    )
+
+
 @contextmanager
 def replaced(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; on success it is synced to disk and takes the place of ``path``.

@@ -9,6 +9,9 @@ from pipeline.commands.base import add, add_config, loaded, positive, value
 
 TITLE = "before a run"
 
+PREVIEW = "perturbed-demos: preview"
+"""Comment in a picture that `preview` wrote, and may overwrite."""
+
 EVERY = "all"
 """In place of an axis: one picture of each."""
 
@@ -74,17 +77,20 @@ def preview(arguments: argparse.Namespace) -> None:
     """render what an axis does to a task: its first frame, and up to eleven perturbations over components and levels
 
     With `all`, one strong perturbation on each axis beside the clean twin. A name that ends in .jpg gives JPEG, else
-    PNG. Seed, ranges and demonstrations are those of the configuration. An axis that it does not name has default
-    ranges.
+    PNG. Only a picture of an earlier preview is overwritten. Seed, ranges and demonstrations are those of the
+    configuration. An axis that it does not name has default ranges.
     """
+    from PIL.PngImagePlugin import PngInfo
+
     from pipeline import gl
-    from pipeline.files import replaced
+    from pipeline.files import refuse_other_file, replaced
     from pipeline.libero.tasks import select_tasks
     from pipeline.report import preview
     from pipeline.testset import benchmark
 
     config = loaded(arguments)
     chosen = select_tasks([arguments.task])
+    refuse_other_file(arguments.out, PREVIEW)
     gl.choose()  # Where nothing renders, that is said before anything takes time.
     stage = preview.staged(chosen, config)
     with replaced(arguments.out) as temporary:
@@ -92,7 +98,12 @@ def preview(arguments: argparse.Namespace) -> None:
             picture = preview.overview(stage, config, benchmark.load())
         else:
             picture = preview.axis_sheet(stage, arguments.axis, config, benchmark.load())
-        picture.save(temporary, format="JPEG" if arguments.out.suffix == ".jpg" else "PNG", quality=90)
+        if arguments.out.suffix == ".jpg":
+            picture.save(temporary, format="JPEG", quality=90, comment=PREVIEW)
+        else:
+            described = PngInfo()
+            described.add_text("Software", PREVIEW)
+            picture.save(temporary, format="PNG", pnginfo=described)
         of = f", the first of {len(chosen)} tasks" if len(chosen) > 1 else ""
         print(f"{arguments.out} shows {arguments.axis} on {stage.demo.demo_id}{of}")
 

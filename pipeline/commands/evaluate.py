@@ -7,7 +7,7 @@ from typing import Any
 
 from pipeline.commands.base import add, add_config, add_fields, add_group, argument, owned, plan_of, positive, value
 from pipeline.errors import PipelineError
-from pipeline.files import write_json
+from pipeline.files import refuse_other_file, write_json
 
 TITLE = "evaluate policies"
 REPORT = Path("report.html")
@@ -148,10 +148,13 @@ def gap(arguments: argparse.Namespace) -> None:
     from pipeline.evaluation import composition
     from pipeline.evaluation.results import stored
 
+    picture, findings = arguments.results / "gap.png", arguments.results / "gap.json"
+    refuse_other_file(picture, composition.TITLE)
+    refuse_other_file(findings, "papers_chi_square")
     measured = composition.pairs(stored([arguments.results]))
-    composition.heatmap(measured, arguments.results / "gap.png")
+    composition.heatmap(measured, picture)
     figures = {f"{pair.one}+{pair.other}": pair.figures() for pair in measured}
-    write_json(arguments.results / "gap.json", figures)
+    write_json(findings, figures)
     print(json.dumps(figures))
 
 
@@ -163,8 +166,9 @@ def construct(arguments: argparse.Namespace) -> None:
     """
     from pipeline.evaluation import own_draws, selection
     from pipeline.evaluation.results import stored
-    from pipeline.evaluation.task_list import write_tasks
+    from pipeline.evaluation.task_list import refuse_other_list, write_tasks
 
+    refuse_other_list(arguments.out)
     rows = [row for row, _ in stored(arguments.results)]
     plan = own_draws.planned(arguments.plan) if arguments.plan else None
     drawn, size = selection.candidates(arguments.seed), arguments.size or selection.SIZE
@@ -177,8 +181,9 @@ def grade(arguments: argparse.Namespace) -> None:
     """difficulty of tasks, 1 to 5, by how many of several models solve each"""
     from pipeline.evaluation.results import stored
     from pipeline.evaluation.statistics import grade
-    from pipeline.evaluation.task_list import write_tasks
+    from pipeline.evaluation.task_list import refuse_other_list, write_tasks
 
+    refuse_other_list(arguments.out)
     results = [stored([folder]) for folder in arguments.results]
     seed, *others = sorted({row.seed for of_model in results for row, _ in of_model})
     if others:

@@ -33,6 +33,9 @@ from pipeline.evaluation.statistics import Interval, interval
 from pipeline.files import replaced
 from pipeline.types import Floats
 
+TITLE = "perturbed-demos: compositional gap"
+"""Title in the metadata of a heat map, by which `analyse gap` knows its own."""
+
 
 @dataclass(frozen=True)
 class Pair:
@@ -182,4 +185,4 @@ def heatmap(measured: Sequence[Pair], file: Path) -> None:
     axes.set_title("above: p(i | success) p(j | success)\nbelow: p(i, j | success)", fontsize=10)
     figure.colorbar(image, ax=axes)
     with replaced(file) as temporary:
-        figure.savefig(temporary, format="png", dpi=120)
+        figure.savefig(temporary, format="png", dpi=120, metadata={"Title": TITLE})

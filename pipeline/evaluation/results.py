@@ -8,9 +8,10 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from pipeline.compute.workers import LOGS
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
-from pipeline.files import read_json, write
+from pipeline.files import read_json, refuse_other_file, write
 from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
@@ -82,6 +83,25 @@ class EpisodeFiles:
 
     def video(self, episode: str) -> Path:
         return self.folder / "videos" / f"{episode}.mp4"
+
+    def refuse_other_folder(self) -> None:
+        """Reject a folder that has files and no results, such as a checkpoint's, and another program's summary.
+
+        Raises:
+            PipelineError: naming the folder or the file.
+        """
+        refuse_other_file(self.folder / "summary.json", '"by_axis": ')
+        if not self.folder.exists() or (self.folder / "episodes").is_dir():
+            return
+        # A cluster's workers have files of their own there; an evaluation without any result has its summary.
+        names = [entry.name for entry in self.folder.iterdir() if not entry.name.startswith(".cluster-")]
+        if set(names) - {"summary.json", LOGS.parts[0]}:
+            raise PipelineError(
+                f"holds files and no results of an evaluation: {', '.join(sorted(names)[:3])}",
+                where=self.folder,
+                expected="a new or empty folder, or one of an earlier evaluation",
+                remedy="name another folder",
+            )
 
     def save(self, row: EpisodeResult) -> None:
         write(self.path(row.episode), json.dumps(asdict(row), sort_keys=True) + "\n")

@@ -128,11 +128,12 @@ class Evaluation:
 
     def check(self, tasks: Iterable[EvaluationTask]) -> None:
         """Refuse a folder that has another policy of this name, or results of other versions that nobody allowed to
-        make anew.
+        make anew, or files of another kind.
 
         Raises:
             PipelineError: when it has. Nothing was changed.
         """
+        self.files.refuse_other_folder()
         known = [(row.policy, row.identity, self.folder) for row in self.files.rows()]
         refuse_shared_names([*known, (self.policy.name(self.identity), self.identity, self.folder)])
         rows = ((task, self.files.row(self.episode(task))) for task in tasks)

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from pipeline.errors import PipelineError
 from pipeline.evaluation.own_draws import first_draws
 from pipeline.evaluation.tasks import EvaluationTask
-from pipeline.files import write
+from pipeline.files import refuse_other_file, write
 from pipeline.seeding import digest
 
 
@@ -58,6 +58,15 @@ def read_tasks(file: Path, seed: int) -> list[EvaluationTask]:
             remedy="make the list anew with the command that made it, or evaluate with the version that made it",
         )
     return listed.tasks
+
+
+def refuse_other_list(file: Path) -> None:
+    """Reject a file that ``write_tasks`` would overwrite and that it has not written.
+
+    Raises:
+        PipelineError: naming the file.
+    """
+    refuse_other_file(file, '"draws": "')
 
 
 def write_tasks(listed: Iterable[EvaluationTask | dict[str, Any]], seed: int, file: Path) -> None:

@@ -42,13 +42,15 @@ def write(policies: Sequence[Evaluated], path: Path) -> dict[str, Any]:
         Where they are, and each policy's rate by source.
 
     Raises:
-        PipelineError: when ``path`` is not one of an HTML file.
+        PipelineError: when ``path`` is not the name of an HTML file, or one of the two is another file.
     """
     if path.suffix != ".html":
         raise PipelineError("not the name of a page", where=path, expected="a name that ends in .html")
+    beside = path.with_suffix(".json")
+    files.refuse_other_file(path, "<title>Evaluation: ")
+    files.refuse_other_file(beside, '"paper_table": ')
     found = findings(policies)
     files.write(path, page(found, {episode: file for policy in policies for episode, file in policy.videos.items()}))
-    beside = path.with_suffix(".json")
     files.write_json(beside, found)
     rates = {
         name: {source: one["all"] for source, one in policy["results"].items()}

@@ -1,0 +1,86 @@
+"""No command overwrites a file that it has not written: a person's, or another program's."""
+
+import io
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY, STOVE
+from episode_results import result
+from PIL import Image
+
+from pipeline import __main__ as command_line
+from pipeline.evaluation.results import EpisodeFiles
+from pipeline.evaluation.selection import Selection, select
+
+ONE_TASK = Selection(source="pairs", suites=(STOVE.suite,), tasks=(STOVE.name,), axes=("robot", "noise"), episodes=1)
+
+
+def picture(kind: str) -> bytes:
+    """A person's picture."""
+    written = io.BytesIO()
+    Image.new("RGB", (8, 8), "red").save(written, format=kind)
+    return written.getvalue()
+
+
+def called(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["pipeline", *words])
+    return command_line.main()
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Path:
+    """Results of one policy."""
+    folder = tmp_path / "results"
+    for task in select(ONE_TASK):
+        EpisodeFiles(folder).save(result(task, success=True))
+    return folder
+
+
+STARTER = str(REPOSITORY / "configs" / "starter.yaml")
+PREVIEW = ("preview", f"{STOVE.suite}/{STOVE.name}", "noise", STARTER, "--out")
+REWRITE = ("rewrite", str(STOVE.bddl_file), "--endpoint", "http://127.0.0.1:9/v1", "--model", "-")
+HTML = b"<!doctype html><title>Mine</title>"
+CASES = (
+    ("sheet.png", picture("PNG"), (*PREVIEW, "sheet.png")),
+    ("mine.jpg", picture("JPEG"), (*PREVIEW, "mine.jpg")),
+    ("report.html", HTML, ("analyse", "report", "results")),
+    ("report.json", b'{"loss": [1.0]}', ("analyse", "report", "results")),
+    ("tasks.json", b'{"tasks": ["mine"]}', ("analyse", "construct", "--out", "tasks.json")),
+    ("tasks.json", b'{"tasks": ["mine"]}', ("analyse", "grade", "results", "--out", "tasks.json")),
+    ("results/gap.png", picture("PNG"), ("analyse", "gap", "results")),
+    ("results/gap.json", b'{"gap": 1}', ("analyse", "gap", "results")),
+    ("bank.yaml", b"mine: true\n", (*REWRITE, "--out", "bank.yaml")),
+    ("policy/summary.json", b"{}", ("evaluate", "policy", "--replay", "--task", STOVE.name, "--workers", "1")),
+    ("policy/config.json", b"{}", ("evaluate", "policy", "--replay", "--task", STOVE.name, "--workers", "1")),
+)
+
+
+@pytest.mark.parametrize(("name", "content", "words"), CASES, ids=[f"{words[0]} {name}" for name, _, words in CASES])
+def test_a_file_of_another_kind_is_named_and_stays(
+    name: str,
+    content: bytes,
+    words: tuple[str, ...],
+    results: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(results.parent)
+    Path(name).parent.mkdir(exist_ok=True)
+    Path(name).write_bytes(content)
+    before = {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()}
+    assert called(monkeypatch, *words) == 1
+    error = capsys.readouterr().err
+    assert Path(name).name in error
+    assert "Traceback" not in error
+    assert {path: path.read_bytes() for path in Path().rglob("*") if path.is_file()} == before
+
+
+def test_what_a_command_wrote_it_overwrites(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(results.parent)
+    for _ in range(2):
+        assert called(monkeypatch, "analyse", "report", "results") == 0
+        assert called(monkeypatch, "analyse", "gap", "results") == 0
+        assert called(monkeypatch, "analyse", "grade", "results", "--out", "tasks.json") == 0
+    assert json.loads(Path("tasks.json").read_text())["tasks"]
