@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from pipeline.compute.workers import LOGS
+from pipeline.compute.slurm import LOGS
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
 from pipeline.files import read_json, refuse_other_file, write
