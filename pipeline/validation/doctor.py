@@ -118,11 +118,13 @@ def _finished(config: Config) -> Diagnosis:
         rows = plan_stage.upcoming(config)
     except PipelineError as error:
         return Diagnosis("finished work", "warn", f"not known, as the run cannot be planned: {error.what}")
-    unneeded = dropped.measure(rows, config)
+    try:
+        unneeded, found = dropped.measure(rows, config), outdated(rows, config, gl.choose().device)
+    except PipelineError as error:
+        return Diagnosis("finished work", "fail", f"{error.where}: {error.what}", error.remedy or "")
     if unneeded.asks:
         remedy = "put the configuration back, give it another `name:`, or `REMAKE=1` before the command"
         return Diagnosis("finished work", "warn", f"no longer needed, and would be deleted: {unneeded}", remedy)
-    found = outdated(rows, config, gl.choose().device)
     if not found:
         return Diagnosis("finished work", "ok", "stays, or nothing was made yet")
     told = "; ".join(f"{number} {what}" for what, number in found.items())

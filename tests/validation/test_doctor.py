@@ -22,6 +22,7 @@ from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import machine
 from pipeline.run.work_time import REFERENCE
+from pipeline.stores.sealed_file import seal
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Extra
@@ -142,7 +143,7 @@ def test_demonstrations_count_by_their_files_and_before_by_what_is_published(sho
 def test_what_a_run_has_made_already_needs_no_more_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     link_testset(tmp_path)
-    frames = tmp_path / "data" / "starter" / "frames" / "0123" / "4567.npz"
+    frames = tmp_path / "data" / "starter" / "frames" / "0123" / "4567.h5"
     frames.parent.mkdir(parents=True)
     with frames.open("wb") as file:
         file.truncate(500_000_000)
@@ -256,7 +257,7 @@ def stored(folder: Path, *names: str) -> Path:
     """A run's folder with a file in each of these folders, as if made there."""
     for name in names:
         (folder / name / "0123").mkdir(parents=True)
-        (folder / name / "0123" / "4567.npz").touch()
+        seal(folder / name / "0123" / "4567.npz", {}, {"made_by": "another version"})
     return folder
 
 
@@ -343,3 +344,12 @@ def test_an_older_record_says_nothing_of_trials(tmp_path: Path) -> None:
     (folder / machine.FILE).write_text(json.dumps({"mujoco": "3.2.7", "ten steps": "89ab"}))
     machine.record(folder, TRIAL)
     assert machine.trials(folder)
+
+
+def test_a_damaged_file_is_a_finding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    link_testset(tmp_path)
+    folder = stored(tmp_path / "data" / "starter", "frames")
+    file = folder / "frames" / "0123" / "4567.npz"
+    file.write_bytes(file.read_bytes()[:-100])
+    assert run_doctor("starter", monkeypatch, free_gb=1) == 1
