@@ -28,15 +28,15 @@ from pipeline.seeding import digest
 Step = Literal["physics", "pixels", "encoding", "rlds", "lerobot", "lerobot_v21", "evaluation", "checks", "pictures"]
 
 RECIPES: dict[Step, int] = {
-    "physics": 7,
-    "pixels": 5,
+    "physics": 8,
+    "pixels": 6,
     "encoding": 1,
-    "rlds": 4,
+    "rlds": 5,
     "lerobot": 8,
     "lerobot_v21": 3,
-    "evaluation": 1,
-    "checks": 7,
-    "pictures": 5,
+    "evaluation": 2,
+    "checks": 8,
+    "pictures": 6,
 }
 """What a number stands for, the commit tells that raised it.
 
