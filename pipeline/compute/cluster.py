@@ -118,7 +118,7 @@ def workplace_of(client: Any, folder: Path) -> Iterator[Workplace]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     # Of a killed run, the next stage deletes it as it does all such files (``files.remove_leftovers``).
-    token = folder.absolute() / f".cluster-{uuid4().hex}.tmp"
+    token = folder.absolute() / f".cluster.{uuid4().hex}.tmp"
     workplace = Workplace(Path.cwd(), token, setup())
     token.touch()
     try:

@@ -200,13 +200,13 @@ def test_the_next_stage_deletes_what_a_killed_run_left_for_its_workers(cluster: 
     data, environment = tmp_path / "data", os.environ | {"PYTHONPATH": str(REPOSITORY)}
     busy = subprocess.Popen([sys.executable, "-c", BUSY, cluster((1, {})), str(data)], cwd=tmp_path, env=environment)
     deadline = time.monotonic() + 60
-    while not list(data.glob(".cluster-*")):
+    while not list(data.glob(".cluster.*")):
         assert busy.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.1)
     busy.kill()
     busy.wait()
-    assert list(data.glob(".cluster-*"))
+    assert list(data.glob(".cluster.*"))
     with locked(data):
         assert [entry.name for entry in data.iterdir()] == [".lock"]
 
