@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from pipeline.compute.slurm import LOGS
 from pipeline.errors import PipelineError
 from pipeline.evaluation.tasks import EvaluationTask, Prompt
-from pipeline.files import read_json, refuse_other_file, write
+from pipeline.files import is_temporary, read_json, refuse_other_file, write
 from pipeline.grouping import grouped
 from pipeline.seeding import digest
 
@@ -94,7 +94,7 @@ class EpisodeFiles:
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
         # A cluster's workers have files of their own there; an evaluation without any result has its summary.
-        names = [entry.name for entry in self.folder.iterdir() if not entry.name.startswith(".cluster-")]
+        names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
         if set(names) - {"summary.json", LOGS.parts[0]}:
             raise PipelineError(
                 f"holds files and no results of an evaluation: {', '.join(sorted(names)[:3])}",
