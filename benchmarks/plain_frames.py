@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="compare every so many frames of a stream")
     arguments = parser.parse_args()
     data = arguments.data.resolve()
-    config = load(data.parent.parent / read_json(data / "configuration.json")["configuration"])
+    config = load(data.resolve() / read_json(data / "configuration.json")["configuration"])
     store, trajectories = FrameStore(data / "frames", config.render), TrajectoryStore(data / "trajectories")
     shown = shown_of(store.rows())
     if any(each.device != gl.choose().device for each in shown.values()) or not shown:

@@ -8,7 +8,6 @@ and stay there if the upload is cut off: run again, only the rest is sent. (``up
 leaves notes among the files, shows half a dataset meanwhile, and tries for ever where a token may not write.)
 """
 
-import re
 from collections.abc import Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass
@@ -28,9 +27,7 @@ from pipeline.generated import record, unchanged
 from pipeline.grouping import grouped
 from pipeline.publish.card import REPOSITORY
 from pipeline.publish.repository import UPLOAD, Content, LastUpload, Repository, content_of, deletions, files_of, read
-
-OFT_STATISTICS = re.compile(r"dataset_statistics_[0-9a-f]{64}\.json")
-"""What OpenVLA-OFT's loader writes beside the shards when it trains without ``finetune/run_openvla_oft.py``."""
+from pipeline.run.export import OFT_STATISTICS
 
 FAILURES = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
 """What an upload raises. Only before huggingface-hub 1 there is a ``XetError``; only since then it speaks by httpx."""

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import chdir
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from pipeline.__main__ import main, parser
 from pipeline.files import edition
 from pipeline.libero.tasks import SUITES, tasks
 from pipeline.run import manifest
-from pipeline.run.stage import OWNER
+from pipeline.run.stage import claimed
 
 VERBS = {
     "demos": ("fetch", "expand", "check"),
@@ -211,12 +212,12 @@ def ablation(finished: Path, tmp_path_factory: pytest.TempPathFactory) -> Ablati
     clone, data = folder / "clone", folder / "elsewhere" / "tiny"
     shutil.copytree(finished.parent.parent, clone, symlinks=True)
     shutil.move(clone / "data" / "tiny", data)
-    (data / OWNER).unlink()  # Elsewhere, a folder is that of one checkout's configuration.
     (clone / "params.yaml").write_text("run: other\ndata: data\n")
+    configured(clone, folder=str(data.parent))
+    with chdir(clone):
+        claimed(Path("configs/tiny.yaml"))
     where = {"axis": ["clean", "camera"], "suite": ["libero_goal"]}
-    configured(
-        clone, folder=str(data.parent), export={"rlds": {"name": "libero_tiny"}, "lerobot": None, "where": where}
-    )
+    configured(clone, export={"rlds": {"name": "libero_tiny"}, "lerobot": None, "where": where})
     for name in ("plan.parquet", "report.html"):
         (data / name).unlink()
     names = ("trajectories", "frames", "lerobot", "previews")
