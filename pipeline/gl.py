@@ -67,10 +67,12 @@ def choose() -> GlChoice:
     what the run's own process chose (``WorkerSetup``).
 
     Raises:
-        PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does.
+        PipelineError: when ``MUJOCO_GL`` names something that does not render here, or when nothing does; or as
+            ``check_device``.
     """
     if _of_the_run is not None:
         return _of_the_run
+    check_device()
     asked = os.environ.get("MUJOCO_GL", "").lower().strip()
     device_named = "MUJOCO_EGL_DEVICE_ID" in os.environ
     faults = {}
@@ -93,6 +95,24 @@ def choose() -> GlChoice:
         f"{f'MUJOCO_GL={asked} does not render' if asked else 'no OpenGL renders'} here ({what or 'unknown'})",
         expected=" or ".join(BACKENDS),
         remedy=f"unset MUJOCO_GL; {REMEDY}" if asked else REMEDY,
+    )
+
+
+def check_device() -> None:
+    """Compare ``MUJOCO_EGL_DEVICE_ID`` with ``CUDA_VISIBLE_DEVICES``; robosuite cannot be imported if they disagree.
+
+    Raises:
+        PipelineError: when the first is not among the second.
+    """
+    device, visible = os.environ.get("MUJOCO_EGL_DEVICE_ID"), os.environ.get("CUDA_VISIBLE_DEVICES", "")
+    numbers = [number.strip() for number in visible.split(",")]
+    if device is None or not visible or (device.isdigit() and device in numbers):
+        return
+    named = [number for number in numbers if number.isdigit()]
+    raise PipelineError(
+        f"MUJOCO_EGL_DEVICE_ID={device} is not among CUDA_VISIBLE_DEVICES={visible}",
+        expected="one of its numbers, as robosuite renders on no other GPU",
+        remedy=f"export MUJOCO_EGL_DEVICE_ID={named[0]}, or unset it" if named else "unset MUJOCO_EGL_DEVICE_ID",
     )
 
 
@@ -152,7 +172,12 @@ def import_mujoco() -> None:
 
 @contextmanager
 def left_out() -> Iterator[None]:
-    """For a moment, have MuJoCo and robosuite load no OpenGL when they are imported, whatever ``MUJOCO_GL`` names."""
+    """For a moment, have MuJoCo and robosuite load no OpenGL when they are imported, whatever ``MUJOCO_GL`` names.
+
+    Raises:
+        PipelineError: as ``check_device``.
+    """
+    check_device()
     asked = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
     try:

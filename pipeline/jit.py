@@ -4,9 +4,12 @@ Numba keeps what it compiled beside the source, for all processes that come late
 once (``pipeline/validation/loops.py``).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
+
+from pipeline.errors import PipelineError
 
 DISPATCHERS: dict[str, Callable[[], Any]] = {}
 """Name of each compiled function to what gives Numba's dispatcher for it."""
@@ -25,7 +28,8 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
     def dispatcher() -> Any:
         from numba import njit
 
-        return njit(cache=True)(function)
+        with keeping_compiled():
+            return njit(cache=True)(function)
 
     DISPATCHERS[f"{function.__module__}.{function.__qualname__}"] = dispatcher
 
@@ -35,3 +39,24 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
         return result
 
     return call
+
+
+@contextmanager
+def keeping_compiled() -> Iterator[None]:
+    """Name the variable to set where Numba finds no folder for what it compiles.
+
+    Numba tries the source's folder and then ``~/.cache/numba``, for robosuite's loops as soon as they are imported.
+
+    Raises:
+        PipelineError: when neither can be written.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if "no locator available" not in str(error):
+            raise
+        raise PipelineError(
+            f"Numba has no folder to keep compiled loops in ({error})",
+            expected="a folder that can be written: that of the source, or ~/.cache/numba",
+            remedy="name one by the variable NUMBA_CACHE_DIR, such as `export NUMBA_CACHE_DIR=$PWD/numba`",
+        ) from error

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 
 from pipeline import gl
 from pipeline.errors import PipelineError
@@ -223,3 +224,34 @@ def test_a_render_node_that_the_user_may_not_open(machine: Path, nvidia: bool) -
     what, remedy = gl.idle_gpu() or ("", "")
     assert what == f"this user may not open {node}"
     assert "usermod -aG" in remedy
+
+
+@pytest.mark.parametrize(
+    ("device", "visible", "remedy"),
+    [
+        ("1", "0", "export MUJOCO_EGL_DEVICE_ID=0"),
+        ("1", "10,11", "export MUJOCO_EGL_DEVICE_ID=10"),
+        ("0", "GPU-8f", "unset MUJOCO_EGL_DEVICE_ID"),
+        ("auto", "0,1", "export MUJOCO_EGL_DEVICE_ID=0"),
+    ],
+)
+def test_a_device_that_the_job_was_not_given_is_named_with_both_variables(
+    device: str, visible: str, remedy: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MUJOCO_EGL_DEVICE_ID", device)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    for use in (choose, gl.import_mujoco):
+        with pytest.raises(PipelineError) as caught:
+            use()
+        assert caught.value.what == f"MUJOCO_EGL_DEVICE_ID={device} is not among CUDA_VISIBLE_DEVICES={visible}"
+        assert remedy in str(caught.value.remedy)
+
+
+def test_doctor_names_both_variables_without_a_traceback(tmp_path: Path) -> None:
+    """In a process of its own, as robosuite looks at both when it is imported."""
+    environment = os.environ | {"MUJOCO_EGL_DEVICE_ID": "1", "CUDA_VISIBLE_DEVICES": "0", "COLUMNS": "300"}
+    command = [sys.executable, "-m", "pipeline", "doctor", str(REPOSITORY / "configs" / "starter.yaml")]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "MUJOCO_EGL_DEVICE_ID=1 is not among CUDA_VISIBLE_DEVICES=0" in done.stderr

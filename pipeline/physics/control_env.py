@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline import gl
 from pipeline.errors import PipelineError
+from pipeline.jit import keeping_compiled
 from pipeline.libero.assets import package_folder
 from pipeline.types import Task
 
@@ -20,10 +21,14 @@ PLACEMENT_TRIES = 50
 
 
 def control_env() -> Any:
-    """LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner."""
+    """LIBERO's ``ControlEnv`` class, imported without OpenGL and without robosuite's banner.
+
+    Raises:
+        PipelineError: as ``gl.check_device`` and ``jit.keeping_compiled``.
+    """
     logging.disable(logging.WARNING)
     try:
-        with gl.left_out():
+        with gl.left_out(), keeping_compiled():
             if "robosuite" not in sys.modules:
                 _set_macros()
             from libero.libero.envs.env_wrapper import ControlEnv

@@ -92,15 +92,23 @@ def run(config: Config, *, tried: bool = False) -> int:
     left_mb = (max(0.0, mb - size_mb(config.data / folder)) for folder, mb in needed_mb(config).items())
     findings = check(config, max(sum(left_mb), RUN_MB) / 1e3)
     if all(finding.status != "fail" for finding in findings):
-        speed = (machine.known_speed(config.data) if tried else None) or machine.trial().speed
-        time = in_words(needed_s(config, speed), workers_of(config.compute))
-        findings += [*([] if tried else [_same(config.data)]), _finished(config), Diagnosis("time", "ok", time)]
+        findings += _tried(config, tried)
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
         table.add_row(Text(finding.status, style=styles[finding.status]), *cells)
     Console(stderr=True, highlight=False).print(table)
     return int(any(finding.status == "fail" for finding in findings))
+
+
+def _tried(config: Config, tried: bool) -> list[Diagnosis]:
+    """What takes a trial, unless it was made before."""
+    try:
+        speed = (machine.known_speed(config.data) if tried else None) or machine.trial().speed
+    except PipelineError as error:
+        return [Diagnosis("trial", "fail", error.what, error.remedy or "")]
+    time = in_words(needed_s(config, speed), workers_of(config.compute))
+    return [*([] if tried else [_same(config.data)]), _finished(config), Diagnosis("time", "ok", time)]
 
 
 def _same(data: Path) -> Diagnosis:

@@ -160,12 +160,7 @@ def test_long_instructions_and_test_tasks_of_ones_own(root: Path, monkeypatch: p
     assert note.startswith("my_suite/long: the instruction has 44 words and marks")
     assert "SmolVLA and pi0 read 48 tokens" in note
     assert "tested.bddl: has the scene of LIBERO-Plus's test task libero_goal/" in fault
-    said_run = {
-        "name": "own",
-        "demos": {"root": "own", "tasks": ["my_suite/long"]},
-        "plan": {"episodes": {"camera": 1}},
-    }
-    (warning,) = doctor._instructions(Config.model_validate(said_run).demos)
+    (warning,) = doctor._instructions(DemosConfig(root=Path("own"), tasks=("my_suite/long",)))
     assert warning.status == "warn"
 
 
