@@ -15,7 +15,7 @@ from conftest import BOWL, STOVE, link_testset, starter_demo, tiny_config
 from pydantic import ValidationError
 
 from pipeline.compute.pool import loop
-from pipeline.config import Config, ReplayConfig
+from pipeline.config import Config, DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.physics.environment import Environment
