@@ -16,6 +16,7 @@ from pipeline.catalogue.object_model import ObjectModel
 from pipeline.catalogue.objects import TEST_CATEGORIES, goes_with, models, taken
 from pipeline.config import ReplayConfig
 from pipeline.errors import PipelineError, RefusedError
+from pipeline.libero.bddl import Arena
 from pipeline.libero.starts import HOME_RAD, recorded_start
 from pipeline.libero.tasks import tasks
 from pipeline.physics.environment import Environment
@@ -118,6 +119,23 @@ def test_regions_are_those_of_the_test_set() -> None:
         )
         assert front + back >= 0.95 * places.total(), arena
         assert known.front_share == pytest.approx(front / (front + back), abs=0.01), arena
+
+
+@pytest.mark.parametrize("arena", ["tabletop", "kitchen", "living_room", "floor"])
+def test_places_are_on_the_cameras_side_as_often_as_the_test_s(arena: Arena) -> None:
+    """At x > 0.19 m, where a place is drawn first; one that does not fit there is drawn in the other region."""
+    tested = [
+        float(pair.split(",")[0])
+        for test in benchmark.load(REPOSITORY / benchmark.FOLDER).of("layout")
+        if test.parameters["arena"] == arena
+        for pair in str(test.parameters["positions"]).split(";")
+    ]
+    drawn = []
+    for key in range(1000):
+        keyed = seeding.rng("side", arena, key)
+        first, _ = REGIONS[arena].order(keyed)
+        drawn.append(first.draw(keyed)[0])
+    assert np.mean(np.array(drawn) > 0.19) == pytest.approx(np.mean(np.array(tested) > 0.19), abs=0.13)
 
 
 def within(region: Region, at_m: Sequence[float]) -> bool:
