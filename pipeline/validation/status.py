@@ -97,7 +97,8 @@ def _steps(
     if not rows:
         yield "plan", "there is no plan yet"
         return
-    of_plan = not plan_stage.is_up_to_date(config)
+    files_changed = bool(_changed(config.data / "inputs.json", inputs.listing(config)))
+    of_plan = files_changed or not plan_stage.is_up_to_date(config)
     if of_plan:
         yield "plan", _why_planned(config)
     made_anew = outdated(rows, config)
