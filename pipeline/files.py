@@ -195,7 +195,7 @@ def remove_leftovers(folder: Path) -> None:
     Only for who holds a lock that keeps all others, on every host, from writing there: a name does not say whether its
     process still lives on another host.
     """
-    for entry in folder.iterdir():
+    for entry in folder.glob(".*.tmp"):  # Nothing if the folder does not exist.
         if is_temporary(entry.name):
             _discard(entry)
 

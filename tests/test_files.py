@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from conftest import limited
 
-from pipeline.files import keep_below, replaced
+from pipeline.files import keep_below, remove_leftovers, replaced
 
 
 def test_two_that_write_the_same_file_do_not_disturb_each_other(tmp_path: Path) -> None:
@@ -42,3 +42,13 @@ def test_files_that_the_program_did_not_make_stay(tmp_path: Path) -> None:
     ]
     keep_below(tmp_path, {tmp_path / "a"})
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "kept.npz"]
+
+
+def test_leftovers_of_a_folder_that_is_not_there_are_none(tmp_path: Path) -> None:
+    """As before the first object of a user's own is converted."""
+    remove_leftovers(tmp_path / "objects")
+    kept, left = tmp_path / ".notes.tmp", tmp_path / ".model.01ef.tmp"
+    kept.touch()
+    left.touch()
+    remove_leftovers(tmp_path)
+    assert list(tmp_path.iterdir()) == [kept]
