@@ -294,7 +294,7 @@ def _evaluated(group: Sequence[Stored], alike: Sequence[EpisodeResult]) -> Evalu
         ((f"{row} by {row.policy}", {"episode": row.episode}, files.path(row.episode)) for row, files in acted),
         "a task counts twice: ",
         expected="one episode of each task",
-        remedy="name only one of the two files",
+        remedy="move one of the two files into another folder",
     )
     settings = group[0][0].settings
     differing = [key for key in settings if any(row.settings.get(key) != settings[key] for row in alike)]
