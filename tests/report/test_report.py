@@ -60,7 +60,7 @@ def test_needs_nothing_beside_itself(html: str) -> None:
 
 def _rendered(**values: Any) -> str:
     """The text of a page of a run without episodes, but for what ``values`` have."""
-    names = ("yields", "axes", "overall", "lengths", "quality", "worst", "seen", "rewrites", "videos")
+    names = ("yields", "axes", "overall", "lengths", "quality", "worst", "seen", "rewrites", "videos", "shortfalls")
     tables = ("headline", "by_axis", "coverage", "leakage", "sheets", "previews", "versions", "origins")
     empty: dict[str, Any] = {**dict.fromkeys(names, ()), **{name: {} for name in tables}}
     texts = {"name": "tiny", "example": "", "settings": "", "sample": seen.SAMPLE}
