@@ -161,7 +161,8 @@ class Format(ABC, Generic[Options]):
 
     @abstractmethod
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
-        """What is off with the dataset as a whole, each with ``format``, ``ids`` or ``readable`` as the check's name.
+        """List what is off with the dataset as a whole, each with the check's name: ``format``, ``ids``, ``splits`` or
+        ``readable``.
 
         Args:
             kept: episode id to its row of the manifest.

@@ -88,7 +88,7 @@ class LeRobot(Format[LeRobotConfig]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import lerobot_check
 
-        return lerobot_check.check(self.root, cache, kept, self._convention.columns(self.extras))
+        return lerobot_check.check(self.root, cache, kept, self._convention, self.extras, self.options.validation)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_read

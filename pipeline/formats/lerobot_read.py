@@ -18,7 +18,8 @@ from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.lerobot_columns import EPISODE_ID, INSTANCES, LANGUAGE, OBJECT_POSES, camera_column
-from pipeline.formats.read_back import Copy, sampled
+from pipeline.formats.lerobot_statistics import QUANTILES, matrix
+from pipeline.formats.read_back import Copy, Statistics, sampled
 from pipeline.types import Episode, Extra, Frame, Geometry
 
 UNREADABLE = (
@@ -38,11 +39,8 @@ UNREADABLE = (
 MARKS = ("frame_index", "timestamp")
 """LeRobot's columns that tell steps apart."""
 
-QUANTILES = ("q01", "q10", "q50", "q90", "q99")
-"""lerobot's statistics of a whole set beside mean, deviation and range; pi0.5 normalises by them."""
-
-SAME_SHARE, SAME = 1e-4, 1e-6
-"""Largest relative and absolute difference between stored statistics and those of the columns."""
+NUMBERS = ("float32", "int64")
+"""Types of the columns that have statistics, in addition to frames."""
 
 
 def read(root: Path, episode_id: str, extras: tuple[Extra, ...]) -> Copy | None:
@@ -78,7 +76,7 @@ def _opened(info_file: Edition) -> tuple[dict[str, Any], dict[str, dict[str, Any
     meta = info_file.path.parent
     info: dict[str, Any] = json.loads(info_file.path.read_text())
     info["tasks"] = {row["task_index"]: row["task"] for row in pq.read_table(meta / "tasks.parquet").to_pylist()}
-    files = sorted((meta / "episodes").rglob("*.parquet"))
+    files = episode_files(meta.parent)
     names = [name for name in pq.read_schema(files[0]).names if not name.startswith("stats/")]
     episodes = [row for file in files for row in pq.read_table(file, columns=names).to_pylist()]
     provenance = pq.read_table(meta / "provenance.parquet").to_pylist()
@@ -121,7 +119,39 @@ def copy_of(root: Path, row: Mapping[str, Any], extras: tuple[Extra, ...]) -> Co
         place={"lerobot_episode_index": index},
         said=table[LANGUAGE].to_pylist() if LANGUAGE in table.column_names else None,
         train=index < int(info["splits"]["train"].partition(":")[2]),
+        statistics=Statistics(
+            _statistics(root, row),
+            {name: matrix(table, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS},
+            {view: spec.lerobot_key for view, spec in SCHEMA.views.items()},
+            QUANTILES,
+        ),
     )
+
+
+def episode_files(root: Path) -> list[Path]:
+    """List the files of ``meta/episodes``."""
+    return sorted((root / "meta" / "episodes").rglob("*.parquet"))
+
+
+def _statistics(root: Path, row: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Read what ``meta/episodes`` states of an episode's columns."""
+    chunk, number = _file(row, "meta/episodes")
+    table, places = _stated(edition(root / f"meta/episodes/chunk-{chunk:03d}/file-{number:03d}.parquet"))
+    (values,) = table.slice(places[row["episode_index"]], 1).to_pylist()
+    stated: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        column, _, figure = name.removeprefix("stats/").rpartition("/")
+        stated.setdefault(column, {})[figure] = value
+    return stated
+
+
+@lru_cache(maxsize=2)
+def _stated(file: Edition) -> tuple[pa.Table, dict[int, int]]:
+    """The statistics in a file of ``meta/episodes``, and the number of each episode to its place there."""
+    names = [name for name in pq.read_schema(file.path).names if name.startswith("stats/")]
+    table = pq.read_table(file.path, columns=["episode_index", *names])
+    places = {index: place for place, index in enumerate(table["episode_index"].to_pylist())}
+    return table.select(names), places
 
 
 def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> None:
@@ -141,30 +171,6 @@ def refuse_others(table: pa.Table, row: Mapping[str, Any], first_step: int) -> N
             raise ValueError(f"by {name}, these are not the {steps} steps of episode {index}")
 
 
-def vectors(file: Path, columns: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Column of a data file to its vectors (T, D)."""
-    table = pq.read_table(file, columns=[*columns])
-    return {column: _matrix(table, column) for column in columns}
-
-
-def wrong_statistics(
-    stored: Mapping[str, Any], steps: Sequence[Mapping[str, NDArray[Any]]], quantiles: Sequence[str] = ()
-) -> Iterator[tuple[str, str]]:
-    """What is off with the stored statistics of the ``vectors`` of some files, and what these come to.
-
-    Args:
-        quantiles: names of those to look at too, such as q01.
-    """
-    for column in steps[0]:
-        values = np.concatenate([of_file[column] for of_file in steps], dtype=float)
-        wanted = {name: getattr(values, name)(axis=0) for name in ("mean", "std", "min", "max")}
-        shares = [int(name[1:]) / 100 for name in quantiles]
-        wanted |= dict(zip(quantiles, np.quantile(values, shares, axis=0), strict=True))
-        for name, expected in (wanted | {"count": np.array([len(values)])}).items():
-            if not np.allclose(stored[column][name], expected, rtol=SAME_SHARE, atol=SAME):
-                yield f"{name} of {column} is {stored[column][name]} in the statistics", f"{expected.tolist()}"
-
-
 def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: tuple[Extra, ...]) -> Episode:
     """An episode, from v3.0's columns of its steps and its row of ``meta/provenance.parquet``; frames where those are
     image files."""
@@ -175,13 +181,13 @@ def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: t
             for view, spec in SCHEMA.views.items()
             if spec.lerobot_key in table.column_names
         },
-        state=_matrix(table, SCHEMA.state.lerobot_key),
-        joint_state=_matrix(table, SCHEMA.joint_state.lerobot_key),
-        action=_matrix(table, SCHEMA.action.lerobot_key),
+        state=matrix(table, SCHEMA.state.lerobot_key),
+        joint_state=matrix(table, SCHEMA.joint_state.lerobot_key),
+        action=matrix(table, SCHEMA.action.lerobot_key),
         instruction=instruction,
         provenance=row,
         geometry={view: _geometry(table, row, view, extras) for view in SCHEMA.views},
-        object_poses=_matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
+        object_poses=matrix(table, OBJECT_POSES).reshape(-1, *SCHEMA.object_poses.shape)
         if "object_poses" in extras
         else None,
         instances=json.loads(row[INSTANCES]) if named(extras) else (),
@@ -204,12 +210,6 @@ def _footer(data_file: Edition) -> tuple[pq.FileMetaData, NDArray[np.int64]]:
     """What a data file says of itself, and the rows at which its row groups end."""
     footer = pq.read_metadata(data_file.path)
     return footer, np.cumsum([footer.row_group(group).num_rows for group in range(footer.num_row_groups)])
-
-
-def _matrix(table: pa.Table, column: str) -> NDArray[Any]:
-    """(T, D) of a column of vectors."""
-    values = table[column].combine_chunks()
-    return np.asarray(values.flatten().to_numpy().reshape(len(values), -1))
 
 
 def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:

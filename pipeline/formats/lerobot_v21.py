@@ -76,7 +76,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import lerobot_v21_read
 
-        return lerobot_v21_read.check(self.folder, kept, self.convention, self.extras)
+        return lerobot_v21_read.check(self.folder, kept, self.convention, self.extras, self.options.validation)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import lerobot_v21_read

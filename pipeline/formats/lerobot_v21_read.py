@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +12,14 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from pipeline.episode_schema import SCHEMA
+from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
 from pipeline.formats.lerobot_columns import EPISODE_ID, Convention
-from pipeline.formats.lerobot_read import (
-    MARKS,
-    QUANTILES,
-    decoded,
-    episode,
-    readable,
-    refuse_others,
-    vectors,
-    wrong_statistics,
-)
-from pipeline.formats.lerobot_v21_write import data_path, video_path
-from pipeline.formats.read_back import Copy, Fault
+from pipeline.formats.lerobot_meta import as_json, described, wrong_modality, wrong_tasks, wrong_video
+from pipeline.formats.lerobot_read import MARKS, NUMBERS, decoded, episode, readable, refuse_others
+from pipeline.formats.lerobot_statistics import FIGURES, matrix, wrong_frames, wrong_in_dataset
+from pipeline.formats.lerobot_v21_write import DATA_PATH, EPISODES_OF_A_CHUNK, VIDEO_PATH, data_path, video_path
+from pipeline.formats.read_back import Copy, Fault, Statistics, in_both_splits, unlike
 from pipeline.types import Extra
 
 NAME, VERSION = "lerobot_v21", "v2.1"
@@ -42,63 +37,94 @@ def open_all(folder: Path) -> None:
 
 
 def check(
-    folder: Path, kept: Mapping[str, Row], convention: Convention, extras: tuple[Extra, ...]
+    folder: Path, kept: Mapping[str, Row], convention: Convention, extras: tuple[Extra, ...], validation: float = 0.0
 ) -> Iterator[tuple[str, Fault]]:
-    """Version, frame rate, robot, the columns' names and shapes, all totals, the files and statistics of every episode
-    and of no other, as many episodes as were kept, and what actions and states of each and of all come to.
+    """Compare the sets as a whole with what their files hold: every field of ``meta/info.json``, the tasks, the splits,
+    the files of every episode, the videos' own properties, and the statistics of all columns, computed again.
 
     Raises:
         PipelineError: when a set cannot be opened.
     """
-    episodes: list[str] = []
+    split_of: dict[str, str] = {}
     for root in _sets(folder):
         with readable(root, VERSION):
-            info, rows, tasks = _opened(root, _modified_ns(root))
-            stats = {line["episode_index"]: line["stats"] for line in _lines(root / "meta" / "episodes_stats.jsonl")}
-            wrong = list(_wrong_statistics(root, stats, convention))
-        videos = [key for key, of in info["features"].items() if of["dtype"] == "video"]
-        indices = [row["episode_index"] for row in rows.values()]
-        files = [*map(data_path, indices), *(video_path(index, key) for index in indices for key in videos)]
-        wanted = {
-            "codebase_version": VERSION,
-            "fps": SCHEMA.fps_hz,
-            "robot_type": convention.robot_type,
-            "total_episodes": len(rows),
-            "total_frames": sum(row["length"] for row in rows.values()),
-            "total_tasks": len(tasks),
-            "total_videos": len(rows) * len(videos),
-        }
-        read = {name: info.get(name) for name in wanted}
-        read["columns"] = {name: _described(of) for name, of in info["features"].items()}
-        wanted["columns"] = {name: _described(of) for name, of in convention.columns(extras).items()}
-        read["files"] = sorted(str(file.relative_to(root)) for file in root.glob("*/chunk-*/**/*") if file.is_file())
-        wanted["files"] = sorted(files)
-        read["episodes with statistics"], wanted["episodes with statistics"] = [*stats], indices
-        for name, expected in wanted.items():
-            if read[name] != expected:
-                yield "format", Fault(NAME, None, f"{root.name}: {name} {_short(read[name])}", _short(expected))
+            _, rows, _ = _opened(root, _modified_ns(root))
+            faults = list(_format(root, convention, extras))
+            wrong = list(_wrong_statistics(root, convention, extras))
+        yield from (("format", fault) for fault in faults)
         for what, expected in wrong:
             yield "format", Fault(NAME, None, f"{root.name}: {what}", expected)
-        episodes += rows
-    if len(episodes) != len(kept):
-        yield "ids", Fault(NAME, None, f"{len(episodes)} episodes", f"{len(kept)}")
+        for episode_id in rows.keys() & split_of.keys():
+            yield "ids", Fault(NAME, episode_id, f"is in {root.name} and in another set", "one set")
+        split_of |= dict.fromkeys(rows, "val" if root.name.endswith("_val") else "train")
+    if len(split_of) != len(kept):
+        yield "ids", Fault(NAME, None, f"{len(split_of)} episodes", f"{len(kept)}")
     # One that is missing is told where it is looked for.
-    for episode_id in set(episodes) - kept.keys():
+    for episode_id in split_of.keys() - kept.keys():
         yield "ids", Fault(NAME, episode_id, "is in the dataset", "kept episodes alone")
+    splits, wanted = set(split_of.values()), {"train", "val"} if validation else {"train"}
+    if splits != wanted:
+        yield "format", Fault(NAME, None, f"the sets are for {sorted(splits)}", f"{sorted(wanted)}")
+    yield from in_both_splits(NAME, split_of, kept)
 
 
-def _wrong_statistics(
-    root: Path, of_episodes: Mapping[int, Mapping[str, Any]], convention: Convention
-) -> Iterator[tuple[str, str]]:
-    """Of the whole set, and of each episode whose file is there."""
-    measured = [convention.name(spec.lerobot_key) for spec in (SCHEMA.action, SCHEMA.state)]
-    of_all = json.loads((root / "meta" / "stats.json").read_text())
-    steps = {file: vectors(file, measured) for file in sorted(root.glob("data/**/*.parquet"))}
-    yield from wrong_statistics(of_all, [*steps.values()], QUANTILES)
-    for index, stored in of_episodes.items():
-        if (of_episode := steps.get(root / data_path(index))) is not None:
-            for what, expected in wrong_statistics(stored, [of_episode]):
-                yield f"{what} of episode {index}", expected
+def _format(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[Fault]:
+    """Compare what ``meta/`` of a set states with its files and its episodes."""
+    info, rows, _ = _opened(root, _modified_ns(root))
+    tasks = _lines(root / "meta" / "tasks.jsonl")
+    columns = as_json(described(convention, extras))
+    videos = [key for key, of in columns.items() if of["dtype"] == "video"]
+    indices = [row["episode_index"] for row in rows.values()]
+    files = [*map(data_path, indices), *(video_path(index, key) for index in indices for key in videos)]
+    wanted = {
+        "codebase_version": VERSION,
+        "robot_type": convention.robot_type,
+        "total_episodes": len(rows),
+        "total_frames": sum(row["length"] for row in rows.values()),
+        "total_tasks": len(tasks),
+        "total_videos": len(rows) * len(videos),
+        "total_chunks": len({file.split("/")[1] for file in files}),
+        "chunks_size": EPISODES_OF_A_CHUNK,
+        "fps": SCHEMA.fps_hz,
+        "splits": {"train": f"0:{len(rows)}"},
+        "data_path": DATA_PATH,
+        "video_path": VIDEO_PATH if videos else None,
+        "features": columns,
+    }
+    within = f"{root.name}: "
+    yield from unlike(NAME, info, wanted, within)
+    there = [file.relative_to(root).as_posix() for file in root.glob("*/chunk-*/**/*") if file.is_file()]
+    stated = [line["episode_index"] for line in _lines(root / "meta" / "episodes_stats.jsonl")]
+    read = {"fields of info.json": sorted(info), "files": sorted(there), "episodes with statistics": stated}
+    expected = {"fields of info.json": sorted(wanted), "files": sorted(files), "episodes with statistics": indices}
+    yield from unlike(NAME, read, expected, within)
+    lines = _lines(root / "meta" / "episodes.jsonl")
+    read = {"episode_index": [line.get("episode_index") for line in lines]}
+    read["fields of episodes.jsonl"] = sorted({(*sorted(line),) for line in lines})
+    expected = {"episode_index": [*range(len(rows))]}
+    expected["fields of episodes.jsonl"] = [("episode_id", "episode_index", "length", "tasks")]
+    yield from unlike(NAME, read, expected, within)
+    yield from wrong_tasks(NAME, tasks, [row["tasks"][0] for row in rows.values()])
+    if convention.open_is_one:
+        yield from wrong_modality(NAME, root, columns, convention)
+    # Those of a set are alike: one of each view is opened, and of the others the frames that are decoded.
+    for key in videos:
+        yield from wrong_video(NAME, root / video_path(indices[0], key), info["features"][key]["info"])
+
+
+def _wrong_statistics(root: Path, convention: Convention, extras: tuple[Extra, ...]) -> Iterator[tuple[str, str]]:
+    """Compare ``meta/stats.json`` with all steps, and for frames with the statistics of the episodes."""
+    stored = json.loads((root / "meta" / "stats.json").read_text())
+    yield from wrong_in_dataset(stored, sorted(root.glob("data/**/*.parquet")), convention.columns(extras))
+    views = [convention.name(view.lerobot_key) for view in SCHEMA.views.values()]
+    figures: dict[tuple[str, str], list[Any]] = {(view, name): [] for view in views for name in FIGURES}
+    with (root / "meta" / "episodes_stats.jsonl").open() as lines:
+        for line in lines:
+            stats = json.loads(line)["stats"]
+            for view, name in figures:
+                figures[view, name].append(np.ravel(stats[view][name]))
+    for view in views:
+        yield from wrong_frames(view, stored[view], {name: np.array(figures[view, name]) for name in FIGURES})
 
 
 def read(folder: Path, episode_id: str, convention: Convention, extras: tuple[Extra, ...]) -> Copy | None:
@@ -109,17 +135,22 @@ def read(folder: Path, episode_id: str, convention: Convention, extras: tuple[Ex
     """
     for root in _sets(folder):
         with readable(root, VERSION):
-            _, rows, tasks = _opened(root, _modified_ns(root))
+            info, rows, tasks = _opened(root, _modified_ns(root))
             if episode_id in rows:
-                return _copy(root, rows[episode_id], tasks, convention, extras)
+                return _copy(root, info, rows[episode_id], tasks, convention, extras)
     return None
 
 
 def _copy(
-    root: Path, row: Mapping[str, Any], tasks: Mapping[int, str], convention: Convention, extras: tuple[Extra, ...]
+    root: Path,
+    info: Mapping[str, Any],
+    row: Mapping[str, Any],
+    tasks: Mapping[int, str],
+    convention: Convention,
+    extras: tuple[Extra, ...],
 ) -> Copy:
     index = row["episode_index"]
-    table = pq.read_table(root / data_path(index))
+    stored = table = pq.read_table(root / data_path(index))
     refuse_others(table, row, row["first_step"])
     instructions = [tasks[task] for task in table["task_index"].to_pylist()]
     if row["tasks"] != [instructions[0]]:
@@ -132,7 +163,30 @@ def _copy(
     keys = {view: convention.name(spec.lerobot_key) for view, spec in SCHEMA.views.items()}
     videos = {view: (root / video_path(index, key), 0.0) for view, key in keys.items() if convention.frames == "video"}
     marks = {name: table[name].to_numpy() for name in MARKS}
-    return Copy(NAME, made, instructions, decoded(table["timestamp"].to_pylist(), videos), marks, {})
+    numbers = {name: matrix(stored, name) for name, of in info["features"].items() if of["dtype"] in NUMBERS}
+    statistics = Statistics(_statistics(root, index), numbers, keys)
+    shown = decoded(table["timestamp"].to_pylist(), videos)
+    return Copy(NAME, made, instructions, shown, marks, {}, statistics=statistics)
+
+
+def _statistics(root: Path, index: int) -> dict[str, Any]:
+    """Read what ``meta/episodes_stats.jsonl`` states of an episode's columns."""
+    file = root / "meta" / "episodes_stats.jsonl"
+    with file.open("rb") as lines:
+        lines.seek(_begins(edition(file))[index])
+        line = json.loads(lines.readline())
+    if line["episode_index"] != index:
+        raise ValueError(f"line {index} of {file.name} is of episode {line['episode_index']}")
+    stats: dict[str, Any] = line["stats"]
+    return stats
+
+
+@lru_cache(maxsize=8)
+def _begins(file: Edition) -> list[int]:
+    """Where the lines of a file begin, in bytes."""
+    with file.path.open("rb") as lines:
+        lengths = [len(line) for line in lines]
+    return [0, *accumulate(lengths)]
 
 
 def _sets(folder: Path) -> list[Path]:
@@ -158,12 +212,3 @@ def _opened(root: Path, modified_ns: int) -> tuple[dict[str, Any], dict[str, dic
 
 def _lines(file: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in file.read_text().splitlines()]
-
-
-def _described(column: Mapping[str, Any]) -> tuple[Any, ...]:
-    return column["dtype"], tuple(column["shape"]), tuple(column["names"] or ())
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    return text if len(text) < 200 else f"{text[:200]}…"

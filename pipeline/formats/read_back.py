@@ -1,6 +1,6 @@
 """What is found where a dataset is read back: its copies of episodes, its files, and what is off with either."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,23 @@ class Fault:
 
 
 @dataclass(frozen=True)
+class Statistics:
+    """What a dataset states of an episode's columns, and the columns.
+
+    Attributes:
+        stored: column to the name of a figure to its values.
+        numbers: column to what it has at each step, (T, D).
+        views: view to the column of its frames.
+        quantiles: names of the quantiles that are stated of an episode.
+    """
+
+    stored: Mapping[str, Mapping[str, Any]]
+    numbers: Mapping[str, NDArray[Any]]
+    views: Mapping[str, str]
+    quantiles: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
 class Copy:
     """An episode as a dataset hands it out.
 
@@ -41,6 +58,7 @@ class Copy:
         place: where it lies, by the format's columns of the manifest.
         said: lerobot's language column, the entries of each step; None where the dataset has none.
         train: whether it is there to train on.
+        statistics: those of the episode; None where the dataset states none.
     """
 
     dataset: str
@@ -51,6 +69,7 @@ class Copy:
     place: Mapping[str, Any]
     said: Sequence[Sequence[Mapping[str, Any]]] | None = None
     train: bool = True
+    statistics: Statistics | None = None
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -85,6 +104,41 @@ class Written:
         except OSError as error:
             return [Fault(self.dataset, None, f"{self.file}: cannot be read ({error})", expected)]
         return [] if same else [Fault(self.dataset, None, f"{self.file}: was changed since it was written", expected)]
+
+
+def in_both_splits(
+    dataset: str, split_of: Mapping[str, str], kept: Mapping[str, Mapping[str, Any]]
+) -> Iterator[tuple[str, Fault]]:
+    """Find demonstrations with episodes in two splits: validation would know the actions from training.
+
+    All that was expanded from one human demonstration counts as that one.
+
+    Args:
+        split_of: episode id to its split.
+        kept: episode id to its row of the manifest.
+    """
+    first: dict[tuple[str, str], str] = {}
+    for episode_id, split in split_of.items():
+        if (row := kept.get(episode_id)) is None:
+            continue  # Reported as a foreign one.
+        task = row["demo_id"].rpartition("/")[0]
+        origin = (task, row.get("demo_origin_sha256") or row["demo_id"])
+        other = split_of[first.setdefault(origin, episode_id)]
+        if other != split:
+            what = f"is in {split}, and {first[origin]} of the same demonstration {row['demo_id']} in {other}"
+            yield "splits", Fault(dataset, episode_id, what, "one split for all episodes of a demonstration")
+
+
+def unlike(dataset: str, read: Mapping[str, Any], wanted: Mapping[str, Any], within: str = "") -> Iterator[Fault]:
+    """Compare what files state, by the name of the statement, with what they should state."""
+    for name, expected in wanted.items():
+        if read.get(name) != expected:
+            yield Fault(dataset, None, f"{within}{name} is {_short(read.get(name))}", _short(expected))
+
+
+def _short(value: object) -> str:
+    text = str(value)
+    return text if len(text) < 200 else f"{text[:200]}…"
 
 
 def sampled(steps: int) -> list[int]:

@@ -80,7 +80,7 @@ class Rlds(Format[RldsConfig]):
     def check(self, kept: Mapping[str, Row], cache: Path) -> Iterator[tuple[str, Fault]]:
         from pipeline.formats import rlds_read
 
-        return rlds_read.check(self.folder, kept, self.extras)
+        return rlds_read.check(self.folder, kept, self.extras, self.options.validation)
 
     def read(self, row: Row, cache: Path) -> Copy | None:
         from pipeline.formats import rlds_read

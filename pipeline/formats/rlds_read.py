@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import tensorflow_datasets as tfds
+from google.protobuf import json_format
 
 from pipeline.episode_schema import MAPS, MATRICES, SCHEMA, named, provenance_of
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import Edition, edition
 from pipeline.formats.base import Row
-from pipeline.formats.read_back import Copy, Fault
-from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets
+from pipeline.formats.read_back import Copy, Fault, in_both_splits, unlike
+from pipeline.formats.rlds_layout import VERSION, dataset_of, datasets, split_of
 from pipeline.formats.rlds_write import features
-from pipeline.formats.tfrecord import METADATA, columns, record_at, records, spans
+from pipeline.formats.rlds_write import texts as rlds_texts
+from pipeline.formats.tfrecord import METADATA, OVERHEAD_BYTES, columns, record_at, records, spans
 from pipeline.types import Episode, Extra, Geometry
 
 MARKS = ("is_first", "is_last", "is_terminal", "reward", "discount")
@@ -35,8 +37,13 @@ def open_all(root: Path) -> None:
         _info(folder)
 
 
-def check(root: Path, kept: Mapping[str, Row], extras: tuple[Extra, ...]) -> Iterator[tuple[str, Fault]]:
-    """The feature tree of this version, all shards there and whole, and as many episodes as were kept."""
+def check(
+    root: Path, kept: Mapping[str, Row], extras: tuple[Extra, ...], validation: float = 0.0
+) -> Iterator[tuple[str, Fault]]:
+    """Compare the sets as a whole with what their files hold: the feature tree of this version, every field of
+    ``dataset_info.json`` that readers go by, all shards there and whole, as many episodes as were kept, and no
+    demonstration in two splits.
+    """
     stored = 0
     present = {file.parent.parent.name for file in root.glob("*/*/dataset_info.json")}
     for name in sorted(present | {dataset_of(row) for row in kept.values()}):
@@ -44,26 +51,76 @@ def check(root: Path, kept: Mapping[str, Row], extras: tuple[Extra, ...]) -> Ite
         info = _info(folder)
         if info.features.to_json() != features(extras).to_json():
             yield "format", Fault("rlds", None, f"features.json of {name} is another", "the one of this version")
-        lengths = {
-            shard: length
-            for split_info in info.splits.values()
-            for shard, length in zip(split_info.filenames, split_info.shard_lengths, strict=True)
-        }
-        there = {path.name for path in folder.glob("*.tfrecord-*")}
-        if set(lengths) != there:
-            yield "format", Fault("rlds", None, f"{name} has the shards {sorted(there)}", f"{sorted(lengths)}")
-        for shard in sorted(there):
+        counts: dict[str, int] = {}
+        for shard in sorted(folder.glob("*.tfrecord-*")):
             try:
-                count = sum(1 for _ in spans(folder / shard))
-                if count != lengths.get(shard):
-                    expected = f"{lengths.get(shard)}, as dataset_info.json says"
-                    yield "readable", Fault("rlds", None, f"{shard} has {count} records", expected)
-                stored += count
+                counts[shard.name] = sum(1 for _ in spans(shard))
             except PipelineError as error:
                 yield "readable", Fault("rlds", None, str(error), "a whole file")
+        for shard_name, length in _lengths(info).items():
+            if shard_name in counts and counts[shard_name] != length:
+                expected = f"{length}, as dataset_info.json says"
+                yield "readable", Fault("rlds", None, f"{shard_name} has {counts[shard_name]} records", expected)
+        yield from (("format", fault) for fault in _wrong_info(folder, info, counts, extras))
+        stored += sum(counts.values())
     # One that is missing is told where it is looked for.
     if stored > len(kept):
         yield "ids", Fault("rlds", None, f"has {stored} episodes, foreign ones or some twice", f"{len(kept)}")
+    split_names = {split_of(file) for file in root.glob("*/*/*.tfrecord-*")}
+    wanted = {"train", "val"} if validation else {"train"}
+    if split_names != wanted:
+        yield "format", Fault("rlds", None, f"the splits are {sorted(split_names)}", f"{sorted(wanted)}")
+    # Each episode is where its row says, as the check ``place`` makes sure.
+    yield from in_both_splits("rlds", {one: split_of(Path(row["rlds_shard"])) for one, row in kept.items()}, kept)
+
+
+def _lengths(info: Any) -> dict[str, int]:
+    """Name of each shard to the number of its episodes, as ``dataset_info.json`` has it."""
+    lengths: dict[str, int] = {}
+    for split_info in info.splits.values():
+        lengths |= dict(zip(split_info.filenames, split_info.shard_lengths, strict=True))
+    return lengths
+
+
+def _wrong_info(folder: Path, info: Any, counts: Mapping[str, int], extras: tuple[Extra, ...]) -> Iterator[Fault]:
+    """Compare ``dataset_info.json`` of a set with its shards.
+
+    Args:
+        counts: name of each shard that is whole to the number of its records.
+    """
+    name = folder.parent.name
+    bytes_of: dict[str, int] = {}
+    for shard, count in counts.items():
+        split_name = split_of(Path(shard))
+        stored = (folder / shard).stat().st_size - OVERHEAD_BYTES * count
+        bytes_of[split_name] = bytes_of.get(split_name, 0) + stored
+    stated = json.loads((folder / "dataset_info.json").read_text())
+    there = sorted(path.name for path in folder.glob("*.tfrecord-*"))
+    read = {
+        "name": stated.get("name"),
+        "version": stated.get("version"),
+        "fileFormat": stated.get("fileFormat"),
+        "filepathTemplate": sorted({split.get("filepathTemplate") for split in stated.get("splits", [])}),
+        "shards": sorted(_lengths(info)),
+        "number of bytes": {split.name: split.num_bytes for split in info.splits.values()},
+        "description": stated.get("description"),
+        "homepage": stated.get("location", {}).get("urls"),
+        "citation": stated.get("citation"),
+        "license": stated.get("redistributionInfo", {}).get("license"),
+    }
+    texts = {key: text.strip() for key, text in rlds_texts(extras).items()}
+    wanted: dict[str, Any] = {
+        "name": name,
+        "version": VERSION,
+        "fileFormat": "tfrecord",
+        "filepathTemplate": ["{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"],
+        "shards": there,
+        **texts,
+        "homepage": [texts["homepage"]],
+    }
+    if len(counts) == len(there):
+        wanted["number of bytes"] = bytes_of
+    yield from unlike("rlds", read, wanted, f"{name}: ")
 
 
 def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
@@ -75,11 +132,11 @@ def read(root: Path, row: Row, extras: tuple[Extra, ...]) -> Copy | None:
     episode_id = row["episode_id"]
     folder = root / dataset_of(row) / VERSION
     place: Place | None = (folder / row["rlds_shard"], row["rlds_index"])
-    steps = _columns(place)
-    if steps is None or _id(steps) != episode_id:
-        place = _places(tuple(map(edition, sorted(root.glob("*/*/*.tfrecord-*"))))).get(episode_id)
-        steps = _columns(place)
     try:
+        steps = _columns(place)
+        if steps is None or _id(steps) != episode_id:
+            place = _places(tuple(map(edition, sorted(root.glob("*/*/*.tfrecord-*"))))).get(episode_id)
+            steps = _columns(place)
         return None if place is None or steps is None else _copy(steps, place, extras)
     except KeyError as error:
         raise PipelineError(f"has no feature {error}", where=f"episode {episode_id}") from error
@@ -102,7 +159,7 @@ def _places(shards: tuple[Edition, ...]) -> dict[str, Place]:
         try:
             for index, record in enumerate(records(shard)):
                 places[_id(columns(record, _info(shard.parent).features))] = (shard, index)
-        except PipelineError:
+        except (PipelineError, KeyError):
             continue  # Told by ``check``, or by ``read`` of the record.
     return places
 
@@ -110,7 +167,7 @@ def _places(shards: tuple[Edition, ...]) -> dict[str, Place]:
 def _info(folder: Path) -> Any:
     try:
         return _opened(edition(folder / "dataset_info.json"))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, AssertionError, json_format.Error) as error:
         raise PipelineError(
             f"{type(error).__name__}: {error}", where=folder, expected="a set that TFDS opens", remedy=MAKE_AGAIN
         ) from error
@@ -118,7 +175,9 @@ def _info(folder: Path) -> Any:
 
 @lru_cache(maxsize=8)
 def _opened(info_file: Edition) -> Any:
-    return tfds.builder_from_directory(info_file.path.parent).info
+    info = tfds.builder_from_directory(info_file.path.parent).info
+    _lengths(info)  # Raises where the names of the shards do not follow from what is stated.
+    return info
 
 
 def _geometry(steps: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:

@@ -57,7 +57,6 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
                 name=split_name, shard_lengths=list(shards.values()), num_bytes=stored, filename_template=template
             )
         )
-    kept, end = ("miss the goal", "failure") if "outcome" in extras else ("solve the task", "success")
     tfds.folder_dataset.write_metadata(
         data_dir=folder,
         features=features(extras),
@@ -65,12 +64,21 @@ def write_metadata(folder: Path, lengths: Mapping[Path, int], extras: tuple[Extr
         version=VERSION,
         filename_template=template,
         check_data=False,  # the check needs TensorFlow
-        description=f"LIBERO demonstrations, perturbed, replayed in simulation and kept when they {kept}. "
-        f"Robot: Franka Panda. Every episode ends in {end}; episode_metadata says what was changed.",
-        homepage="https://libero-project.github.io",
-        citation=schema_file("citation.bib").read_text(),
-        license="LIBERO's demonstrations: CC BY 4.0. README.md of the dataset names what its textures and objects owe.",
+        **texts(extras),
     )
+
+
+def texts(extras: tuple[Extra, ...] = ()) -> dict[str, str]:
+    """What ``dataset_info.json`` says to people."""
+    kept, end = ("miss the goal", "failure") if "outcome" in extras else ("solve the task", "success")
+    return {
+        "description": f"LIBERO demonstrations, perturbed, replayed in simulation and kept when they {kept}. "
+        f"Robot: Franka Panda. Every episode ends in {end}; episode_metadata says what was changed.",
+        "homepage": "https://libero-project.github.io",
+        "citation": schema_file("citation.bib").read_text(),
+        "license": "LIBERO's demonstrations: CC BY 4.0. README.md of the dataset names what its textures and objects "
+        "owe.",
+    }
 
 
 @cache

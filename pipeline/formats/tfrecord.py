@@ -104,11 +104,13 @@ def columns(record: bytes, features: Any) -> dict[str, NDArray[Any]]:
     """
     try:
         example = _parser(features).parse_example(record)
-    except KeyError as error:
+        return dict(_flat(example["steps"])) | dict(_flat(example.get("episode_metadata", {}), METADATA))
+    except (LookupError, ValueError, TypeError) as error:
         raise PipelineError(
-            f"a record has no feature {error}", expected="what features.json names", remedy="write the dataset again"
+            f"a record cannot be read by features.json ({type(error).__name__}: {error})",
+            expected="the features that it names",
+            remedy="write the dataset again",
         ) from error
-    return dict(_flat(example["steps"])) | dict(_flat(example.get("episode_metadata", {}), METADATA))
 
 
 @lru_cache(maxsize=8)

@@ -1,6 +1,6 @@
 """One episode wherever it lies, which the checks look at."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -48,6 +48,7 @@ class Case:
         trajectory: the replay that it was rendered from.
         copies: as each dataset has it, as far as it could be read.
         bank: the run's own bank of rewrites.
+        witness: whether it is one of the few of which all frames are decoded.
     """
 
     row: Mapping[str, Any]
@@ -55,6 +56,17 @@ class Case:
     trajectory: Trajectory
     copies: Sequence[Copy]
     bank: Path | None
+    witness: bool = False
+
+    @cached_property
+    def levels(self) -> dict[str, NDArray[np.int64]]:
+        """View to how often each level occurs in each channel of all of its stored frames, (3, 256)."""
+        return {view: _levels(map(decode, files)) for view, files in self.made.frames.items()}
+
+    @cached_property
+    def sampled_levels(self) -> dict[str, NDArray[np.int64]]:
+        """View to the same of its sampled frames."""
+        return {view: _levels(seen.frames.values()) for view, seen in self.stored.items()}
 
     @cached_property
     def stored(self) -> dict[str, Seen]:
@@ -91,3 +103,10 @@ class Case:
 
     def finding(self, dataset: str, what: str, expected: object) -> Fault:
         return Fault(dataset, self.made.episode_id, what, str(expected))
+
+
+def _levels(frames: Iterable[Frame]) -> NDArray[np.int64]:
+    counts = np.zeros((3, 256), np.int64)
+    for frame in frames:
+        counts += [np.bincount(frame[..., channel].ravel(), minlength=256) for channel in range(3)]
+    return counts

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pipeline.axes import TextPerturbation, from_json, of_layer
 from pipeline.axes.language import LanguagePerturbation, deal
 from pipeline.episode_schema import MATRICES, MOTION, SCHEMA
+from pipeline.formats.lerobot_statistics import FIGURES, complete, wrong_numbers, wrong_pixels, wrong_sample
 from pipeline.formats.read_back import Copy, Fault
 from pipeline.libero.tasks import WITHOUT_DEBRIS, debris, find_task
 from pipeline.run.manifest import OWN_VERSION
@@ -228,6 +229,31 @@ def clock(case: Case) -> Iterator[Fault]:
         yield from _marked(case, copy, {"frame_index": step, "timestamp": step / SCHEMA.fps_hz})
 
 
+def statistics(case: Case) -> Iterator[Fault]:
+    """Statistics of each episode: of its numbers, computed again, and of its frames, by the stored frames."""
+    for copy in case.whole:
+        if (found := copy.statistics) is None:
+            continue
+        wrong: list[tuple[str, str]] = []
+        if found.stored.keys() != found.numbers.keys() | {*found.views.values()}:
+            wrong.append((f"states the columns {sorted(found.stored)}", f"{sorted(found.numbers)} and the views"))
+        figures = (*FIGURES, *found.quantiles)
+        for column, values in found.numbers.items():
+            stated = found.stored.get(column, {})
+            lacking = [*complete(column, stated, figures, values.shape[1])]
+            wrong += lacking or wrong_numbers(column, stated, values, found.quantiles)
+        for view, column in found.views.items():
+            stated = found.stored.get(column, {})
+            if lacking := [*complete(column, stated, figures, 3)]:
+                wrong += lacking
+                continue
+            wrong += wrong_sample(column, stated, case.sampled_levels[view], len(case.made))
+            if case.witness:
+                wrong += wrong_pixels(column, stated, case.levels[view], found.quantiles)
+        for what, expected in wrong:
+            yield case.finding(copy.dataset, what, expected)
+
+
 def _marked(case: Case, copy: Copy, wanted: Mapping[str, NDArray[Any]]) -> Iterator[Fault]:
     for name in sorted(copy.marks.keys() & wanted.keys()):
         values, expected = copy.marks[name], wanted[name]
@@ -250,5 +276,5 @@ def _listed(place: Mapping[str, Any]) -> str:
 Check = Callable[[Case], Iterable[Fault]]
 
 _EVERY = (length, motion, instruction, wording, provenance, place, jpeg, geometry, video, cameras, alive, gripper)
-CHECKS: Mapping[str, Check] = {check.__name__: check for check in (*_EVERY, flags, clock)}
+CHECKS: Mapping[str, Check] = {check.__name__: check for check in (*_EVERY, flags, clock, statistics)}
 """Name to check."""

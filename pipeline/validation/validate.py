@@ -38,6 +38,9 @@ from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
 from pipeline.validation.rerender import rendered, witnesses
 
+WHOLE = 4
+"""So many of the episodes that are rendered anew have all frames decoded, for the statistics of their views."""
+
 SLICE = 16
 """So many episodes are checked in one call, where no scene has to be opened for them."""
 
@@ -155,13 +158,13 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
 
 
 def _as_a_whole(one: Format[Any], episodes: Mapping[str, Row], cache: Path) -> Results:
-    results = Results()
+    results, found = Results(), []
     try:
-        found = list(one.check(episodes, cache))
+        for named in one.check(episodes, cache):
+            found.append(named)
     except PipelineError as error:
         results.note("readable", [_unreadable(one, error)], 0)
-        return results
-    for check, checked in (("format", 1), ("ids", len(episodes)), ("readable", 0)):
+    for check, checked in (("format", 1), ("ids", len(episodes)), ("splits", len(episodes)), ("readable", 0)):
         results.note(check, [fault for named, fault in found if named == check], checked)
     return results
 
@@ -246,7 +249,8 @@ class EpisodesJob:
             quality = measure(trajectory, find_task(row["suite"], row["task"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
         language = self.config.plan.axes.language
-        case = Case(row, made, trajectory, copies, language.bank if language else None)
+        witness = episode_id in sorted(self.witnesses)[:WHOLE]
+        case = Case(row, made, trajectory, copies, language.bank if language else None, witness)
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:

@@ -1,30 +1,36 @@
 """Compare everything that a run stored with the checksums that it was stored with."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from typing import Any
 
 from pipeline.compute.pool import Workers
 from pipeline.config import Config
-from pipeline.errors import PipelineError
+from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.files import read_json
 from pipeline.formats.read_back import Written
 from pipeline.formats.registry import recorded
+from pipeline.planning import plan
+from pipeline.run import manifest, outcome
 from pipeline.stores.frame_store import FrameStore
-from pipeline.stores.store import Store
+from pipeline.stores.store import TABLE, Store
 from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.tables import read_table
 
 
 def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
-    """Read every stored file of a run: trajectories, frames and the datasets.
+    """Read every stored file of a run: trajectories, frames, the datasets and the tables.
 
     Returns:
-        JSON-serialisable: what was read to how many files were ``checked``, and which are ``damaged``, each with what
-        to do about it.
+        JSON-serialisable: the part of the run to how many files were ``checked``, and which are ``damaged`` or gone,
+        each with what to do about it.
     """
     results: dict[str, dict[str, Any]] = {}
     stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
     for name, store in zip(("trajectories", "frames"), stores, strict=True):
-        results[name] = _result(workers(partial(_damaged, store), store.names(), name))
+        there = store.names()
+        found = [*workers(partial(_damaged, store), there, name), *_gone(store, there)]
+        results[name] = _result(found)
     for one in recorded(config.data, config.export, config.render.extras):
         name = one.folder.relative_to(config.data).as_posix()
         try:
@@ -34,7 +40,42 @@ def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
             continue
         faults = workers(Written.faults, files, one.title)
         results[name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
+    results["tables"] = _result(_unreadable(read) for read in _readers(config))
+    if not any(result["damaged"] for result in results.values()):
+        # A file may be gone with the table that lists it; the plan still needs it.
+        results["episodes"] = _result([_unreadable(partial(outcome.read, config))])
     return results
+
+
+def _gone(store: Store, there: Sequence[str]) -> list[list[str]]:
+    """Find the files that a store's table lists and that are not there; nothing where there is no table."""
+    file = store.root / TABLE
+    if not file.exists():
+        return []
+    try:
+        listed = {str(row["file"]) for row in read_table(file, ["file"], MAKE_AGAIN).to_pylist()}
+    except PipelineError as error:
+        return [[str(error)]]
+    what = f"{file} lists it, and it is gone; `{MAKE_AGAIN}` makes it again"
+    return [[f"{store.path(name)}: {what}"] for name in sorted(listed - {*there})]
+
+
+def _readers(config: Config) -> list[Callable[[], object]]:
+    """Functions that read each table of a run, which has no checksum."""
+    readers: list[Callable[[], object]] = [
+        partial(plan.read, config.data / "plan.parquet"),
+        partial(manifest.read, config.data / "manifest.parquet"),
+    ]
+    names = ["counts.json", "leakage.json", *(["dataset_statistics.json"] if config.export.rlds else [])]
+    return [*readers, *(partial(read_json, config.data / name) for name in names)]
+
+
+def _unreadable(read: Callable[[], object]) -> list[str]:
+    try:
+        read()
+    except PipelineError as error:
+        return [str(error)]
+    return []
 
 
 def _damaged(store: Store, file: str) -> list[str]:

@@ -115,6 +115,9 @@ EXPECTED = {
     ("motion", "lerobot", CHANGED),
     ("clock", "lerobot", LATE),
     ("video", "lerobot", LATE),  # Read by the time of the step, the frame is the next step's.
+    ("statistics", "lerobot", CHANGED),  # Those that are stated are of the action and the times before.
+    ("statistics", "lerobot", LATE),
+    ("format", "rlds", None),  # dataset_info.json states the bytes of the shards before.
     ("openvla_oft", "rlds", None),  # Its statistics are not those of the changed actions.
     ("format", "lerobot", None),  # 10 frames a second, says info.json.
     ("place", "manifest", "other"),

@@ -30,6 +30,34 @@ def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -
     assert not any(result["damaged"] for result in results.values())
 
 
+@pytest.mark.parametrize("part", ["trajectories", "frames"])
+def test_check_finds_a_deleted_file(part: str, finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    config = load(finished.parent.parent / "configs" / "tiny.yaml")
+    files = sorted((data / part).rglob("*.[!p]*"))  # All but the table.
+    stored = [file for file in files if file.is_file()]
+    stored[0].unlink()
+    with chdir(tmp_path):
+        with_table = verify(config, loop)[part]
+        (data / part / "index.parquet").unlink()
+        without_table = verify(config, loop)
+    (told,) = with_table["damaged"]
+    assert (with_table["checked"], told.partition(":")[0]) == (len(stored), str(stored[0].relative_to(tmp_path)))
+    assert "gone" in told
+    assert [what for result in without_table.values() for what in result["damaged"]]
+
+
+@pytest.mark.parametrize("name", ["plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json"])
+def test_check_finds_a_deleted_table(name: str, finished: Path, tmp_path: Path) -> None:
+    data = tmp_path / "data" / "tiny"
+    shutil.copytree(finished, data)
+    (data / name).unlink()
+    with chdir(tmp_path):
+        results = verify(load(finished.parent.parent / "configs" / "tiny.yaml"), loop)
+    assert any(name in what for what in results["tables"]["damaged"])
+
+
 def test_a_changed_dataset_is_not_read_any_further(
     finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
