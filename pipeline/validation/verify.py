@@ -73,7 +73,7 @@ def _readers(config: Config) -> list[Callable[[], object]]:
 def _unreadable(read: Callable[[], object]) -> list[str]:
     try:
         read()
-    except PipelineError as error:
+    except (PipelineError, OSError) as error:
         return [str(error)]
     return []
 
@@ -83,7 +83,7 @@ def _damaged(store: Store, file: str) -> list[str]:
         with store.opened(file) as opened:
             for array in opened.checksums:
                 opened.array(array)
-    except PipelineError as error:
+    except (PipelineError, OSError) as error:
         return [str(error)]
     return []
 

@@ -16,8 +16,9 @@ from pipeline.episode_schema import SCHEMA
 from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
+from pipeline.formats.lerobot_statistics import DEVIATION, FIGURES, MEAN_LEVELS
 from pipeline.formats.lerobot_video import ENCODER, OPTIONS, planes
-from pipeline.formats.read_back import Copy, sampled
+from pipeline.formats.read_back import Copy, Statistics, sampled
 from pipeline.images.jpeg import decode
 from pipeline.report import figures
 from pipeline.report.sheets import Tile, sheet, side_by_side, spread
@@ -107,12 +108,18 @@ def checks() -> dict[str, Any]:
         marks={"is_first": np.arange(steps) == 1, "timestamp": np.arange(steps) / 10},
         place={"place": 2},
         said=[[{"role": "user", "style": "task_aug", "timestamp": 0.0, "content": "task_1"}]] * steps,
+        statistics=Statistics(
+            {"state": {name: [0.5] * 8 for name in FIGURES} | {"count": [1]}},
+            {"state": made.state},
+            {view: view},
+        ),
     )
     blank = replace(wrong, dataset="blank", decoded={place: frame * 0 for place, frame in shown.items()})
     case = Case(row, made, trajectory, [whole, wrong, blank], None)
     found = {name: len(list(check(case))) for name, check in of_episodes.CHECKS.items()}
     limits = {name: value for name, value in vars(of_episodes).items() if isinstance(value, float)}
-    return {"found": found, "limits": limits | {"fresh PSNR dB": rerender.PSNR_DB}}
+    limits |= {"fresh PSNR dB": rerender.PSNR_DB, "mean levels": MEAN_LEVELS, "deviation": DEVIATION}
+    return {"found": found, "limits": limits}
 
 
 def pictures() -> dict[str, str]:
