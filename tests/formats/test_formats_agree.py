@@ -85,7 +85,10 @@ from synthetic import IDS, write_lerobot, write_rlds
 folder = Path(tempfile.mkdtemp(dir=sys.argv[1]))
 write_lerobot(folder)
 made = write_rlds(folder)
-rows = {name: {**made.record().places[name], "episode_id": name, "suite": "synthetic", "steps": 1} for name in IDS}
+rows = {}
+for name in IDS:
+    told = {"episode_id": name, "demo_id": name, "suite": "synthetic", "steps": 1}
+    rows[name] = {**made.record().places[name], **told}
 assert all(made.read(row, folder) for row in rows.values())
 list(made.check(rows, folder))
 print(sorted({"torch", "tensorflow", "lerobot"} & sys.modules.keys()))
@@ -109,7 +112,7 @@ def test_extras_are_further_features(written: Written, tmp_path: Path) -> None:
     rlds = write_rlds(tmp_path, with_extras, extras=EXTRAS)
     lerobot_set = write_lerobot(tmp_path, with_extras, extras=EXTRAS)
     plain, tree = rlds_write.features(), rlds_write.features(EXTRAS)
-    rows = {episode_id: {**rlds.record().places[episode_id], "episode_id": episode_id} for episode_id in IDS}
+    rows = {name: {**rlds.record().places[name], "episode_id": name, "demo_id": name} for name in IDS}
     for episode_id, row in rows.items():
         source = with_extras(episode_id)
         for copy in (rlds.read(row, tmp_path / "cache"), lerobot_set.read(row, tmp_path / "cache")):

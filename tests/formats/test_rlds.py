@@ -119,7 +119,7 @@ def test_rlds_holds_the_episodes(written: Written) -> None:
 
 def test_a_set_with_an_episode_too_many_or_a_foreign_shard_is_found(tmp_path: Path) -> None:
     target = write_rlds(tmp_path)
-    places = target.record().places
+    places = {name: {**place, "demo_id": name} for name, place in target.record().places.items()}
     assert list(target.check(places, tmp_path)) == []
     ((check, fault),) = target.check({one: places[one] for one in IDS[1:]}, tmp_path)
     assert (check, fault.what) == ("ids", "has 6 episodes, foreign ones or some twice")

@@ -312,7 +312,7 @@ def test_what_is_no_address_is_refused(endpoint: str) -> None:
     [
         ("(define (problem x)", "not a BDDL file"),
         ("(define (problem x) (:language do it))", "has no :objects"),
-        ("(define (problem x) ())", "not a BDDL file"),
+        ("(define (problem x) ())", "empty parentheses"),
         (None, "cannot be read"),
     ],
 )
