@@ -43,7 +43,7 @@ def check(arguments: argparse.Namespace) -> int:
     """read all that a run stored, compare it with its checksums, and read its RLDS as OpenVLA-OFT does
 
     Says which files are not what was written, and what OpenVLA-OFT would train on and what would mislead it. The last
-    line is JSON. Ends with 1 where something is off: delete a damaged file, and the run makes it anew. (The stage
+    line is JSON. Ends with 1 where something is off: move a damaged file away, and the run makes it again. (The stage
     validate, which is a part of every run, compares the content of the datasets with each other and with the plan.)
     """
     from pipeline.clients import oft

@@ -98,7 +98,7 @@ class Written:
 
     def faults(self) -> list[Fault]:
         """What is off with it, by reading all of it: nothing, or that it is not what was written."""
-        expected = f"what its checksum in {self.dataset}.json is of; delete it, and `{MAKE_AGAIN}` makes it again"
+        expected = f"what its checksum in {self.dataset}.json is of; move it away, and `{MAKE_AGAIN}` makes it again"
         try:
             same = checksum(self.file) == self.sha256
         except OSError as error:

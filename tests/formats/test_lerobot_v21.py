@@ -91,7 +91,7 @@ def test_v21_does_not_depend_on_workers_and_keeps_extras(convention: str, tmp_pa
         two = write_lerobot_v21(tmp_path / "two", convention, with_extras, run, EXTRAS)
         # Another number of pieces, and so another identity, but the same files.
         assert files(one.folder) == files(two.folder)
-    kept = {episode_id: {"episode_id": episode_id} for episode_id in IDS}
+    kept = {episode_id: {"episode_id": episode_id, "demo_id": episode_id} for episode_id in IDS}
     assert list(two.check(kept, tmp_path)) == []
     for episode_id in IDS:
         source, copy = with_extras(episode_id), two.read(kept[episode_id], tmp_path)

@@ -26,7 +26,7 @@ def test_verify_finds_a_flipped_bit(part: str, finished: Path, tmp_path: Path) -
         results = verify(config, loop)
     (told,) = results.pop(part)["damaged"]
     assert str(file.relative_to(data)) in told
-    assert "delete" in told
+    assert "move" in told
     assert not any(result["damaged"] for result in results.values())
 
 
