@@ -24,7 +24,7 @@ from pipeline.compute.pool import runner
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import DemosConfig, PlanConfig, RenderConfig, ReplayConfig
 from pipeline.errors import PipelineError
-from pipeline.identity import made_with
+from pipeline.identity import REMAKE, made_with
 from pipeline.machine_code import SETTINGS
 from pipeline.planning import plan
 from pipeline.run.render_job import RenderJob
@@ -127,7 +127,8 @@ def test_two_runs_on_one_cluster_are_what_they_are_without_it(
     for folder in (here, there):
         folder.mkdir()
         inputs(folder, short_demos, "please switch on the stove now")
-    # The second run has its plan, its frames and its datasets where the first had them.
+    # The second run has its plan, its frames and its datasets where the first had them, which it may delete.
+    monkeypatch.setenv(REMAKE, "1")
     made = [run(there, configuration("demos", address, seed), monkeypatch) for seed in (7, 8)]
     alone = run(here, configuration("demos", "loop", 8), monkeypatch)
     assert made[0] != made[1]
