@@ -299,7 +299,7 @@ def test_dvc_runs_nothing_twice_and_only_what_a_change_concerns(
         (
             ("export", "lerobot_v21"),
             {"name": "tiny", "convention": "ipec"},
-            {"export_lerobot", "validate", "recipe", "card", "report"},
+            {"export_lerobot", "manifest", "validate", "recipe", "card", "report"},
         ),
         (("render", "jpeg_quality"), 90, {"render", "report"}),
         (("compute", "workers"), 5, set()),
