@@ -219,7 +219,7 @@ def test_a_batch_has_the_actions_that_follow_and_what_was_told(tmp_path: Path, m
 
     monkeypatch.chdir(tmp_path)
     vectors = sentences.read()
-    batch = Steps(read(small(tmp_path, tmp_path)), numbered(), vectors).batch(np.random.default_rng(0), 50)
+    batch = Steps(read(small(tmp_path, tmp_path / "demos")), numbered(), vectors).batch(np.random.default_rng(0), 50)
     first = batch[ACTION][:, 0, 0]
     assert set(first.tolist()) == {0, 1, 2, 3, 4}
     for number, actions, pad, told in zip(first, batch[ACTION], batch["action_is_pad"], batch[SENTENCE], strict=True):
@@ -240,7 +240,7 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, mo
     from safetensors.torch import load_file
 
     monkeypatch.chdir(tmp_path)
-    experiment, vectors, taken = read(small(tmp_path, tmp_path)), sentences.read(), []
+    experiment, vectors, taken = read(small(tmp_path, tmp_path / "demos")), sentences.read(), []
     learning_rate = training.learning_rate
 
     def stopped(step: int, config: Any) -> float:

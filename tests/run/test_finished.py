@@ -111,15 +111,17 @@ def test_a_finished_dataset_is_made_anew_only_where_that_was_allowed(
     identity._parts.cache_clear()
 
 
-def test_a_lost_shard_and_a_damaged_trajectory_are_made_again(clone: Path, config: Config) -> None:
+def test_a_lost_shard_is_made_again_and_a_damaged_trajectory_once_it_is_moved_away(clone: Path, config: Config) -> None:
     shard = largest(config.data / "rlds")
     trajectory = next((config.data / "trajectories").glob("*.npz"))
     before = shard.read_bytes(), trajectory.read_bytes()
     shard.unlink()
     trajectory.write_bytes(before[1][: len(before[1]) // 2])
-    stale = config.data / "trajectories" / "stale.npz"
-    stale.write_bytes(b"of an earlier plan")
+    stopped = dvc(clone, "repro")
+    assert stopped.returncode != 0
+    assert f"{trajectory.name}: damaged" in stopped.stdout + stopped.stderr
+    assert len(trajectory.read_bytes()) == len(before[1]) // 2
+    trajectory.rename(clone / trajectory.name)
     done = dvc(clone, "repro")
     assert done.returncode == 0, done.stdout + done.stderr
     assert (shard.read_bytes(), trajectory.read_bytes()) == before
-    assert not stale.exists()

@@ -70,7 +70,7 @@ def test_a_reserve_is_replayed_where_frames_are_refused_and_a_rerun_changes_noth
     clone = tmp_path / "clone"
     fields = reserved(short_demos)
     in_a_clone(fields, clone)
-    for name in ("machine.json", ".finished/doctor.json"):  # The machine was tried for that run.
+    for name in ("configuration.json", "machine.json", ".finished/doctor.json"):  # The machine was tried for that run.
         copy_of(f"data/tiny/{name}", finished.parent.parent, clone)
     made(clone, "replay")
     replayed = set((clone / "data/tiny/trajectories").glob("*.npz"))
