@@ -96,7 +96,7 @@ class Work:
         # What a policy did that was trained before under the same settings is not this one's.
         label = f"{policy.name}_{weights[:8]}"
         folder = self.out / "evaluations" / label
-        tasks = folder / "tasks.json"
+        tasks, own_tasks = (self.out / "task_lists" / f"{label}{part}.json" for part in ("", "_own"))
         tested = evaluation.tested(self.experiment)
         write_tasks(tested, 0, tasks)
         server = running(str(HERE / "server.py"), "--args.folder", str(policy))
@@ -104,8 +104,8 @@ class Work:
             words = ["evaluate", str(folder), "--server", address, "--label", label, "--tasks-from", str(tasks)]
             run("-m", "pipeline", *words)
             own, black = [task for task in tested if task.source == "libero"], folder / "black"
-            write_tasks(own, 0, folder / "own.json")
-            words[1], words[-1] = str(black), str(folder / "own.json")
+            write_tasks(own, 0, own_tasks)
+            words[1], words[-1] = str(black), str(own_tasks)
             run("-m", "pipeline", *words, "--black", "all")
             reading = evaluation.tell(self.experiment, address, folder / "reading")
         dataset = self.dataset(arm)

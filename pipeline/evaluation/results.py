@@ -93,9 +93,9 @@ class EpisodeFiles:
         refuse_other_file(self.folder / "summary.json", '"by_axis": ')
         if not self.folder.exists() or (self.folder / "episodes").is_dir():
             return
-        # Workers of a cluster and lists of tasks lie there; an evaluation without any result has its summary.
+        # Workers of a cluster have files of their own there; an evaluation without any result has its summary.
         names = [entry.name for entry in self.folder.iterdir() if not is_temporary(entry.name)]
-        if set(names) - {"summary.json", "tasks.json", LOGS.parts[0]}:
+        if set(names) - {"summary.json", LOGS.parts[0]}:
             raise PipelineError(
                 f"holds files and no results of an evaluation: {', '.join(sorted(names)[:3])}",
                 where=self.folder,

@@ -4,14 +4,9 @@ The stages ``plan``, ``replay`` and ``render`` ask here before they replace or d
 ``doctor`` report the same.
 """
 
-import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
-
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
@@ -23,15 +18,11 @@ from pipeline.run import machine
 from pipeline.run.outcome import MISSED, rejections, rendered
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
 from pipeline.stores.frame_store import FrameStore, shown_of
-from pipeline.stores.store import TABLE, Store
 from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
 from pipeline.types import Verdict
 
 LARGEST_SHARE = 0.1
 """The share of the finished work that stages delete without a question."""
-
-Rows = Mapping[str, Mapping[str, Any]]
-"""Name of a stored file to its row of the store's table."""
 
 
 @dataclass(frozen=True)
@@ -74,14 +65,14 @@ def measure(rows: Sequence[plan.Row], config: Config) -> Dropped:
     encoded = config.render.model_dump(mode="json")
     all_s = dropped_s = 0.0
     unneeded_streams = 0
-    replayed = _finished(replays)
+    replayed = replays.rows_of_all_settings()
     unneeded = replayed.keys() - trajectories
     for name, row in replayed.items():
         took_s = replay_s(row["steps"], speed)
         all_s += took_s
         dropped_s += took_s * (name in unneeded)
-    settings = _settings(frames)
-    for name, row in _finished(frames).items():
+    settings = frames.settings_by_fingerprint()
+    for name, row in frames.rows_of_all_settings().items():
         other = settings.get(row["made_by"], encoded) != encoded
         of_file = {(name.split("/")[0], stream) for stream in row["streams"]}
         gone = of_file if other else of_file - streams
@@ -140,23 +131,6 @@ def _replays(config: Config) -> TrajectoryStore:
 
 def _frames(config: Config) -> FrameStore:
     return FrameStore(config.data / "frames", config.render)
-
-
-def _finished(store: Store) -> Rows:
-    """Every finished file that can be read or that the table on disk lists, also those of other settings."""
-    path = store.root / TABLE
-    listed: Iterable[dict[str, Any]] = pq.read_table(path).to_pylist() if path.exists() else ()
-    there = {row["file"]: row for row in listed if store.path(row["file"]).exists()}
-    return there | store.rows()
-
-
-def _settings(store: Store) -> dict[str, Any]:
-    """Fingerprint of stored files to the settings that they were made with, as far as the table says so."""
-    try:
-        made_with = json.loads(pq.read_schema(store.root / TABLE).metadata[b"made_with"])
-    except (OSError, pa.ArrowException, LookupError, TypeError, ValueError):
-        return {}
-    return {made_by: made["settings"] for made_by, made in made_with.items()}
 
 
 def _hours(seconds: float) -> str:

@@ -154,6 +154,19 @@ class Store(ABC):
                 told.setdefault(name, {})
         return believed, told.keys() - believed.keys()
 
+    def rows_of_all_settings(self) -> dict[str, dict[str, Any]]:
+        """Map the name of each file that ``rows`` or the table lists to its row, also files with other settings.
+
+        Raises:
+            PipelineError: as ``rows``.
+        """
+        listed, _ = self._table()
+        return {name: row for name, row in listed.items() if self.path(name).exists()} | self.rows()
+
+    def settings_by_fingerprint(self) -> dict[str, object]:
+        """Map each fingerprint that the table knows to the settings that its files were written with."""
+        return {made_by: made_with["settings"] for made_by, made_with in self._known().items()}
+
     def row(self, name: str) -> dict[str, Any] | None:
         """Read one row from its file; ``None`` when the file is missing or not up to date.
 
