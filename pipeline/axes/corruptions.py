@@ -124,7 +124,9 @@ class Zoom(Frozen):
         """(copies,) the magnifications, as ``np.arange`` computes them from the step between two."""
         # Without rounding, the step from 1 to 1.36 in 37 copies would not be the benchmark's 0.01.
         step = round((self.max_scale - 1) / (self.copies - 1), 12)
-        return np.asarray(np.arange(1, self.max_scale + step / 2, step), float)
+        # ``np.arange`` adds multiples of the difference of its first two values. Its own end would not be exact.
+        spacing = (1 + step) - 1
+        return np.asarray(1 + np.arange(self.copies) * spacing, float)
 
 
 def _diamond_square(jitter: Floats, roughness_decay: float) -> Floats:
