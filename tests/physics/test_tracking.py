@@ -224,7 +224,9 @@ def test_a_hand_that_is_stuck_does_not_wait_for_ever(milk: Reference) -> None:
 
 
 CHANGES: dict[Task, PhysicsPerturbation] = {
-    STOVE: RobotAxis(levels=(3,)).sample(rng("tracking", 0), STOVE, 0),
+    STOVE: RobotAxis(levels=(3,), components=("initial_joints",), initial_norm_rad=(0.1, 0.2, 0.3, 0.4, 0.5)).sample(
+        rng("tracking", 0), STOVE, 0
+    ),
     MILK: PosePerturbation(component="target", level=3, moved="milk_1", dx_m=0.03, dy_m=-0.03, dyaw_deg=12.0),
 }
 
