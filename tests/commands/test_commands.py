@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -171,6 +172,11 @@ def test_status_says_what_is_kept_and_what_would_run(clone: Path) -> None:
     configured(clone, plan=tiny_config(clone)["plan"] | {"seed": 8})
     assert "plan: another configuration: plan.seed" in call(clone, "status").stdout
     (clone / "data/tiny/plan.parquet").unlink()
+    told = call(clone, "status", "configs/tiny.yaml").stdout
+    assert "  plan: " in told
+    assert re.search(r"no longer needed, and deleted by a run with REMAKE=1, without which it stops: \d+ traj", told)
+    for folder in ("trajectories", "frames"):
+        shutil.rmtree(clone / "data/tiny" / folder)
     assert would_run() == ["plan"]
 
 
