@@ -160,6 +160,9 @@ class FilterConfig(Frozen):
 
     An episode is dropped, with the column as its reason, where the figure is above the limit, or below it in
     ``joint_margin_rad``; then reserves take its place. Trajectories stay as they are.
+
+    Attributes:
+        exceeds_step_limit: ``drop`` leaves out what takes more control steps than an evaluation of its suite allows.
     """
 
     non_target_moved_m: float | None = Field(default=None, ge=0.0)
@@ -170,10 +173,11 @@ class FilterConfig(Frozen):
     idle_share: float | None = Field(default=None, ge=0.0, le=1.0)
     joint_margin_rad: float | None = Field(default=None, ge=-1.0, le=3.0)
     lag_m: float | None = Field(default=None, gt=0.0)
+    exceeds_step_limit: Literal["drop"] | None = None
 
     def fault(self, quality: Mapping[str, Any]) -> str | None:
-        """The first column whose figure is refused."""
-        for name, limit in self.model_dump(exclude_none=True).items():
+        """Return the first column of ``Quality`` whose figure is refused."""
+        for name, limit in self.model_dump(exclude_none=True, exclude={"exceeds_step_limit"}).items():
             if quality[name] < limit if name == "joint_margin_rad" else quality[name] > limit:
                 return name
         return None

@@ -19,6 +19,8 @@ def run(config: Config) -> None:
     Console().print(counts.shown(rows, config.plan.episodes))
     for sentence in counts.shortfalls(counts.targets(rows, config.plan.episodes)):
         print(sentence)
+    for sentence in counts.beyond_step_limit(rows):
+        print(sentence)
 
 
 def _draw(rows: Sequence[dict[str, Any]], config: Config) -> None:

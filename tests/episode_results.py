@@ -4,9 +4,9 @@ from dataclasses import asdict
 from typing import Any
 
 from pipeline.__main__ import parser
-from pipeline.evaluation.environment import STEP_LIMITS
 from pipeline.evaluation.results import EpisodeResult
 from pipeline.evaluation.tasks import EvaluationTask
+from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.seeding import digest
 
 

@@ -19,11 +19,10 @@ from pipeline.__main__ import main
 from pipeline.compute_config import ComputeConfig
 from pipeline.config import load
 from pipeline.errors import PipelineError
-from pipeline.evaluation import environment
 from pipeline.evaluation.environment import EpisodeSettings
 from pipeline.evaluation.evaluate import _environment
 from pipeline.libero.demonstrations import DemoEntry, StarterSource
-from pipeline.libero.tasks import find_task
+from pipeline.libero.tasks import STEP_LIMITS, find_task
 from pipeline.planning.selection import pending
 
 EFFECT = REPOSITORY / "benchmarks" / "effect"
@@ -286,7 +285,7 @@ def test_from_demonstrations_to_the_results(
 
     monkeypatch.setattr(command, "run", run_here)
     monkeypatch.setattr(evaluation, "ComputeConfig", partial(ComputeConfig, cluster="loop"))
-    monkeypatch.setitem(environment.STEP_LIMITS, STOVE.suite, 50)
+    monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 50)
     file, kept = small(tmp_path, short_demos), tmp_path / "results"
     words = ["effect", "--experiment", str(file), "--results", str(kept), "evaluate", "clean", "0"]
     monkeypatch.setattr(sys, "argv", words)

@@ -25,8 +25,9 @@ from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.outcome import rejections
 from pipeline.run.render_stage import render_plan
 from pipeline.run.replay_stage import Replays
+from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, shown_of
-from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset import benchmark
 
 VIEWS = ("image", "wrist_image")
@@ -78,7 +79,7 @@ def make(experiment: Experiment, arm: str, demos: Sequence[DemoEntry], vectors: 
         while (known := rejections(rows, shown_of(frames.rows()))) != rejected:
             rejected = known
             Replays(run.demos, run.replay, trajectories.root, workers, run.filter).of(rows, rejected)
-            outcome = selection.select(chosen, verdicts_of(trajectories.rows(), run.filter), rejected)
+            outcome = selection.select(chosen, verdicts_of(trajectories.rows(), chosen, run.filter), rejected)
             kept = [row for row in chosen if outcome[row.episode_id].kept]
             if len(kept) < experiment.episodes:
                 counts = Counter(row.axis for row in chosen if row.wanted) - Counter(row.axis for row in kept)

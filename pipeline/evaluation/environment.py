@@ -22,14 +22,11 @@ from pipeline.evaluation.simulator import Picture, Simulator
 from pipeline.evaluation.tasks import EvaluationTask, Prompt, find_replacement, libero_states
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.starts import recorded_start
-from pipeline.libero.tasks import find_task
+from pipeline.libero.tasks import STEP_LIMITS, find_task
 from pipeline.testset import benchmark
 from pipeline.testset.benchmark import TestTask
 from pipeline.testset.definitions import SceneFiles
 from pipeline.types import Floats, Frame, Scene, Task
-
-STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
-"""Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
 
 LEROBOT_SPATIAL = 280
 """lerobot's limit of ``libero_spatial``; its others are those of OpenVLA (``lerobot/envs/libero.py``, 0.6.1)."""

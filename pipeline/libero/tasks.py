@@ -16,6 +16,9 @@ from pipeline.types import Task
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
+STEP_LIMITS = {"libero_spatial": 220, "libero_object": 280, "libero_goal": 300, "libero_10": 520, "libero_90": 400}
+"""Control steps after settling before an episode has failed, as OpenVLA and LIBERO-Plus limit them."""
+
 Same = Literal["task", "scene"]
 """What two changes may have in common: the LIBERO task, or the scene that their tasks begin in."""
 
@@ -135,6 +138,11 @@ def find_task(suite: str, name: str) -> Task:
         closest = difflib.get_close_matches(name, by_name, cutoff=0)
         raise PipelineError(f"{suite} has no task {name!r}", expected=" or ".join(closest))
     return by_name[name]
+
+
+def exceeds_step_limit(suite: str, steps: int) -> bool | None:
+    """Whether an evaluation ends before so many control steps are executed; None for suites of one's own."""
+    return steps > STEP_LIMITS[suite] if suite in STEP_LIMITS else None
 
 
 def shared(task: Task, same: Same) -> Hashable:

@@ -75,7 +75,10 @@ def page(config: Config, test: TestSet) -> str:
         origins=counts.origins(kept, config.demos.source),
         headline=_headline(tried, kept),
         yields=[yields.wanted_and_kept(counts.targets(rows, config.plan.episodes)), *yields.tables(tried)],
-        shortfalls=counts.shortfalls(counts.targets(rows, config.plan.episodes)),
+        shortfalls=[
+            *counts.shortfalls(counts.targets(rows, config.plan.episodes)),
+            *counts.beyond_step_limit(rows),
+        ],
         axes=axes,
         overall=_histograms({axis: _stacked(rows, actions) for axis, rows in by_axis(kept).items()}),
         by_axis=_own_motion(kept, twins, actions),

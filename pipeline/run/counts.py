@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.export_config import CLEAN
 from pipeline.grouping import grouped
 from pipeline.libero.demonstrations import HUMAN
+from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.planning.selection import NOT_NEEDED
 from pipeline.run.outcome import MADE
 
@@ -80,6 +81,19 @@ def shortfalls(found: Mapping[str, Target]) -> list[str]:
             remedy = "raise plan.reserve, which adds candidates and keeps what is finished"
         sentences.append(f"{axis}: {target.kept} of {target.wanted} wanted episodes are kept; {remedy}")
     return sentences
+
+
+def beyond_step_limit(rows: Rows) -> list[str]:
+    """Say which kept episodes take longer than an evaluation allows; empty where none does."""
+    beyond = [row for row in rows if row["kept"] and row["exceeds_step_limit"]]
+    if not beyond:
+        return []
+    longest = max(beyond, key=lambda row: row["steps"] / STEP_LIMITS[row["suite"]])
+    return [
+        f"{len(beyond)} kept episodes take more control steps than an evaluation allows: at most {longest['steps']} of "
+        f"{STEP_LIMITS[longest['suite']]}, in {longest['suite']}/{longest['task']}; `filter: {{exceeds_step_limit: "
+        "drop}` drops them"
+    ]
 
 
 def tried(rows: Rows) -> list[Mapping[str, Any]]:

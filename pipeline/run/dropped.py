@@ -16,9 +16,10 @@ from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
 from pipeline.planning.streams import streams_of
 from pipeline.run import machine
 from pipeline.run.outcome import MISSED, rejections, rendered
+from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
 from pipeline.stores.frame_store import FrameStore, shown_of
-from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
 LARGEST_SHARE = 0.1
@@ -104,7 +105,7 @@ def refuse_unasked(rows: Sequence[plan.Row], config: Config) -> None:
 
 def _needed(rows: Sequence[plan.Row], config: Config) -> tuple[set[str], set[tuple[str, str]]]:
     """Ids of the trajectories that a plan may need, and of the streams, each with its trajectory's."""
-    verdicts = verdicts_of(_replays(config).rows(), config.filter)
+    verdicts = verdicts_of(_replays(config).rows(), rows, config.filter)
     shown = shown_of(_frames(config).rows())
     rejected = rejections(rows, shown)
     unknown = Verdict(False, NOT_REPLAYED)

@@ -16,6 +16,7 @@ from pipeline.config import Config, RenderConfig, ReplayConfig
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import Where
 from pipeline.identity import DISTRIBUTION, VERSIONS, versions
+from pipeline.libero.tasks import exceeds_step_limit
 from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED
 from pipeline.run.outcome import Outcome, rendered
@@ -45,6 +46,11 @@ class Result:
         str | None, "open_loop or tracked: how the executed actions came about; null when not replayed"
     ]
     steps: Annotated[int | None, "executed actions (episode length), null when not replayed"]
+    exceeds_step_limit: Annotated[
+        bool | None,
+        "steps above the limit at which an evaluation of the suite ends (220 spatial, 280 object, 300 goal, 520 long, "
+        "400 libero_90); null where not replayed, and for suites of one's own",
+    ]
     resolved: Annotated[
         str | None,
         "JSON of what physics perturbations came to in the scene, by axis, or under fault why the demonstration could "
@@ -100,6 +106,7 @@ def build(
             chosen=where is None or where.takes(row.axis, row.component, row.level, row.suite),
             replay_mode=replayed.get("mode"),
             steps=replayed.get("steps"),
+            exceeds_step_limit=exceeds_step_limit(row.suite, replayed["steps"]) if replayed else None,
             resolved=replayed.get("resolved"),
             path_ratio=_ratio(replayed, run.trajectories.get(run.row_of[row.twin_id].trajectory_id, {})),
             gl_device=run.frames[row.trajectory_id].device if replayed and rendered(row, run.frames) else None,

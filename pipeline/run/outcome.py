@@ -12,9 +12,10 @@ from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.export_config import ExportConfig
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
+from pipeline.run.verdicts import verdicts_of
 from pipeline.seeding import digest
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
-from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
 LEFT_OUT = "left_out"
@@ -84,7 +85,7 @@ def replayed(
     """
     store = TrajectoryStore(folder)
     trajectories = store.rows()
-    needed = selection.pending(rows, verdicts_of(trajectories, limits), rejected)
+    needed = selection.pending(rows, verdicts_of(trajectories, rows, limits), rejected)
     # What takes the place of rejected frames, only the stage render replays.
     _refuse_missing([store.path(name) for name in needed], "render" if rejected else "replay")
     return trajectories
@@ -116,7 +117,7 @@ def read(config: Config) -> Outcome:
     frames = shown_of(store.rows())
     rejected = rejections(rows, frames)
     trajectories = replayed(rows, config.data / "trajectories", rejected, config.filter)
-    judged = selection.select(rows, verdicts_of(trajectories, config.filter), rejected)
+    judged = selection.select(rows, verdicts_of(trajectories, rows, config.filter), rejected)
     if where := config.export.where:
         for row in rows:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):

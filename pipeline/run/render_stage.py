@@ -15,8 +15,9 @@ from pipeline.planning.plan import Row
 from pipeline.planning.selection import select
 from pipeline.planning.streams import Stream, streams_of
 from pipeline.run.outcome import MISSED, rejections
+from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, file_name, shown_of
-from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
 STREAMS_OF_A_JOB = 64
@@ -59,7 +60,7 @@ def render_plan(rows: Sequence[Row], config: Config, trajectories: Path, folder:
     """
     device = gl.choose().device
     store = FrameStore(folder, config.render)
-    judged = verdicts_of(TrajectoryStore(trajectories).rows(), config.filter)
+    judged = verdicts_of(TrajectoryStore(trajectories).rows(), rows, config.filter)
     undone: set[str] = set()
     while True:
         stored = {name: row for name, row in store.refresh().items() if row["device"] == device}

@@ -9,7 +9,8 @@ from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.planning.plan import Row
 from pipeline.planning.selection import pending
-from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.run.verdicts import verdicts_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 
 NO_LIMITS = FilterConfig()
@@ -44,7 +45,7 @@ class Replays:
             PipelineError: when workers leave work undone.
         """
         store = TrajectoryStore(self.folder)
-        stored = verdicts_of(store.refresh(), self.limits)
+        stored = verdicts_of(store.refresh(), rows, self.limits)
         twins = [row for row in rows if row.role == "twin"]
         verdicts: dict[str, Verdict] = {}
         for group in (twins, rows):
@@ -52,7 +53,7 @@ class Replays:
                 missing = [trajectory_id for trajectory_id in needed if trajectory_id not in stored]
                 if missing:
                     self._replay(missing, rows)
-                    stored = verdicts_of(store.refresh(), self.limits)
+                    stored = verdicts_of(store.refresh(), rows, self.limits)
                     _refuse_undone([store.path(one) for one in missing if one not in stored])
                 verdicts |= {trajectory_id: stored[trajectory_id] for trajectory_id in needed}
         return verdicts

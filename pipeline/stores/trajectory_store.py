@@ -1,7 +1,6 @@
 """Replayed trajectories on disk, verdicts included."""
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any, ClassVar
 
@@ -10,7 +9,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from pipeline.catalogue.scene_files import located, portable
-from pipeline.config import FilterConfig
 from pipeline.stores.sealed_file import SealedFile
 from pipeline.stores.store import Store
 from pipeline.tables import columns_of
@@ -88,13 +86,3 @@ class TrajectoryStore(Store):
                 verdict=Verdict(told["kept"], told["reason"]),
                 quality=None if quality is None else Quality(**quality),
             )
-
-
-def verdicts_of(rows: Mapping[str, Mapping[str, Any]], limits: FilterConfig) -> dict[str, Verdict]:
-    """Trajectory id to verdict, from the rows of the table and the limits of quality."""
-    return {trajectory_id: _verdict(row, limits) for trajectory_id, row in rows.items()}
-
-
-def _verdict(row: Mapping[str, Any], limits: FilterConfig) -> Verdict:
-    fault = limits.fault(row) if row["kept"] else None
-    return Verdict(False, fault) if fault else Verdict(row["kept"], row["reason"])

@@ -13,7 +13,7 @@ from pipeline.config import DemosConfig, ReplayConfig
 from pipeline.errors import PipelineError
 from pipeline.libero.demonstrations import DemoEntry, HDF5Source
 from pipeline.libero.starts import kept_actions
-from pipeline.libero.tasks import find_task, suites
+from pipeline.libero.tasks import STEP_LIMITS, exceeds_step_limit, find_task, suites
 from pipeline.planning.plan import twins
 from pipeline.run.outcome import MISSED
 from pipeline.run.replay_job import ReplayJob
@@ -118,7 +118,7 @@ class _FileJob:
         if all_miss:
             faults += self._missing(missing, reasons)
         missed = [] if all_miss else [entry.demo_id for entry in missing]
-        notes = [*index.notes, *_instruction_notes(self.task)]
+        notes = [*index.notes, *_instruction_notes(self.task), *self._length_notes(index.entries)]
         return index.entries, Found(replayed=len(chosen), faults=faults, missed=missed, notes=notes)
 
     def _chosen(self, entries: Sequence[DemoEntry]) -> list[DemoEntry]:
@@ -161,6 +161,22 @@ class _FileJob:
     def _dropped_noops(self, entry: DemoEntry) -> int:
         actions = HDF5Source(self.root).load(entry.demo_id).actions
         return int((~kept_actions(actions, self.replay.noops)).sum())
+
+    def _length_notes(self, entries: Sequence[DemoEntry]) -> Iterator[str]:
+        """Count the demonstrations whose actions, without no-ops, take longer than an evaluation allows."""
+        steps = {}
+        for entry in entries:
+            if exceeds_step_limit(self.task.suite, entry.steps):
+                executed = entry.steps - self._dropped_noops(entry)
+                if exceeds_step_limit(self.task.suite, executed):
+                    steps[entry] = executed
+        if steps:
+            longest = max(steps, key=lambda entry: steps[entry])
+            yield (
+                f"{self._place(longest)}: takes {steps[longest]} control steps, {len(steps)} of {len(entries)} "
+                f"demonstrations more than the {STEP_LIMITS[self.task.suite]} that an evaluation allows; `filter: "
+                "{exceeds_step_limit: drop}` drops such episodes"
+            )
 
     @property
     def _file(self) -> Path:

@@ -16,8 +16,9 @@ from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
 from pipeline.run import cleaning, counts, dropped, export, finished, inputs, machine, outcome, plan_stage
 from pipeline.run.outcome import outdated
+from pipeline.run.verdicts import verdicts_of
 from pipeline.stores.frame_store import FrameStore, Shown, shown_of
-from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.types import Verdict
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
 
@@ -39,7 +40,7 @@ def told(config: Config) -> Iterator[str | Table]:
     except PipelineError as error:
         yield f"the run cannot be planned: {error}"
         return
-    verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), config.filter)
+    verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), rows, config.filter)
     frames = shown_of(FrameStore(config.data / "frames", config.render).rows())
     rejected = outcome.rejections(rows, frames)
     judged = selection.select(rows, verdicts, rejected)

@@ -13,13 +13,14 @@ from conftest import STOVE
 from synthetic import IDS, episode, files, write_lerobot, write_lerobot_v21, write_rlds
 
 from pipeline.episode_schema import SCHEMA
-from pipeline.evaluation.environment import STEP_LIMITS, EpisodeEnvironment
+from pipeline.evaluation.environment import EpisodeEnvironment
 from pipeline.evaluation.policies import Wanted
 from pipeline.evaluation.selection import Selection, select
 from pipeline.formats.lerobot_statistics import DEVIATION, FIGURES, MEAN_LEVELS
 from pipeline.formats.lerobot_video import ENCODER, OPTIONS, planes
 from pipeline.formats.read_back import Copy, Statistics, sampled
 from pipeline.images.jpeg import decode
+from pipeline.libero.tasks import STEP_LIMITS
 from pipeline.report import figures
 from pipeline.report.sheets import Tile, sheet, side_by_side, spread
 from pipeline.seeding import digest

@@ -19,7 +19,7 @@ from pipeline import identity
 from pipeline.axes.camera import CameraAxis, SphericalRange
 from pipeline.compute.pool import loop
 from pipeline.errors import PipelineError
-from pipeline.evaluation import environment, own_draws, results
+from pipeline.evaluation import own_draws, results
 from pipeline.evaluation.environment import EpisodeEnvironment, EpisodeSettings
 from pipeline.evaluation.evaluate import EvaluationJob, _environment, check_settings, evaluate
 from pipeline.evaluation.policies import Checkpoint
@@ -27,6 +27,7 @@ from pipeline.evaluation.results import EpisodeFiles
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig
 from pipeline.evaluation.selection import Selection, select
 from pipeline.evaluation.tasks import EvaluationTask, libero_task
+from pipeline.libero.tasks import STEP_LIMITS
 
 STEPS = 4
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
@@ -37,7 +38,7 @@ SETTINGS = EpisodeSettings()
 def short() -> Iterator[None]:
     """Episodes of a few steps; afterwards the process gives back the environment that it keeps."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(environment.STEP_LIMITS, STOVE.suite, STEPS)
+        patch.setitem(STEP_LIMITS, STOVE.suite, STEPS)
         yield
     _environment(SETTINGS, None).close()
 
@@ -188,7 +189,7 @@ def test_a_checkpoint_that_changes_during_the_run_stops_it(tmp_path: Path, monke
 def test_a_video_shows_what_the_policy_does_not_look_at(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setitem(environment.STEP_LIMITS, STOVE.suite, 20)
+    monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 20)
     chosen = CHOSEN.model_copy(update={"episodes": 2})
     evaluate(replace(evaluation(PolicyConfig(kind="open_loop"), tmp_path), videos="all"), chosen, loop)
     assert "evaluate, episodes: 2/2, " in capsys.readouterr().err, "progress is counted in episodes"

@@ -26,7 +26,7 @@ from pipeline.evaluation.results import read, refuse_different, stored  # noqa: 
 from pipeline.evaluation.rollout import Evaluation, PolicyConfig  # noqa: E402
 from pipeline.evaluation.selection import Selection, select  # noqa: E402
 from pipeline.evaluation.tasks import libero_states  # noqa: E402
-from pipeline.libero.tasks import tasks  # noqa: E402
+from pipeline.libero.tasks import STEP_LIMITS, tasks  # noqa: E402
 from pipeline.seeding import rng  # noqa: E402
 from pipeline.types import Task  # noqa: E402
 
@@ -92,7 +92,7 @@ def test_actions_are_seen_as_in_liberos_own_environment(suite: str) -> None:
 
 
 def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(environment.STEP_LIMITS, STOVE.suite, 2)
+    monkeypatch.setitem(STEP_LIMITS, STOVE.suite, 2)
     policy = PolicyConfig(kind="checkpoint", address=str(checkpoints.save(tmp_path / "act", 0.0)), label="act")
     settings = EpisodeSettings(runner="lerobot-eval")
     evaluation = Evaluation(settings, policy, policy.identity(), tmp_path / "rows")
@@ -130,7 +130,7 @@ def test_environments_share_episodes_and_each_is_a_row(tmp_path: Path, monkeypat
 
 
 def test_limits_of_openvla_and_lerobot_are_not_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(environment.STEP_LIMITS, "libero_spatial", 1)
+    monkeypatch.setitem(STEP_LIMITS, "libero_spatial", 1)
     monkeypatch.setattr(environment, "LEROBOT_SPATIAL", 2)
     policy = PolicyConfig(kind="open_loop")
     listed = select(Selection(suites=("libero_spatial",)))[:1]

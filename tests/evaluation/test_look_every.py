@@ -21,12 +21,12 @@ from vla_eval.connection import Connection  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 
 from pipeline.errors import PipelineError  # noqa: E402
-from pipeline.evaluation import environment  # noqa: E402
 from pipeline.evaluation.environment import EpisodeEnvironment  # noqa: E402
 from pipeline.evaluation.harness import PerturbedLibero  # noqa: E402
 from pipeline.evaluation.policies import Server  # noqa: E402
 from pipeline.evaluation.rollout import roll_out_policy  # noqa: E402
 from pipeline.evaluation.selection import Selection, select  # noqa: E402
+from pipeline.libero.tasks import STEP_LIMITS  # noqa: E402
 
 STEPS, LOOK_EVERY = 17, 8
 CHOSEN = Selection(suites=(STOVE.suite,), tasks=(STOVE.name,))
@@ -91,7 +91,7 @@ def shown(run: Run, address: str, out: Path, look_every: int) -> tuple[dict[int,
 @pytest.fixture(scope="module", autouse=True)
 def short() -> Any:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(environment.STEP_LIMITS, STOVE.suite, STEPS)
+        patch.setitem(STEP_LIMITS, STOVE.suite, STEPS)
         yield
     opened().close()
 

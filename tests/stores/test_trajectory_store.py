@@ -28,10 +28,11 @@ from pipeline.planning import plan, selection
 from pipeline.run import outcome
 from pipeline.run.outcome import outdated
 from pipeline.run.replay_stage import Replays
+from pipeline.run.verdicts import verdicts_of
 from pipeline.seeding import rng
 from pipeline.stores.sealed_file import HEADER
 from pipeline.stores.store import TABLE
-from pipeline.stores.trajectory_store import TrajectoryStore, verdicts_of
+from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.tables import read_table
 from pipeline.types import Verdict
 
@@ -74,17 +75,17 @@ def test_quality_is_stored_and_a_filter_drops_by_it(config: Config, rows: list[p
     assert quality is not None
     figures = asdict(quality)
     assert {column: told[column] for column in figures} == figures
-    assert set(FilterConfig.model_fields) == set(figures)
-    assert verdicts_of(store.rows(), FilterConfig()) == {name: Verdict(True, "kept")}
+    assert set(FilterConfig.model_fields) == {*figures, "exceeds_step_limit"}
+    assert verdicts_of(store.rows(), rows, FilterConfig()) == {name: Verdict(True, "kept")}
     for column, figure in figures.items():
         if column == "joint_margin_rad":
             refusing, letting = figure + 0.01, figure
         else:
             refusing, letting = figure * 0.99, figure
         if figure > 0:
-            refused = verdicts_of(store.rows(), FilterConfig(**{column: refusing}))
+            refused = verdicts_of(store.rows(), rows, FilterConfig(**{column: refusing}))
             assert refused == {name: Verdict(False, column)}
-        assert verdicts_of(store.rows(), FilterConfig(**{column: letting}))[name].kept
+        assert verdicts_of(store.rows(), rows, FilterConfig(**{column: letting}))[name].kept
 
     limits = FilterConfig(path_m=figures["path_m"] / 2)
     judged = Replays(config.demos, config.replay, whole_replay, nothing_to_do, limits).of(rows)

@@ -1,0 +1,33 @@
+"""Which replays a run keeps: those that succeeded in the simulator and that the section ``filter`` lets pass."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.config import FilterConfig
+from pipeline.libero.tasks import exceeds_step_limit
+from pipeline.planning.plan import Row
+from pipeline.types import Verdict
+
+
+def verdicts_of(
+    stored: Mapping[str, Mapping[str, Any]], rows: Sequence[Row], limits: FilterConfig
+) -> dict[str, Verdict]:
+    """Trajectory id to verdict, for every stored trajectory.
+
+    Args:
+        stored: trajectory id to its row in the table of replays.
+        rows: the plan, which tells the suite of each trajectory; of others, the number of steps is not limited.
+    """
+    suite_of = {row.trajectory_id: row.suite for row in rows}
+    return {name: _verdict(replayed, suite_of.get(name), limits) for name, replayed in stored.items()}
+
+
+def _verdict(replayed: Mapping[str, Any], suite: str | None, limits: FilterConfig) -> Verdict:
+    if not replayed["kept"]:
+        return Verdict(False, replayed["reason"])
+    fault = limits.fault(replayed)
+    if fault is not None:
+        return Verdict(False, fault)
+    if limits.exceeds_step_limit and suite is not None and exceeds_step_limit(suite, replayed["steps"]):
+        return Verdict(False, "exceeds_step_limit")
+    return Verdict(True, replayed["reason"])
