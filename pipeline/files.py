@@ -71,7 +71,7 @@ def read_json(file: Path, remedy: str = MAKE_AGAIN) -> dict[str, Any]:
         raise PipelineError("not there", where=file, remedy=remedy) from error
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise PipelineError(
-            f"damaged ({error})", where=file, expected="a JSON object", remedy=f"delete it, and {remedy}"
+            f"damaged ({error})", where=file, expected="a JSON object", remedy=f"move it away, and {remedy}"
         ) from error
     return content
 

@@ -63,7 +63,7 @@ def read_table(path: Path, columns: Collection[str], remedy: str) -> pa.Table:
     except MemoryError:
         raise
     except (OSError, ValueError, TypeError, LookupError, RuntimeError, pa.ArrowException) as error:
-        raise PipelineError(f"damaged ({error})", where=path, remedy=f"delete it, and {remedy}") from error
+        raise PipelineError(f"damaged ({error})", where=path, remedy=f"move it away, and {remedy}") from error
     if lacking := sorted(set(columns) - set(table.column_names)):
         raise PipelineError(
             f"lacks the columns {', '.join(lacking)}", where=path, expected="a file of this version", remedy=remedy

@@ -59,7 +59,7 @@ def check(path: Path, sha256: str, content: str) -> None:
             f"not the file that this project was made with, {content}: its SHA-256 is {found}",
             where=path,
             expected=sha256,
-            remedy="delete the file and run it again",
+            remedy="move the file away and run it again",
         )
 
 

@@ -55,7 +55,7 @@ def find(name: str, sha256: str) -> ObjectModel:
         raise PipelineError(
             f"the object {name} is not the one that was planned with",
             where=model.mjcf,
-            remedy="rm -rf .venv && bash setup.sh" if installed else f"delete its folder and run {AGAIN}",
+            remedy="rm -rf .venv && bash setup.sh" if installed else f"move its folder away and run {AGAIN}",
         )
     return model
 

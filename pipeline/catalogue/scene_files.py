@@ -78,7 +78,7 @@ def _found(name: str, where: object) -> str:
             f"the scene has an added object whose file {below} is {'another' if file.is_file() else 'not there'}",
             where=where,
             expected=f"{file} with the SHA-256 {sha256}",
-            remedy=f"copy {object_sources.FOLDER} from where the trajectory was made, or delete the object's folder "
+            remedy=f"copy {object_sources.FOLDER} from where the trajectory was made, or move the object's folder away "
             f"and run {object_sources.AGAIN}",
         )
     return str(file)

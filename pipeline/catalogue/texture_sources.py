@@ -164,7 +164,7 @@ def kept(name: str, sha256: str) -> Texture:
     texture = from_file(name, file, "the folder's") if file.is_file() else None
     if texture is None or texture.sha256 != sha256:
         raise PipelineError(
-            f"the texture {name} is {'missing' if texture is None else 'damaged: delete its file'}",
+            f"the texture {name} is {'missing' if texture is None else 'damaged: move its file away'}",
             where=file,
             remedy=f"copy {FOLDER} from where the plan was made, or python stages/plan.py CONFIG",
         )

@@ -6,10 +6,12 @@ The stages ``plan``, ``replay`` and ``render`` ask here before they replace or d
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 from pipeline.config import Config
 from pipeline.errors import PipelineError
+from pipeline.formats.registry import failures_of, formats_of
 from pipeline.identity import ALLOW, REMAKE
 from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
@@ -34,28 +36,40 @@ class Dropped:
         trajectories: how many.
         streams: how many streams of frames.
         work_s: seconds of one core that these took.
-        share: of all finished work, in [0, 1].
+        share: of all trajectories and frames, by that time, in [0, 1].
+        episodes: of the datasets; their trajectories and frames may have been deleted before.
+        episode_share: of all episodes of the datasets, in [0, 1].
     """
 
-    trajectories: int
-    streams: int
-    work_s: float
-    share: float
+    trajectories: int = 0
+    streams: int = 0
+    work_s: float = 0.0
+    share: float = 0.0
+    episodes: int = 0
+    episode_share: float = 0.0
 
     @property
     def asks(self) -> bool:
         """Whether a person must allow it."""
-        return self.share > LARGEST_SHARE
+        return max(self.share, self.episode_share) > LARGEST_SHARE
+
+    def __bool__(self) -> bool:
+        return bool(self.trajectories or self.streams or self.episodes)
 
     def __str__(self) -> str:
-        return (
-            f"{self.trajectories} trajectories and {self.streams} streams of frames, {self.share:.0%} of the finished "
-            f"work, about {_hours(self.work_s)} of one core"
-        )
+        parts = []
+        if self.trajectories or self.streams:
+            parts.append(
+                f"{self.trajectories} trajectories and {self.streams} streams of frames, {self.share:.0%} of the "
+                f"finished work, about {_hours(self.work_s)} of one core"
+            )
+        if self.episodes:
+            parts.append(f"{self.episodes} episodes of the datasets, {self.episode_share:.0%} of them")
+        return "; ".join(parts)
 
 
 def measure(rows: Sequence[plan.Row], config: Config) -> Dropped:
-    """Finished work that the stages ``replay`` and ``render`` would delete under a plan.
+    """Measure the finished work that the stages ``replay``, ``render`` and ``export`` would delete under a plan.
 
     An episode counts as needed while it is not known whether it is: where it, or a candidate before it, is not
     replayed or not rendered yet.
@@ -81,7 +95,16 @@ def measure(rows: Sequence[plan.Row], config: Config) -> Dropped:
         all_s += len(of_file) * stream_s
         dropped_s += len(gone) * stream_s
         unneeded_streams += len(gone)
-    return Dropped(len(unneeded), unneeded_streams, dropped_s, dropped_s / all_s if all_s else 0.0)
+    exported = _exported(config)
+    gone_episodes = len(exported - {row.episode_id for row in rows})
+    return Dropped(
+        trajectories=len(unneeded),
+        streams=unneeded_streams,
+        work_s=dropped_s,
+        share=dropped_s / all_s if all_s else 0.0,
+        episodes=gone_episodes,
+        episode_share=gone_episodes / len(exported) if exported else 0.0,
+    )
 
 
 def refuse_unasked(rows: Sequence[plan.Row], config: Config) -> None:
@@ -99,8 +122,8 @@ def refuse_unasked(rows: Sequence[plan.Row], config: Config) -> None:
             remedy=f"put the configuration back; or copy it to a file with another `name:`, which gets a folder of its "
             f"own; or allow it: {ALLOW}",
         )
-    if dropped.trajectories or dropped.streams:
-        print(f"no longer needed, and deleted by the stages replay and render: {dropped}")
+    if dropped:
+        print(f"no longer needed, and deleted by the stages that follow: {dropped}")
 
 
 def _needed(rows: Sequence[plan.Row], config: Config) -> tuple[set[str], set[tuple[str, str]]]:
@@ -124,6 +147,16 @@ def _needed(rows: Sequence[plan.Row], config: Config) -> tuple[set[str], set[tup
         if verdict.kept or verdict.reason in (NOT_REPLAYED, rejected.get(row.episode_id), *failures):
             streams |= {(row.trajectory_id, stream.stream_id) for stream in streams_of(row.perturbations).values()}
     return trajectories, streams
+
+
+def _exported(config: Config) -> set[str]:
+    """Ids of the episodes in the finished datasets that the run would replace."""
+    formats = [*formats_of(config.data, config.export), *failures_of(config.data, config.export)]
+    exported: set[str] = set()
+    for target in formats:
+        with suppress(PipelineError):  # There is none.
+            exported |= target.record().places.keys()
+    return exported
 
 
 def _replays(config: Config) -> TrajectoryStore:

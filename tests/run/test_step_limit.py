@@ -3,10 +3,11 @@
 The starter set's demonstration of the wine bottle has 347 actions after no-ops; evaluations of libero_goal end at 300.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
-from stores.bowl import nothing_to_do
 
 from pipeline.compute.pool import loop
 from pipeline.config import DemosConfig, FilterConfig, ReplayConfig
@@ -61,6 +62,9 @@ def test_a_run_that_asks_for_it_drops_the_wine_bottle(replayed: tuple[Row, Traje
     name = row.trajectory_id
     assert verdicts_of(store.rows(), [row], FilterConfig()) == {name: Verdict(True, "kept")}
     assert verdicts_of(store.rows(), [row], DROP) == {name: Verdict(False, "exceeds_step_limit")}
+
+    def nothing_to_do(fn: Any, items: Sequence[Any], description: str) -> list[Any]:
+        raise AssertionError("a trajectory that is there was replayed again")
 
     judged = Replays(DemosConfig(), ReplayConfig(), store.root, nothing_to_do, DROP).of([row])
     assert judged == {name: Verdict(False, "exceeds_step_limit")}
