@@ -3,23 +3,19 @@
 So DVC notices what it cannot see itself.
 """
 
-from pipeline.config import Config
 from pipeline.files import write_json
-from pipeline.formats.registry import failures_of, formats_of
 from pipeline.run import export, inputs
+from pipeline.run.run import INPUTS, SETTINGS, Run
 from pipeline.run.stage import main
-from pipeline.stores.frame_store import FrameStore
-from pipeline.stores.trajectory_store import TrajectoryStore
 
 
-def run(config: Config) -> None:
-    write_json(config.data / "settings.json", inputs.settings(config))
-    write_json(config.data / "inputs.json", inputs.listing(config))
-    TrajectoryStore(config.data / "trajectories").notice_changes()
-    FrameStore(config.data / "frames", config.render).notice_changes()
-    asked = (config.data, config.export, config.render.extras)
-    for one in (*formats_of(*asked), *failures_of(*asked)):
-        export.notice_changes(one)
+def run(run: Run) -> None:
+    write_json(run.path(SETTINGS), inputs.settings(run.config))
+    write_json(run.path(INPUTS), inputs.listing(run.config))
+    run.trajectories.notice_changes()
+    run.frames.notice_changes()
+    for dataset in (*run.formats, *run.failure_formats):
+        export.notice_changes(dataset)
 
 
 if __name__ == "__main__":

@@ -2,15 +2,15 @@
 
 from rich.console import Console
 
-from pipeline.config import Config
-from pipeline.planning import leakage, plan
+from pipeline.planning import leakage
+from pipeline.run.run import LEAKAGE, Run
 from pipeline.run.stage import main
 from pipeline.testset import benchmark
 
 
-def run(config: Config) -> None:
-    findings = leakage.check(plan.read(config.data / "plan.parquet"), benchmark.load())
-    leakage.write(findings, config.data / "leakage.json")
+def run(run: Run) -> None:
+    findings = leakage.check(run.plan, benchmark.load())
+    leakage.write(findings, run.path(LEAKAGE))
     Console().print(leakage.report(findings))
     leakage.refuse_overlap(findings)
 

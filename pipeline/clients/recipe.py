@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,10 @@ from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
 from pipeline.formats.rlds_layout import dataset_of, split_of
 from pipeline.generated import generated
+from pipeline.run.run import FINETUNE, Run
+
+RECIPE = "finetune.yaml"
+"""File of the folder ``finetune``."""
 
 TEMPLATES = Path(__file__).parent / "templates"
 OFT_SCRIPT = "run_openvla_oft.py"
@@ -40,20 +44,19 @@ def sourced(value: Any, source: str) -> dict[str, Any]:
     return {"value": value, "source": source}
 
 
-def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: ExportConfig) -> dict[str, Any]:
-    """The fine-tuning recipe of a run.
+def build(run: Run) -> dict[str, Any]:
+    """Return the fine-tuning recipe of a run.
 
-    Args:
-        manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
-            episode, its place in each format, and the versions and the device that made it.
-        export: the datasets that the run asks for; OpenVLA-OFT calls all of RLDS by the name there.
+    The hash of the manifest identifies the datasets: the manifest has the content hash of every episode, its place in
+    each format, and the versions and the device that made it.
     """
+    rows, export = run.manifest, run.config.export
     kept = [row for row in rows if row["kept"]]
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for row in kept:
         counts[row["suite"]][row["axis"]] += 1
     dataset = {
-        "sha256": sourced(checksum(manifest_file), "hash of " + MANIFEST),
+        "sha256": sourced(checksum(run.manifest_file), "hash of " + MANIFEST),
         "episodes": sourced(len(kept), MANIFEST),
         "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
         "episodes_by_suite_and_axis": sourced({suite: dict(axes) for suite, axes in counts.items()}, MANIFEST),
@@ -95,34 +98,35 @@ def _filled(template: str, **values: object) -> str:
     return environment.get_template(template).render(**values)
 
 
-def write(recipe: Mapping[str, Any], data: Path, export: ExportConfig) -> None:
+def write(recipe: Mapping[str, Any], run: Run) -> None:
     """Generate the folder ``finetune``: ``finetune.yaml``, the clients' scripts and the files that these read.
 
-    Args:
-        data: the run's folder with its datasets; the scripts look for ``rlds`` next to ``finetune``.
+    The scripts look for the folder ``rlds`` next to ``finetune``.
 
     Raises:
         PipelineError: if edits in ``finetune`` would be lost.
     """
+    export = run.config.export
     wanted = export.lerobot_v21
-    with generated(data / "finetune") as unfinished:
+    folders = {dataset.name: dataset.folder for dataset in run.formats}
+    with generated(run.path(FINETUNE)) as unfinished:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
-        (unfinished / "finetune.yaml").write_text(text)
+        (unfinished / RECIPE).write_text(text)
         if export.rlds is not None:
             shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
         if export.lerobot is not None and export.lerobot.validation:
-            info = read_json(data / "lerobot" / export.lerobot.name / "meta" / "info.json")
+            info = read_json(folders["lerobot"] / export.lerobot.name / "meta" / "info.json")
             listed = [*range(int(info["splits"]["train"].partition(":")[2]))]
             (unfinished / LEROBOT_TRAIN).write_text(json.dumps({"dataset": {"episodes": listed}}) + "\n")
         if wanted is not None and wanted.convention == "openpi":
-            table = pq.read_table(data / "lerobot_v21" / wanted.name / "data", columns=["actions", "state"])
+            table = pq.read_table(folders["lerobot_v21"] / wanted.name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
             (unfinished / OPENPI_ASSETS).parent.mkdir(parents=True)
             content = json.dumps(exact_statistics.openpi(actions, states), indent=1) + "\n"
             (unfinished / OPENPI_ASSETS).write_text(content)
         if wanted is not None and wanted.convention == "ipec":
-            roots = sorted(path.name for path in (data / "lerobot_v21").iterdir() if not path.name.endswith("_val"))
+            roots = sorted(path.name for path in folders["lerobot_v21"].iterdir() if not path.name.endswith("_val"))
             mixture = _filled("starvla_data_config.py.j2", name=wanted.name, roots=roots)
             (unfinished / "starvla_data_config.py").write_text(mixture)
 

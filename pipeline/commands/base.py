@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from pipeline.config import Config
+    from pipeline.run.run import Run
 
 PARAMS = Path("params.yaml")
 
@@ -159,8 +160,8 @@ def loaded(arguments: argparse.Namespace) -> Config:
     return load(config_file(arguments))
 
 
-def owned(arguments: argparse.Namespace) -> Config:
-    """Load the configuration whose run a command reads.
+def owned(arguments: argparse.Namespace) -> Run:
+    """Open the run that a command reads.
 
     Raises:
         PipelineError: as ``run.stage.owned``.
@@ -174,4 +175,4 @@ def plan_of(text: str) -> Path:
     """Type of an argument that names a configuration and stands for its run's plan."""
     from pipeline.run import stage
 
-    return stage.owned(Path(text)).data / "plan.parquet"
+    return stage.owned(Path(text)).plan_file

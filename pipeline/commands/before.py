@@ -36,9 +36,10 @@ def add_commands(commands: Any) -> None:
 
 def doctor(arguments: argparse.Namespace) -> int:
     """check versions, OpenGL, disk, memory and demonstrations for a configuration; changes nothing"""
+    from pipeline.run.run import Run
     from pipeline.validation import doctor
 
-    return doctor.run(loaded(arguments))
+    return doctor.run(Run(loaded(arguments)))
 
 
 def axes(arguments: argparse.Namespace) -> None:

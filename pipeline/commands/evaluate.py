@@ -210,6 +210,6 @@ def leakage(arguments: argparse.Namespace) -> int:
     if not drawn:
         lacking = "there are no held-out perturbations"
         raise PipelineError(lacking, where=arguments.results, remedy="evaluate --source own")
-    findings = own_draws.compare(drawn, own_draws.planned(owned(arguments).data / "plan.parquet"))
+    findings = own_draws.compare(drawn, own_draws.planned(owned(arguments).plan_file))
     print(json.dumps(findings))
     return int(any(finding["overlaps"] for finding in findings.values()))

@@ -47,17 +47,16 @@ def check(arguments: argparse.Namespace) -> int:
     validate, which is a part of every run, compares the content of the datasets with each other and with the plan.)
     """
     from pipeline.clients import oft
-    from pipeline.compute.pool import runner
     from pipeline.validation.verify import verify
 
-    config = owned(arguments)
-    with runner(config.compute, config.data) as run:
-        stored = verify(config, run)
+    run = owned(arguments)
+    with run.workers() as workers:
+        stored = verify(run, workers)
     damaged = [what for found in stored.values() for what in found["damaged"]]
     trained: dict[str, Any] = {}
     # OpenVLA-OFT's reader stops at what is damaged.
-    if config.export.rlds and not stored["rlds"]["damaged"]:
-        trained = oft.check_run(config.data)
+    if run.config.export.rlds and not stored["rlds"]["damaged"]:
+        trained = oft.check_run(run)
     misleading = [f"{name}: {what}" for name, found in trained.items() for what in found["violations"]]
     for what in (*damaged, *misleading):
         print(what)
@@ -103,8 +102,8 @@ def regenerate(arguments: argparse.Namespace) -> int:
             "two places to take the demonstrations from", where="options", expected="CONFIG, or --manifest and --demos"
         )
     if manifest is None:
-        config = owned(arguments)
-        manifest, demos = config.data / "manifest.parquet", config.demos.root
+        run = owned(arguments)
+        manifest, demos = run.manifest_file, run.config.demos.root
     found = regenerate(arguments.episode_id, manifest, arguments.out, demos)
     if found["identical"] is None:
         print(f"only made, in {arguments.out}: no RLDS set lies beside {manifest} to compare it with", file=sys.stderr)
@@ -127,19 +126,17 @@ def push(arguments: argparse.Namespace) -> None:
     format is refused. Cut off, it resumes. A token is read from HF_TOKEN or `hf auth login`, the address of another
     hub from HF_ENDPOINT.
     """
-    from pipeline.formats.registry import formats_of
-
-    config = owned(arguments)
-    if arguments.format not in config.export.formats:
+    run = owned(arguments)
+    if arguments.format not in run.config.export.formats:
         raise PipelineError(
             f"the run has no {arguments.format}",
             where=f"export.{arguments.format}",
-            expected=" or ".join(config.export.formats),
+            expected=" or ".join(run.config.export.formats),
         )
     from pipeline.publish import push
 
-    formats = {one.name: one for one in formats_of(config.data, config.export, config.render.extras)}
-    upload = push.prepare(formats[arguments.format], config.name)
+    (dataset,) = (dataset for dataset in run.formats if dataset.name == arguments.format)
+    upload = push.prepare(dataset, run)
     print(upload.summary())
     options = {"private": arguments.private, "replace": arguments.replace}
     if arguments.really:

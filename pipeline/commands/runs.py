@@ -33,9 +33,9 @@ def status(arguments: argparse.Namespace) -> None:
 
     from pipeline.validation import status
 
-    config = owned(arguments)
+    run = owned(arguments)
     console = Console(soft_wrap=True, highlight=False)
-    for part in status.told(config):
+    for part in status.told(run):
         console.print(part)
 
 
@@ -62,23 +62,23 @@ def clean(arguments: argparse.Namespace) -> None:
     from pipeline.generated import edits_in_words
     from pipeline.run import cleaning, foreign, stage
 
-    config = owned(arguments)
-    stage.refuse_unmarked(config.data)
-    found = cleaning.found(config.data, arguments.only or tuple(cleaning.PARTS))
+    run = owned(arguments)
+    stage.refuse_unmarked(run.folder)
+    found = cleaning.found(run, arguments.only or tuple(cleaning.PARTS))
     if not found:
-        print(f"{config.data} has nothing of this")
+        print(f"{run.folder} has nothing of this")
         return
     for part, size_mb in found.items():
         print(f"{size_mb:10.1f} MB  {part:<13} made again by {cleaning.PARTS[part].made_by}")
-    print(f"{sum(found.values()):10.1f} MB  in all, of {config.data}")
-    for edit in edits_in_words(config.data) if "uploads" in found else ():
+    print(f"{sum(found.values()):10.1f} MB  in all, of {run.folder}")
+    for edit in edits_in_words(run.folder) if "uploads" in found else ():
         print(edit)
-    foreign.refuse_foreign_files(config.data, [name for part in found for name in cleaning.PARTS[part].names])
+    foreign.refuse_foreign_files(run.folder, [name for part in found for name in cleaning.PARTS[part].names])
     if not arguments.yes:
         if not sys.stdin.isatty():
             raise PipelineError("nothing was deleted, as nobody can be asked here", remedy="add --yes")
         if input("Delete all of this? [y/N] ").strip().lower() not in ("y", "yes"):
             print("nothing was deleted")
             return
-    cleaning.delete(config.data, list(found))
+    cleaning.delete(run, list(found))
     print("deleted")

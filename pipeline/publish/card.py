@@ -6,7 +6,6 @@ import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
-from pathlib import Path
 from typing import Any
 
 import jinja2
@@ -16,6 +15,7 @@ from huggingface_hub import DatasetCardData
 from pipeline.axes import from_json
 from pipeline.axes.base import LEVELS, Credit, Layer, Perturbation
 from pipeline.axes.language import LanguagePerturbation, load_bank
+from pipeline.clients.recipe import RECIPE
 from pipeline.episode_schema import SCHEMA
 from pipeline.export_config import validating
 from pipeline.files import checksum, read_json, schema_file
@@ -25,6 +25,7 @@ from pipeline.libero.tasks import SUITES
 from pipeline.publish_config import PublishConfig
 from pipeline.run import manifest
 from pipeline.run.counts import Counts, named, origins, tally, targets, tried
+from pipeline.run.run import CARD, FINETUNE, MANIFEST, SHEETS, Run
 
 REPORTS = ("leakage.json", "validation.json", "dataset_statistics.json")
 """What the card is made from, besides the manifest; in the run's folder."""
@@ -50,30 +51,24 @@ TEMPLATES = jinja2.Environment(
 AnyFormat = Format[Any]
 
 
-def write(data: Path, formats: Sequence[AnyFormat], name: str, publish: PublishConfig) -> None:
-    """Write ``<data>/card/<format>/``, the files next to the dataset at the root of a repository.
-
-    Args:
-        data: the run's folder, with manifest, reports, ``sheets`` and ``finetune``.
-        formats: the run's datasets.
-        name: what all of them together are called.
-        publish: the publisher's statements.
+def write(run: Run) -> None:
+    """Write ``card/<format>/`` of a run, the files next to the dataset at the root of a repository.
 
     Raises:
         PipelineError: when something that it describes cannot be read, or edits of the card would be lost.
     """
-    rows = manifest.read(data / "manifest.parquet")
-    settings = manifest.settings(data / "manifest.parquet")
-    reports = {name: read_json(data / name) for name in REPORTS}
-    clients = yaml.safe_load((data / "finetune" / "finetune.yaml").read_text())["clients"]
+    rows, formats = run.manifest, run.formats
+    settings = manifest.settings(run.manifest_file)
+    reports = {name: read_json(run.path(name)) for name in REPORTS}
+    clients = yaml.safe_load((run.path(FINETUNE) / RECIPE).read_text())["clients"]
     axes = dict.fromkeys(row["axis"] for row in rows)
-    sheets = [axis for axis in axes if (data / "sheets" / f"{axis}.png").is_file()]
-    made_from = {file: checksum(data / file) for file in ("manifest.parquet", *REPORTS)}
-    with generated(data / "card", made_from) as folder:
+    sheets = [axis for axis in axes if (run.path(SHEETS) / f"{axis}.png").is_file()]
+    made_from = {name: checksum(run.path(name)) for name in (MANIFEST, *REPORTS)}
+    with generated(run.path(CARD), made_from) as folder:
         for one in formats:
             (folder / one.name / "pictures").mkdir(parents=True)
             for axis in sheets:
-                shutil.copyfile(data / "sheets" / f"{axis}.png", folder / one.name / "pictures" / f"{axis}.png")
+                shutil.copyfile(run.path(SHEETS) / f"{axis}.png", folder / one.name / "pictures" / f"{axis}.png")
             others = [other.title for other in formats if other is not one]
             text = render(
                 one,
@@ -82,14 +77,14 @@ def write(data: Path, formats: Sequence[AnyFormat], name: str, publish: PublishC
                 reports,
                 clients,
                 sheets=sheets,
-                name=name,
+                name=run.config.export.name,
                 source=settings.source,
                 episodes=settings.episodes,
-                publish=publish,
+                publish=run.config.publish,
             )
             (folder / one.name / "README.md").write_text(text)
             sums = {one.repository_path(path): sha256 for path, sha256 in one.record().files.items()}
-            sums["manifest.parquet"] = made_from["manifest.parquet"]
+            sums[MANIFEST] = made_from[MANIFEST]
             lines = [f"{sha256}  {path}\n" for path, sha256 in sorted(sums.items())]
             (folder / one.name / CHECKSUMS).write_text("".join(lines))
 
@@ -200,7 +195,7 @@ def _metadata(shown: AnyFormat, name: str, publish: PublishConfig, *, free: bool
         task_categories=["robotics"],
         source_datasets=["yifengzhu-hf/LIBERO-datasets"] if libero else None,
         tags=[shown.title, "LIBERO", "LIBERO-Plus", "panda", "simulation"],
-        configs=[*shown.viewer(), {"config_name": "manifest", "data_files": "manifest.parquet"}],
+        configs=[*shown.viewer(), {"config_name": "manifest", "data_files": MANIFEST}],
         **licence,
     )
 

@@ -28,6 +28,7 @@ from pipeline.grouping import grouped
 from pipeline.publish.card import REPOSITORY
 from pipeline.publish.repository import UPLOAD, Content, LastUpload, Repository, content_of, deletions, files_of, read
 from pipeline.run.export import OFT_STATISTICS
+from pipeline.run.run import CARD, FINETUNE, Run
 
 FAILURES = (OSError, RuntimeError, ValueError, httpx.HTTPError, getattr(errors, "XetError", OSError))
 """What an upload raises. Only before huggingface-hub 1 there is a ``XetError``; only since then it speaks by httpx."""
@@ -75,37 +76,37 @@ class Upload:
         )
 
 
-def prepare(target: Format[Any], run: str) -> Upload:
+def prepare(target: Format[Any], run: Run) -> Upload:
     """Gather what belongs to a dataset; nothing is sent.
 
     Args:
-        run: the run's name.
+        target: a dataset of the run.
 
     Raises:
         PipelineError: when files are missing, foreign, not as recorded, not validated, or failed validation.
     """
-    data = target.data
     recorded = target.record().files
     dataset = {target.repository_path(path): file for path, file in _exactly(target.folder, {*recorded}).items()}
-    _refuse_unvalidated(data, dataset, target.name)
+    _refuse_unvalidated(run, dataset, target.name)
     for fault in (fault for file in target.written() for fault in file.faults()):
         raise PipelineError(fault.what, expected=fault.expected)
     sha256 = {target.repository_path(path): sha256 for path, sha256 in recorded.items()}
     others: dict[str, Path] = {}
-    for folder, below, inside in (("card", target.name, ""), ("finetune", "", "finetune/")):
-        checksums = record(data / folder).files
-        for path, file in unchanged(data / folder, below).items():
+    for folder, below, inside in ((CARD, target.name, ""), (FINETUNE, "", f"{FINETUNE}/")):
+        checksums = record(run.path(folder)).files
+        for path, file in unchanged(run.path(folder), below).items():
             name = inside + path.removeprefix(f"{below}/")
             others[name], sha256[name] = file, checksums[path]
-    for name, of_file in record(data / "card").made_from.items():
-        if (data / name).is_symlink() or checksum(data / name) != of_file:
+    for name, of_file in record(run.path(CARD)).made_from.items():
+        source = run.path(name)
+        if source.is_symlink() or checksum(source) != of_file:
             raise PipelineError(
-                "is a link, or has changed since the card was generated from it", where=data / name, remedy=MAKE_AGAIN
+                "is a link, or has changed since the card was generated from it", where=source, remedy=MAKE_AGAIN
             )
-        others[name], sha256[name] = data / name, of_file
+        others[name], sha256[name] = source, of_file
     # Its own folders too where it has nothing in them now, such as videos.
     folders = target.repository_folders() | {path.partition("/")[0] for path in dataset if "/" in path}
-    return Upload(run, target.name, dataset, dict(sorted(others.items())), sha256, folders, target.tag())
+    return Upload(run.name, target.name, dataset, dict(sorted(others.items())), sha256, folders, target.tag())
 
 
 def compare(upload: Upload, repository: str, *, private: bool = False, replace: bool = False) -> str:
@@ -256,9 +257,9 @@ def _exactly(root: Path, wanted: set[str]) -> dict[str, Path]:
     return found
 
 
-def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> None:
+def _refuse_unvalidated(run: Run, files: Mapping[str, Path], name: str) -> None:
     """Stop unless these very files passed validation, and the card tells of it."""
-    report, card = data / "validation.json", data / "card" / name / "README.md"
+    report, card = run.validation_file, run.path(CARD) / name / "README.md"
     checks = read_json(report)
     failed = [f"{check} ({found['findings'][0]})" for check, found in checks.items() if found["findings"]]
     if failed or not checks:
@@ -270,7 +271,7 @@ def _refuse_unvalidated(data: Path, files: Mapping[str, Path], name: str) -> Non
         )
     if not card.is_file():
         raise PipelineError("not there", where=card, remedy=MAKE_AGAIN)
-    newest = max(*files.values(), data / "manifest.parquet", key=_written)
+    newest = max(*files.values(), run.manifest_file, key=_written)
     for before, after in pairwise((newest, report, card)):
         if _written(after) < _written(before):
             raise PipelineError(

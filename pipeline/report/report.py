@@ -29,6 +29,7 @@ from pipeline.report.yields import Table
 from pipeline.run import counts, manifest
 from pipeline.run.counts import Counts, Rows, by_axis
 from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.run import LEAKAGE, PREVIEWS, SHEETS, Run
 from pipeline.stores.frame_store import FrameStore
 from pipeline.testset.benchmark import TestSet
 from pipeline.types import Floats, Quality
@@ -36,7 +37,6 @@ from pipeline.types import Floats, Quality
 ById = Mapping[str, Mapping[str, Any]]
 """Episode id to its row of the manifest."""
 
-FILE = "report.html"
 REWRITES = 12
 """So many are quoted."""
 
@@ -53,22 +53,21 @@ class Video(NamedTuple):
     clip: Clip
 
 
-def page(config: Config, test: TestSet) -> str:
+def page(run: Run, test: TestSet) -> str:
     """The report of a finished run.
 
     Raises:
         PipelineError: when the run's folder lacks what an earlier stage makes.
     """
-    data = config.data
-    rows: Rows = manifest.read(data / "manifest.parquet")
-    load = EpisodeLoader(data, config.render)
+    rows, config = run.manifest, run.config
+    load = run.episodes()
     tried = counts.tried(rows)
     kept = [row for row in tried if row["kept"]]
-    distances = leakage.covered_by(kept, read_json(data / "leakage.json"), test)
+    distances = leakage.covered_by(kept, read_json(run.path(LEAKAGE)), test)
     twins = counts.twins(rows)
-    actions = _actions([*kept, *twins.values()], FrameStore(data / "frames", config.render))
+    actions = _actions([*kept, *twins.values()], run.frames)
     axes = list(dict.fromkeys(row["axis"] for row in kept))
-    sheets = _pictures(data / "sheets")
+    sheets = _pictures(run.path(SHEETS))
     return pages.render(
         "report.html.j2",
         name=config.name,
@@ -85,14 +84,14 @@ def page(config: Config, test: TestSet) -> str:
         lengths=_lengths(rows, kept),
         quality=[_strips(each.name, kept, itemgetter(each.name), each.name) for each in fields(Quality)],
         worst=_worst(kept, twins, load),
-        seen=seen.measure(config, test),
+        seen=seen.measure(run, test),
         sample=seen.SAMPLE,
         coverage=_coverage(tried, test),
         rewrites=_rewrites(kept),
         leakage=distances,
         videos=_videos(kept, twins, load),
         sheets={axis: sheets[axis] for axis in axes if axis in sheets},
-        previews={folder.name: _pictures(folder) for folder in sorted((data / "previews").glob("*"))},
+        previews={folder.name: _pictures(folder) for folder in sorted(run.path(PREVIEWS).glob("*"))},
         versions=_versions(rows),
         example=min(row["episode_id"] for row in kept),
         settings=_settings(config),

@@ -27,7 +27,6 @@ from pipeline.axes.layout import LayoutPerturbation
 from pipeline.axes.noise import NoisePerturbation
 from pipeline.axes.pose import PosePerturbation, ScenePerturbation, Shifts, displacements
 from pipeline.axes.robot import RobotPerturbation
-from pipeline.config import Config
 from pipeline.episode_schema import SCHEMA
 from pipeline.grouping import grouped
 from pipeline.images.jpeg import decode
@@ -35,11 +34,10 @@ from pipeline.libero import bddl
 from pipeline.libero.tasks import find_task
 from pipeline.planning.plan import Row
 from pipeline.run import outcome
-from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.finished import SEEN
+from pipeline.run.run import Run
 from pipeline.scenes.compiled import physics_to_read
 from pipeline.scenes.swept_path import SURFACES
-from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.testset.benchmark import TestSet, TestTask
 from pipeline.types import Floats
 
@@ -147,18 +145,19 @@ class Look(NamedTuple):
         }
 
 
-def measure(config: Config, test: TestSet) -> list[Measure]:
+def measure(run: Run, test: TestSet) -> list[Measure]:
     """Every measure of a finished run and of the test tasks, axis by axis.
 
     Raises:
         PipelineError: when the run lacks a trajectory or frames.
     """
-    run = outcome.read(config)
+    result = run.outcome
     # In the order in which they are written: shuffled, so that the first of each axis are of many tasks.
-    kept = [run.row_of[episode_id] for episode_id in run.kept]
+    kept = [result.row_of[episode_id] for episode_id in result.kept]
     # Trajectories and frames of those that ``export.where`` leaves out are there too.
-    twins = [row for row in run.rows if row.role == "twin" and run.verdicts[row.episode_id].reason in outcome.MADE]
-    seen = _Run(config, {row.episode_id: row for row in twins})
+    made = [row for row in result.rows if result.verdicts[row.episode_id].reason in outcome.MADE]
+    twins = {row.episode_id: row for row in made if row.role == "twin"}
+    seen = _Seen(run, twins)
     by_axis = [[row for row in kept if row.axis == axis][:SAMPLE] for axis in dict.fromkeys(row.axis for row in kept)]
     ours = _summaries(chain(*map(seen.of, chain(*by_axis)), to_nearest_draw(test, kept)))
     run_once = {name: Spread(*values) for name, values in json.loads(SEEN.read_text()).items()}
@@ -174,12 +173,12 @@ def _summaries(pairs: Iterable[tuple[str, float]]) -> dict[str, Spread | Share]:
     }
 
 
-class _Run:
+class _Seen:
     """What a run has of its episodes; each first look is read once."""
 
-    def __init__(self, config: Config, twins: Mapping[str, Row]):
-        self._store = TrajectoryStore(config.data / "trajectories")
-        self._load = EpisodeLoader(config.data, config.render)
+    def __init__(self, run: Run, twins: Mapping[str, Row]):
+        self._store = run.trajectories
+        self._load = run.episodes()
         self._twins = twins
         self._looks: dict[tuple[str, int], Look] = {}
 

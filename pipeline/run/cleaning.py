@@ -4,11 +4,30 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from pipeline.config import Config
 from pipeline.files import remove
-from pipeline.formats.registry import FAILURES, failures_of, formats_of
-from pipeline.run.finished import FOLDER
+from pipeline.formats.registry import FAILURES
 from pipeline.run.foreign import refuse_foreign_files
+from pipeline.run.run import (
+    CARD,
+    COUNTS,
+    FINETUNE,
+    FINISHED,
+    FRAMES,
+    INPUTS,
+    LEAKAGE,
+    MANIFEST,
+    PLAN,
+    PREVIEWS,
+    REPLAY,
+    REPORT,
+    SETTINGS,
+    SHEETS,
+    STATISTICS,
+    TRAJECTORIES,
+    VALIDATION,
+    WORK,
+    Run,
+)
 from pipeline.run.stage import locked, refuse_unmarked
 
 
@@ -30,28 +49,25 @@ def _with_failures(*formats: str) -> tuple[str, ...]:
 
 
 PARTS = {
-    "unfinished": Part((".work",), "nothing: what stopped stages left"),
-    "pictures": Part(("sheets", "previews", "report.html"), "summary and report"),
-    "uploads": Part(("card", "finetune"), "card and recipe"),
+    "unfinished": Part((WORK,), "nothing: what stopped stages left"),
+    "pictures": Part((SHEETS, PREVIEWS, REPORT), "summary and report"),
+    "uploads": Part((CARD, FINETUNE), "card and recipe"),
     "rlds": Part(_with_failures("rlds"), "export_rlds, from the frames"),
     "lerobot": Part(_with_failures("lerobot", "lerobot_v21"), "export_lerobot, from the frames"),
-    "frames": Part(("frames",), "render, from the trajectories: most of a run's time"),
-    "trajectories": Part(("trajectories", "replay.json"), "replay, from the demonstrations"),
+    "frames": Part((FRAMES,), "render, from the trajectories: most of a run's time"),
+    "trajectories": Part((TRAJECTORIES, REPLAY), "replay, from the demonstrations"),
     "tables": Part(
-        (
-            *("plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "leakage.json"),
-            *("validation.json", "inputs.json", "settings.json", FOLDER),
-        ),
+        (PLAN, MANIFEST, COUNTS, STATISTICS, LEAKAGE, VALIDATION, INPUTS, SETTINGS, FINISHED),
         "plan, manifest, validate and others",
     ),
 }
 """Least to make again first."""
 
 
-def say_stale(part: str, config: Config) -> None:
+def say_stale(part: str, run: Run) -> None:
     """Say which datasets of a part of ``PARTS`` are there though nothing asks for them now."""
-    asked = {one.folder for one in (*formats_of(config.data, config.export), *failures_of(config.data, config.export))}
-    for folder in (config.data / name for name in PARTS[part].names):
+    asked = {dataset.folder for dataset in (*run.formats, *run.failure_formats)}
+    for folder in map(run.path, PARTS[part].names):
         if folder.is_dir() and folder not in asked:
             print(
                 f"{folder} is of an earlier run, and not asked for: `python -m pipeline clean --only {part} CONFIG` "
@@ -59,25 +75,29 @@ def say_stale(part: str, config: Config) -> None:
             )
 
 
-def found(data: Path, parts: Iterable[str]) -> dict[str, float]:
-    """Of some parts, those that are there, to their megabytes."""
-    there = {part: [path for name in PARTS[part].names if (path := data / name).exists()] for part in parts}
-    return {part: sum(map(size_mb, paths)) for part, paths in there.items() if paths}
+def found(run: Run, parts: Iterable[str]) -> dict[str, float]:
+    """Map the parts that are there to their megabytes."""
+    sizes_mb = {}
+    for part in parts:
+        paths = [path for path in map(run.path, PARTS[part].names) if path.exists()]
+        if paths:
+            sizes_mb[part] = sum(map(size_mb, paths))
+    return sizes_mb
 
 
-def delete(data: Path, parts: Iterable[str]) -> None:
+def delete(run: Run, parts: Iterable[str]) -> None:
     """Delete parts of a run's folder.
 
     Raises:
         PipelineError: when the folder is not marked as that of a run, a stage of the run is running, or a part holds
             files that no stage made.
     """
-    refuse_unmarked(data)
-    with locked(data):
-        refuse_foreign_files(data, [name for part in parts for name in PARTS[part].names])
+    refuse_unmarked(run.folder)
+    with locked(run.folder):
+        refuse_foreign_files(run.folder, [name for part in parts for name in PARTS[part].names])
         for part in parts:
             for name in PARTS[part].names:
-                remove(data / name)
+                remove(run.path(name))
 
 
 def size_mb(path: Path) -> float:

@@ -9,19 +9,17 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from pipeline.config import Config
 from pipeline.errors import PipelineError
-from pipeline.formats.registry import failures_of, formats_of
 from pipeline.identity import ALLOW, REMAKE
 from pipeline.planning import plan
 from pipeline.planning.selection import NOT_NEEDED, NOT_REPLAYED, select
 from pipeline.planning.streams import streams_of
 from pipeline.run import machine
 from pipeline.run.outcome import MISSED, rejections, rendered
+from pipeline.run.run import Run
 from pipeline.run.verdicts import verdicts_of
 from pipeline.run.work_time import REFERENCE, frame_s, replay_s
-from pipeline.stores.frame_store import FrameStore, shown_of
-from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.stores.frame_store import shown_of
 from pipeline.types import Verdict
 
 LARGEST_SHARE = 0.1
@@ -68,26 +66,25 @@ class Dropped:
         return "; ".join(parts)
 
 
-def measure(rows: Sequence[plan.Row], config: Config) -> Dropped:
+def measure(rows: Sequence[plan.Row], run: Run) -> Dropped:
     """Measure the finished work that the stages ``replay``, ``render`` and ``export`` would delete under a plan.
 
     An episode counts as needed while it is not known whether it is: where it, or a candidate before it, is not
     replayed or not rendered yet.
     """
-    replays, frames = _replays(config), _frames(config)
-    trajectories, streams = _needed(rows, config)
-    speed = machine.known_speed(config.data) or REFERENCE
-    encoded = config.render.model_dump(mode="json")
+    trajectories, streams = _needed(rows, run)
+    speed = machine.known_speed(run) or REFERENCE
+    encoded = run.config.render.model_dump(mode="json")
     all_s = dropped_s = 0.0
     unneeded_streams = 0
-    replayed = replays.rows_of_all_settings()
+    replayed = run.trajectories.rows_of_all_settings()
     unneeded = replayed.keys() - trajectories
     for name, row in replayed.items():
         took_s = replay_s(row["steps"], speed)
         all_s += took_s
         dropped_s += took_s * (name in unneeded)
-    settings = frames.settings_by_fingerprint()
-    for name, row in frames.rows_of_all_settings().items():
+    settings = run.frames.settings_by_fingerprint()
+    for name, row in run.frames.rows_of_all_settings().items():
         other = settings.get(row["made_by"], encoded) != encoded
         of_file = {(name.split("/")[0], stream) for stream in row["streams"]}
         gone = of_file if other else of_file - streams
@@ -95,7 +92,7 @@ def measure(rows: Sequence[plan.Row], config: Config) -> Dropped:
         all_s += len(of_file) * stream_s
         dropped_s += len(gone) * stream_s
         unneeded_streams += len(gone)
-    exported = _exported(config)
+    exported = _exported(run)
     gone_episodes = len(exported - {row.episode_id for row in rows})
     return Dropped(
         trajectories=len(unneeded),
@@ -107,17 +104,17 @@ def measure(rows: Sequence[plan.Row], config: Config) -> Dropped:
     )
 
 
-def refuse_unasked(rows: Sequence[plan.Row], config: Config) -> None:
+def refuse_unasked(rows: Sequence[plan.Row], run: Run) -> None:
     """Print how much finished work a plan drops, and stop where it is much and nobody allowed it.
 
     Raises:
         PipelineError: when it is more than ``LARGEST_SHARE``. Nothing was changed.
     """
-    dropped = measure(rows, config)
+    dropped = measure(rows, run)
     if dropped.asks and os.environ.get(REMAKE) != "1":
         raise PipelineError(
             f"the configuration no longer needs, and the run would delete: {dropped}",
-            where=config.data,
+            where=run.folder,
             expected=f"a configuration that needs all but {LARGEST_SHARE:.0%} of the finished work",
             remedy=f"put the configuration back; or copy it to a file with another `name:`, which gets a folder of its "
             f"own; or allow it: {ALLOW}",
@@ -126,10 +123,11 @@ def refuse_unasked(rows: Sequence[plan.Row], config: Config) -> None:
         print(f"no longer needed, and deleted by the stages that follow: {dropped}")
 
 
-def _needed(rows: Sequence[plan.Row], config: Config) -> tuple[set[str], set[tuple[str, str]]]:
+def _needed(rows: Sequence[plan.Row], run: Run) -> tuple[set[str], set[tuple[str, str]]]:
     """Ids of the trajectories that a plan may need, and of the streams, each with its trajectory's."""
-    verdicts = verdicts_of(_replays(config).rows(), rows, config.filter)
-    shown = shown_of(_frames(config).rows())
+    config = run.config
+    verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
+    shown = shown_of(run.frames.rows())
     rejected = rejections(rows, shown)
     unknown = Verdict(False, NOT_REPLAYED)
     # Reserves are needed unless candidates before them are known to be kept, frames included.
@@ -149,22 +147,13 @@ def _needed(rows: Sequence[plan.Row], config: Config) -> tuple[set[str], set[tup
     return trajectories, streams
 
 
-def _exported(config: Config) -> set[str]:
+def _exported(run: Run) -> set[str]:
     """Ids of the episodes in the finished datasets that the run would replace."""
-    formats = [*formats_of(config.data, config.export), *failures_of(config.data, config.export)]
     exported: set[str] = set()
-    for target in formats:
+    for target in (*run.formats, *run.failure_formats):
         with suppress(PipelineError):  # There is none.
             exported |= target.record().places.keys()
     return exported
-
-
-def _replays(config: Config) -> TrajectoryStore:
-    return TrajectoryStore(config.data / "trajectories")
-
-
-def _frames(config: Config) -> FrameStore:
-    return FrameStore(config.data / "frames", config.render)
 
 
 def _hours(seconds: float) -> str:

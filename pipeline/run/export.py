@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.axes.language import LanguageAxis
-from pipeline.compute.pool import Workers, runner
-from pipeline.config import Config
+from pipeline.compute.pool import Workers
 from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import (
@@ -35,11 +34,10 @@ from pipeline.files import (
 )
 from pipeline.formats.base import Export, Format
 from pipeline.formats.episodes import Episodes, Known, Load, Piece
-from pipeline.formats.registry import failures_of
 from pipeline.identity import PACKAGES, RECIPES, differences, made_with, refuse_unasked
 from pipeline.libero.tasks import find_task
-from pipeline.run import outcome
-from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.outcome import shuffled
+from pipeline.run.run import Run
 from pipeline.seeding import digest
 from pipeline.testset import benchmark
 from pipeline.types import Extra
@@ -56,26 +54,24 @@ BEFORE = "before"
 """Folder of a format's work folder: the dataset that was replaced, until the new one has its record."""
 
 
-def export_run(kind: type[AnyFormat], config: Config) -> None:
+def export_run(kind: type[AnyFormat], run: Run) -> None:
     """Bring a run's dataset of one format up to date, and say what was done.
 
     One that is not asked for is left as it is: where there is none, its record is an empty one.
     """
-    options = config.export.formats.get(kind.name)
+    options = run.config.export.formats.get(kind.name)
     if options is None:
-        record = config.data / f"{kind.name}.json"
+        record = run.path(f"{kind.name}.json")
         if not record.exists():
             write_json(record, {})
         print(f"{kind.title} is not asked for: export.{kind.name} is null")
         return
-    run = outcome.read(config)
-    targets = [kind(config.data, options, config.render.extras)]
-    targets += [one for one in failures_of(config.data, config.export, config.render.extras) if one.name == kind.name]
-    for target in targets:
-        _bring_up_to_date(target, episodes_of(target, config, run), config)
+    for target in (*run.formats, *run.failure_formats):
+        if target.name == kind.name:
+            _bring_up_to_date(target, episodes_of(target, run), run)
 
 
-def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> None:
+def _bring_up_to_date(target: AnyFormat, episodes: Episodes, run: Run) -> None:
     refuse_foreign(target, episodes)
     if not episodes.ids and "outcome" in target.extras:
         remove(target.folder)
@@ -86,7 +82,7 @@ def _bring_up_to_date(target: AnyFormat, episodes: Episodes, config: Config) -> 
         print(f"{target.folder} has these {len(episodes.ids)} episodes already, see {target.record_file}")
         return
     refuse_unasked(outdated(target, episodes), target.folder)
-    with runner(config.compute, config.data) as workers:
+    with run.workers() as workers:
         export(target, episodes, workers)
     print(f"wrote {len(episodes.ids)} episodes to {target.folder}")
 
@@ -123,7 +119,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(path for path in paths if not OFT_STATISTICS.fullmatch(path.name))
 
 
-def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Episodes:
+def episodes_of(target: AnyFormat, run: Run) -> Episodes:
     """What a dataset is made of: the kept episodes of a run, or its failures, in the order they are written.
 
     Where the format takes ``language``, they come with subtasks and with the rewrites that the run's language axis may
@@ -131,16 +127,17 @@ def episodes_of(target: AnyFormat, config: Config, run: outcome.Outcome) -> Epis
     """
     failures = "outcome" in target.extras
     rewrites: dict[str, tuple[str, ...]] | None = {} if target.language else None
+    outcome, language = run.outcome, run.config.plan.axes.language
     known: dict[str, Known] = {}
-    for one in outcome.shuffled(run.missed) if failures else run.kept:
-        row, content = run.row_of[one], run.content(one)
+    for one in shuffled(outcome.missed) if failures else outcome.kept:
+        row, content = outcome.row_of[one], outcome.content(one)
         if rewrites is not None:
-            rewrites[one] = wordings(config.plan.axes.language, row.suite, row.task, row.axis)
+            rewrites[one] = wordings(language, row.suite, row.task, row.axis)
             content = digest(content, rewrites[one])[:16]
-        steps = run.trajectories[row.trajectory_id]["steps"]
+        steps = outcome.trajectories[row.trajectory_id]["steps"]
         known[one] = Known(row.suite, content, row.demo_id, row.instruction, steps, row.demo_origin_sha256)
     extras: tuple[Extra, ...] = ("outcome",) if failures else ()
-    return Episodes(known, EpisodeLoader(config.data, config.render, extras, rewrites))
+    return Episodes(known, run.episodes(extras=extras, rewrites=rewrites))
 
 
 @cache

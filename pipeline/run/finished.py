@@ -16,15 +16,27 @@ from pipeline.axes.language import BANK_FILE
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
-from pipeline.formats.registry import recorded
 from pipeline.identity import fingerprint
 from pipeline.run.export import untouched
-from pipeline.stores.frame_store import FrameStore
+from pipeline.run.run import (
+    COUNTS,
+    FINISHED,
+    FRAMES,
+    INPUTS,
+    LEAKAGE,
+    MACHINE,
+    MANIFEST,
+    PLAN,
+    PREVIEWS,
+    REPORT,
+    SHEETS,
+    STATISTICS,
+    VALIDATION,
+    Run,
+)
 from pipeline.stores.store import TABLE
-from pipeline.stores.trajectory_store import TrajectoryStore
 
-FOLDER = ".finished"
-FRAMES = f"frames/{TABLE}"
+FRAMES_TABLE = f"{FRAMES}/{TABLE}"
 SEEN = Path(__file__).parents[1] / "testset" / "seen.json"
 """What a policy sees in test tasks, which the report shows beside what it sees in the run."""
 
@@ -58,29 +70,29 @@ class Memory:
 
     @property
     def _file(self) -> Path:
-        return self.data / FOLDER / f"{self.stage}.json"
+        return self.data / FINISHED / f"{self.stage}.json"
 
     def _now(self) -> dict[str, Any]:
         return {"made_by": self.made_by, "outputs": _contents([self.data / name for name in self.outputs], self.data)}
 
 
-def of_validate(config: Config) -> Memory:
+def of_validate(run: Run) -> Memory:
     """Of what ``validate`` found: it passed on these contents, of which nothing has changed."""
-    names = ("plan.parquet", "manifest.parquet", "counts.json", "dataset_statistics.json", "inputs.json")
-    formats = recorded(config.data, config.export, config.render.extras)
-    stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
-    files = [config.data / name for name in names] + [store.root / TABLE for store in stores]
-    files += [one.record_file for one in formats]
-    whole = all(store.untouched() for store in stores) and all(untouched(one) for one in formats)
+    stores, formats = (run.trajectories, run.frames), run.recorded_formats
+    files = [run.path(name) for name in (PLAN, MANIFEST, COUNTS, STATISTICS, INPUTS)]
+    files += [store.root / TABLE for store in stores]
+    files += [dataset.record_file for dataset in formats]
+    whole = all(store.untouched() for store in stores) and all(untouched(dataset) for dataset in formats)
+    config = run.config
     sections = [settings_of(section) for section in (config.render, config.export, config.plan.axes)]
     settings = [*sections, checksum(BANK_FILE)]
-    made_by = fingerprint("checks", *settings, _contents(files, config.data)) if whole else None
-    return Memory(config.data, "validate", made_by, ["validation.json"])
+    made_by = fingerprint("checks", *settings, _contents(files, run.folder)) if whole else None
+    return Memory(run.folder, "validate", made_by, [VALIDATION])
 
 
-def of_doctor(config: Config, device: str) -> Memory:
+def of_doctor(run: Run, device: str) -> Memory:
     """Of a trial of this machine."""
-    return Memory(config.data, "doctor", fingerprint("pixels", device, *host()), ["machine.json"])
+    return Memory(run.folder, "doctor", fingerprint("pixels", device, *host()), [MACHINE])
 
 
 def host() -> list[list[str]]:
@@ -90,30 +102,30 @@ def host() -> list[list[str]]:
     return [list(platform.uname()), sorted(models)]
 
 
-def of_summary(config: Config) -> Memory:
+def of_summary(run: Run) -> Memory:
     """Of the contact sheets and previews."""
-    names = ("plan.parquet", "manifest.parquet", "inputs.json", FRAMES)
-    return _of_pictures(config, "summary", ["sheets", "previews"], _drawn_by(config), names)
+    names = (PLAN, MANIFEST, INPUTS, FRAMES_TABLE)
+    return _of_pictures(run, "summary", [SHEETS, PREVIEWS], _drawn_by(run.config), names)
 
 
-def of_previews(config: Config) -> Memory:
+def of_previews(run: Run) -> Memory:
     """Of the previews alone, which show no episode: what is kept and exported changes none."""
-    return _of_pictures(config, "previews", ["previews"], _drawn_by(config), ["inputs.json"])
+    return _of_pictures(run, "previews", [PREVIEWS], _drawn_by(run.config), [INPUTS])
 
 
-def of_report(config: Config) -> Memory:
+def of_report(run: Run) -> Memory:
     """Of the report."""
-    names = ("plan.parquet", "manifest.parquet", "leakage.json", "inputs.json", FRAMES, "sheets", "previews")
-    settings = [settings_of(config, {"compute", "folder", "publish"}), checksum(SEEN)]
-    return _of_pictures(config, "report", ["report.html"], settings, names)
+    names = (PLAN, MANIFEST, LEAKAGE, INPUTS, FRAMES_TABLE, SHEETS, PREVIEWS)
+    settings = [settings_of(run.config, {"compute", "folder", "publish"}), checksum(SEEN)]
+    return _of_pictures(run, "report", [REPORT], settings, names)
 
 
 def _of_pictures(
-    config: Config, stage: str, outputs: Sequence[str], settings: Sequence[object], names: Sequence[str]
+    run: Run, stage: str, outputs: Sequence[str], settings: Sequence[object], names: Sequence[str]
 ) -> Memory:
-    whole = FRAMES not in names or FrameStore(config.data / "frames", config.render).untouched()
-    contents = _contents([config.data / name for name in names], config.data)
-    return Memory(config.data, stage, fingerprint("pictures", *settings, contents) if whole else None, outputs)
+    whole = FRAMES_TABLE not in names or run.frames.untouched()
+    contents = _contents([run.path(name) for name in names], run.folder)
+    return Memory(run.folder, stage, fingerprint("pictures", *settings, contents) if whole else None, outputs)
 
 
 def _drawn_by(config: Config) -> list[dict[str, Any]]:

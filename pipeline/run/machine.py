@@ -10,7 +10,6 @@ import timeit
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 from pipeline import gl
@@ -20,16 +19,13 @@ from pipeline.files import read_json, write_json
 from pipeline.identity import fingerprint, made_with
 from pipeline.libero.demonstrations import StarterSource
 from pipeline.libero.tasks import find_task
-from pipeline.run.finished import FOLDER
+from pipeline.run.run import FINISHED, FRAMES, MACHINE, TRAJECTORIES, Run
 from pipeline.stores.store import SUFFIX
 
-FILE = "machine.json"
-"""File of a run's folder that says what it began with, and what trials came to."""
-
-SPEED = f"{FOLDER}/speed.json"
+SPEED = f"{FINISHED}/speed.json"
 """File of a run's folder that says how fast the machine was, by which ``status`` knows the time that is left."""
 
-STORES = {"ten steps": ("trajectories", "frames"), "one frame": ("frames",)}
+STORES = {"ten steps": (TRAJECTORIES, FRAMES), "one frame": (FRAMES,)}
 """What of a trial stands for the files of which folders."""
 
 TRIAL_TASK, TRIAL_STEPS = ("libero_goal", "turn_on_the_stove"), 10
@@ -93,53 +89,53 @@ def _seconds(call: Callable[[], object], gpu: bool = False) -> float:
     return min(timeit.repeat(call, number=1, repeat=10, timer=time.perf_counter if gpu else time.process_time))
 
 
-def keep_speed(folder: Path, speed: Speed) -> None:
+def keep_speed(run: Run, speed: Speed) -> None:
     """Write it down for ``status``; no file that is made depends on it."""
-    (folder / SPEED).parent.mkdir(exist_ok=True)
-    write_json(folder / SPEED, speed._asdict())
+    run.path(SPEED).parent.mkdir(exist_ok=True)
+    write_json(run.path(SPEED), speed._asdict())
 
 
-def known_speed(folder: Path) -> Speed | None:
+def known_speed(run: Run) -> Speed | None:
     """What ``keep_speed`` wrote last; None where it did not, or another version did."""
-    file = folder / SPEED
+    file = run.path(SPEED)
     found = read_json(file) if file.exists() else {}
     return Speed(**found) if found.keys() == set(Speed._fields) else None
 
 
-def record(folder: Path, trial: Mapping[str, str]) -> None:
+def record(run: Run, trial: Mapping[str, str]) -> None:
     """Write what is here, unless the run was begun where the trial came to something else.
 
     Raises:
         PipelineError: as ``refuse_another``.
     """
-    refuse_another(folder, trial)
+    refuse_another(run, trial)
     here = {**made_with("encoding"), "OpenGL device": trial["OpenGL device"]}
-    write_json(folder / FILE, {"made with": here, "trials": trials(folder) | _named(trial)})
+    write_json(run.path(MACHINE), {"made with": here, "trials": trials(run) | _named(trial)})
 
 
-def refuse_another(folder: Path, trial: Mapping[str, str]) -> None:
+def refuse_another(run: Run, trial: Mapping[str, str]) -> None:
     """Compare a trial with those that are recorded; nothing is written.
 
     Raises:
         PipelineError: when another machine with the same versions and device came to something else, and files were
             made. They would count as current, so that the run would be of two kinds.
     """
-    recorded = trials(folder)
+    recorded = trials(run)
     for name, digest in _named(trial).items():
         stores = STORES[name.split(",")[0]]
-        files_exist = any(next((folder / store).rglob(f"*{SUFFIX}"), None) for store in stores)
+        files_exist = any(next(run.path(store).rglob(f"*{SUFFIX}"), None) for store in stores)
         if recorded.get(name, digest) != digest and files_exist:
             raise PipelineError(
                 f"the run was begun where {name} came to {recorded[name]}, here it is {digest}",
-                where=folder / FILE,
+                where=run.path(MACHINE),
                 expected="the same results of the same versions on the same OpenGL device",
                 remedy="go on where it was begun, or move away its " + " and its ".join(stores),
             )
 
 
-def trials(folder: Path) -> dict[str, str]:
+def trials(run: Run) -> dict[str, str]:
     """What the run's folder has, by name; none where there is no record, or one of an earlier version."""
-    file = folder / FILE
+    file = run.path(MACHINE)
     return dict(read_json(file).get("trials", {})) if file.exists() else {}
 
 

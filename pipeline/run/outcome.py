@@ -71,7 +71,7 @@ def shuffled(episode_ids: Iterable[str]) -> list[str]:
 
 def replayed(
     rows: Sequence[plan.Row],
-    folder: Path,
+    store: TrajectoryStore,
     rejected: Mapping[str, str] | None = None,
     limits: FilterConfig = FilterConfig(),  # noqa: B008 - frozen
 ) -> dict[str, dict[str, Any]]:
@@ -83,7 +83,6 @@ def replayed(
     Raises:
         PipelineError: when a trajectory that the plan needs is not there, or can no longer be read.
     """
-    store = TrajectoryStore(folder)
     trajectories = store.rows()
     needed = selection.pending(rows, verdicts_of(trajectories, rows, limits), rejected)
     # What takes the place of rejected frames, only the stage render replays.
@@ -106,27 +105,25 @@ def rejections(rows: Sequence[plan.Row], frames: Mapping[str, Shown]) -> dict[st
     return reasons
 
 
-def read(config: Config) -> Outcome:
-    """What became of every row of a run, after the render stage, and what of it ``export.where`` leaves out.
+def judge(rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: FrameStore, config: Config) -> Outcome:
+    """Judge every row of a plan after the render stage, and apply ``export.where``.
 
     Raises:
         PipelineError: when a trajectory or a frame that the plan needs is not there, or can no longer be read.
     """
-    rows = plan.read(config.data / "plan.parquet")
-    store = FrameStore(config.data / "frames", config.render)
-    frames = shown_of(store.rows())
-    rejected = rejections(rows, frames)
-    trajectories = replayed(rows, config.data / "trajectories", rejected, config.filter)
-    judged = selection.select(rows, verdicts_of(trajectories, rows, config.filter), rejected)
+    stored_frames = shown_of(frames.rows())
+    rejected = rejections(rows, stored_frames)
+    replays = replayed(rows, trajectories, rejected, config.filter)
+    judged = selection.select(rows, verdicts_of(replays, rows, config.filter), rejected)
     if where := config.export.where:
         for row in rows:
             if judged[row.episode_id].kept and not where.takes(row.axis, row.component, row.level, row.suite):
                 judged[row.episode_id] = Verdict(False, LEFT_OUT)
     failures = [row for row in missed(rows, judged, config.export) if row.episode_id not in rejected]
     kept = [row for row in rows if judged[row.episode_id].kept]
-    missing = dict.fromkeys(store.folder(row.trajectory_id) for row in (*kept, *failures) if not rendered(row, frames))
-    _refuse_missing([*missing], "render")
-    return Outcome(rows, trajectories, frames, judged, [row.episode_id for row in failures])
+    not_rendered = [row for row in (*kept, *failures) if not rendered(row, stored_frames)]
+    _refuse_missing([*dict.fromkeys(frames.folder(row.trajectory_id) for row in not_rendered)], "render")
+    return Outcome(rows, replays, stored_frames, judged, [row.episode_id for row in failures])
 
 
 def missed(rows: Sequence[plan.Row], judged: Mapping[str, Verdict], export: ExportConfig) -> list[plan.Row]:
@@ -151,8 +148,10 @@ def _refuse_missing(missing: Sequence[Path], stage: str) -> None:
         )
 
 
-def outdated(rows: Sequence[plan.Row], config: Config, device: str | None = None) -> Counter[str]:
-    """What of a plan's stored work this version, or this machine, would make anew, and why, to the number of files.
+def outdated(
+    rows: Sequence[plan.Row], trajectories: TrajectoryStore, frames: FrameStore, device: str | None = None
+) -> Counter[str]:
+    """Count the stored files of a plan that this version, or this machine, would generate again, by reason.
 
     Counted are finished files of today's plan, with today's settings, that were made with other recipes, packages,
     machine code or another OpenGL device: see ``identity.refuse_unasked``. A changed configuration or plan wants new
@@ -164,8 +163,8 @@ def outdated(rows: Sequence[plan.Row], config: Config, device: str | None = None
     planned = dict.fromkeys(row.trajectory_id for row in rows)
     found: Counter[str] = Counter()
     for what, reasons in (
-        ("trajectories", TrajectoryStore(config.data / "trajectories").outdated(planned)),
-        ("files of frames", FrameStore(config.data / "frames", config.render).outdated_of(planned, device)),
+        ("trajectories", trajectories.outdated(planned)),
+        ("files of frames", frames.outdated_of(planned, device)),
     ):
         found.update({f"{what}, made with {reason}": number for reason, number in reasons.items()})
     return found

@@ -6,16 +6,15 @@ from pathlib import Path
 
 from pipeline.config import Config
 from pipeline.files import checksum
-from pipeline.formats.registry import FORMATS
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import inputs
 from pipeline.run.finished import Memory
+from pipeline.run.run import PLAN, Run
 from pipeline.seeding import digest
 from pipeline.stores.store import TABLE
 from pipeline.testset import benchmark
 
-FILE = "plan.parquet"
 LIBRARY = Path(__file__).parents[1]
 
 
@@ -36,36 +35,37 @@ def make(config: Config) -> list[plan.Row]:
     return rows
 
 
-def write(rows: Sequence[plan.Row], config: Config) -> None:
+def write(rows: Sequence[plan.Row], run: Run) -> None:
     """Write the plan, and remember what it was made from."""
-    plan.write(rows, config.data / FILE)
-    _memory(config).keep()
+    plan.write(rows, run.plan_file)
+    _memory(run).keep()
 
 
-def is_up_to_date(config: Config) -> bool:
-    """Whether the run's folder has the plan that the stage would write: same settings, files, library and packages."""
-    return _memory(config).holds()
+def is_up_to_date(run: Run) -> bool:
+    """Return whether the run has the plan that the stage would write: same settings, files, library and packages."""
+    return _memory(run).holds()
 
 
-def upcoming(config: Config) -> list[plan.Row]:
-    """The plan that a run would have: the one in its folder if up to date, else another, made here and not written.
+def upcoming(run: Run) -> Sequence[plan.Row]:
+    """Return the plan that a run would have: its own if up to date, else another, made here and not written.
 
     It is empty where a run has neither a plan nor finished work: then it is not made, which may take a minute.
 
     Raises:
         PipelineError: as of ``make``.
     """
-    if is_up_to_date(config):
-        return plan.read(config.data / FILE)
-    records = [f"{kind.name}.json" for kind in FORMATS]
-    written = (FILE, f"trajectories/{TABLE}", f"frames/{TABLE}", *records)
-    return make(config) if any((config.data / name).exists() for name in written) else []
+    if is_up_to_date(run):
+        return run.plan
+    records = [dataset.record_file for dataset in run.formats]
+    written = (run.plan_file, run.trajectories.root / TABLE, run.frames.root / TABLE, *records)
+    return make(run.config) if any(file.exists() for file in written) else []
 
 
-def _memory(config: Config) -> Memory:
+def _memory(run: Run) -> Memory:
+    config = run.config
     sections = {
         name: section for name, section in inputs.settings(config).items() if name in ("demos", "plan", "replay")
     }
     library = {file.relative_to(LIBRARY).as_posix(): checksum(file) for file in sorted(LIBRARY.rglob("*.py"))}
     made_by = digest(sections, inputs.listing(config), library, made_with("physics"))
-    return Memory(config.data, "plan", made_by, [FILE])
+    return Memory(run.folder, "plan", made_by, [PLAN])

@@ -15,8 +15,8 @@ from pipeline.config import Config, load
 from pipeline.errors import PipelineError
 from pipeline.exit_status import Terminated
 from pipeline.files import remove, write
-from pipeline.formats.registry import formats_of
-from pipeline.run import counts, manifest
+from pipeline.run import counts
+from pipeline.run.run import CARD, FINETUNE, PREVIEWS, SHEETS, Run
 from pipeline.run.stage import PARAMS
 
 DVC = (sys.executable, "-m", "dvc")
@@ -42,27 +42,26 @@ def run(file: Path) -> int:
     status = _repro()
     if status == 0:
         print()
-        places = {name: path for name, path in made(config).items() if path.exists()}
+        places = {name: path for name, path in made(Run(config)).items() if path.exists()}
         width = max(map(len, places))
         for name, path in places.items():
             print(f"{name:>{width}}  {path}")
-        rows = manifest.read(config.data / "manifest.parquet")
+        rows = Run(config).manifest
         for sentence in counts.shortfalls(counts.targets(rows, config.plan.episodes)):
             print(sentence)
     return status
 
 
-def made(config: Config) -> dict[str, Path]:
+def made(run: Run) -> dict[str, Path]:
     """What a run makes that a person opens."""
-    data = config.data
     return {
-        **{one.title: one.root for one in formats_of(data, config.export, config.render.extras)},
-        "manifest": data / "manifest.parquet",
-        "report": data / "report.html",
-        "fine-tuning": data / "finetune",
-        "dataset cards": data / "card",
-        "sheets": data / "sheets",
-        "previews": data / "previews",
+        **{dataset.title: dataset.root for dataset in run.formats},
+        "manifest": run.manifest_file,
+        "report": run.report_file,
+        "fine-tuning": run.path(FINETUNE),
+        "dataset cards": run.path(CARD),
+        "sheets": run.path(SHEETS),
+        "previews": run.path(PREVIEWS),
     }
 
 

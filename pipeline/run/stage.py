@@ -17,6 +17,7 @@ from pipeline.exit_status import exit_status
 from pipeline.files import is_temporary, read_json, remove_leftovers, write_json
 from pipeline.identity import REMAKE
 from pipeline.run.foreign import refuse_foreign_files
+from pipeline.run.run import Run
 from pipeline.seeding import digest
 from pipeline.strict_yaml import StrictLoader
 
@@ -33,7 +34,7 @@ LOCK = ".lock"
 """Empty file of a run's folder that a stage holds while it runs."""
 
 
-def main(stage: Callable[[Config], None], description: str) -> None:
+def main(stage: Callable[[Run], None], description: str) -> None:
     """Run ``stage`` on the configuration named on the command line."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
@@ -46,7 +47,7 @@ def main(stage: Callable[[Config], None], description: str) -> None:
         config = claimed(arguments.config)
         with locked(config.data):
             refuse_foreign_files(config.data)
-            stage(config)
+            stage(Run(config))
         return 0
 
     if status := exit_status(run):
@@ -126,8 +127,8 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def owned(file: Path) -> Config:
-    """Load a configuration whose run is to be read; nothing is written.
+def owned(file: Path) -> Run:
+    """Open the run of a configuration to read it; nothing is written.
 
     Raises:
         PipelineError: when the configuration is not valid, or the folder belongs to another file.
@@ -135,7 +136,7 @@ def owned(file: Path) -> Config:
     config = load(file)
     if (config.data / OWNER).exists():
         _refuse_other_owner(config, file)
-    return config
+    return Run(config)
 
 
 def refuse_unmarked(folder: Path) -> None:

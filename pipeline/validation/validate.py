@@ -15,24 +15,22 @@ from typing import Any
 
 from pipeline.clients import oft
 from pipeline.compute.pool import Workers
-from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.files import read_json, scratch
 from pipeline.formats import registry
 from pipeline.formats.base import Format, Row
 from pipeline.formats.read_back import Fault, Written
-from pipeline.formats.registry import failures_of, formats_of
 from pipeline.formats.rlds_layout import datasets
 from pipeline.grouping import grouped
 from pipeline.libero.tasks import find_task
 from pipeline.physics.quality import measure
-from pipeline.planning import plan, selection
+from pipeline.planning import selection
 from pipeline.rendering.renderer import scene_of_process
-from pipeline.run import manifest, outcome
+from pipeline.run import outcome
 from pipeline.run.counts import by_axis_and_suite
 from pipeline.run.episode_loader import EpisodeLoader
 from pipeline.run.export import wordings
-from pipeline.stores.trajectory_store import TrajectoryStore
+from pipeline.run.run import COUNTS, STATISTICS, WORK, Run
 from pipeline.types import Extra
 from pipeline.validation.case import Case
 from pipeline.validation.checks import CHECKS
@@ -68,7 +66,7 @@ class Results:
             self.note(check, found, checked)
 
 
-def validate(config: Config, workers: Workers) -> dict[str, Any]:
+def validate(run: Run, workers: Workers) -> dict[str, Any]:
     """Check a finished run; memory holds one episode in each worker, and the manifest.
 
     Returns:
@@ -78,22 +76,25 @@ def validate(config: Config, workers: Workers) -> dict[str, Any]:
     Raises:
         PipelineError: when the manifest or the stores cannot be read.
     """
-    data = config.data.resolve()
-    rows = manifest.read(data / "manifest.parquet")
+    run = run.resolved()
+    rows = run.manifest
     kept = {row["episode_id"]: row for row in rows if row["kept"]}
     total = Results()
-    total.note("counts", _counts(data, rows), len(rows))
-    asked = (data, config.export, config.render.extras)
-    with scratch(data / ".work" / "validate") as cache:
+    total.note("counts", _counts(run), len(rows))
+    with scratch(run.path(WORK) / "validate") as cache:
         try:
-            job = EpisodesJob(config, data, formats_of(*asked), cache, frozenset(witnesses(rows)))
+            job = EpisodesJob(run, run.formats, cache, frozenset(witnesses(rows)))
             total.add(_datasets(job, kept, workers))
-            missed = set(outcome.read(config).missed) if config.export.failures else set()
+            missed = set(run.outcome.missed) if run.config.export.failures else set()
             if missed:
-                failures = failures_of(*asked)
+                failures = run.failure_formats
                 places = registry.places(failures)
-                failed = {one: row | places.get(one, {}) for row in rows if (one := row["episode_id"]) in missed}
-                job = EpisodesJob(config, data, failures, cache, frozenset([*failed][:1]), ("outcome",))
+                failed = {}
+                for row in rows:
+                    episode_id = row["episode_id"]
+                    if episode_id in missed:
+                        failed[episode_id] = row | places.get(episode_id, {})
+                job = EpisodesJob(run, failures, cache, frozenset([*failed][:1]), ("outcome",))
                 total.add(_datasets(job, failed, workers), within=f"{registry.FAILURES}/")
         finally:
             scene_of_process().close()
@@ -121,8 +122,9 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
         partial(_as_a_whole, one, episodes, job.cache) for one in reversed(job.formats)
     ]
     if "outcome" not in job.extras and any(one.name == "rlds" for one in job.formats):
-        statistics = read_json(job.data / "dataset_statistics.json")
-        work += [partial(_openvla_oft, statistics, folder) for folder in datasets(job.data / "rlds")]
+        statistics = read_json(job.run.path(STATISTICS))
+        (rlds,) = (dataset for dataset in job.formats if dataset.name == "rlds")
+        work += [partial(_openvla_oft, statistics, folder) for folder in datasets(rlds.folder)]
     work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
     for results in workers(call, work, "validate"):
         total.add(results)
@@ -141,9 +143,9 @@ def _unreadable(one: Format[Any], error: PipelineError) -> Fault:
     return Fault(one.name, None, str(error), "a dataset that can be opened")
 
 
-def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
+def _counts(run: Run) -> Iterator[Fault]:
     """Every planned row in the manifest; no quota overfilled, and none left open while candidates are left."""
-    planned = [row.episode_id for row in plan.read(data / "plan.parquet")]
+    planned, rows = [row.episode_id for row in run.plan], run.manifest
     if planned != [row["episode_id"] for row in rows]:
         yield Fault("manifest", None, f"{len(rows)} rows", f"the {len(planned)} of the plan, in its order")
     quotas = grouped(((row["axis"], row["suite"], row["task"]), row) for row in rows)
@@ -153,7 +155,7 @@ def _counts(data: Path, rows: Sequence[Row]) -> Iterator[Fault]:
         left = any(row["reason"] in (selection.NOT_NEEDED, selection.NOT_REPLAYED) for row in members)
         if kept > wanted or (kept < wanted and left):
             yield Fault("manifest", None, f"{kept} episodes of {axis} for {suite}/{task}", f"{wanted}")
-    if read_json(data / "counts.json") != by_axis_and_suite(rows):
+    if read_json(run.path(COUNTS)) != by_axis_and_suite(rows):
         yield Fault("manifest", None, "counts.json does not follow from the rows", "the counts that do")
 
 
@@ -207,8 +209,7 @@ class EpisodesJob:
         extras: ``outcome`` for failures.
     """
 
-    config: Config
-    data: Path
+    run: Run
     formats: Sequence[Format[Any]]
     cache: Path
     witnesses: frozenset[str]
@@ -217,9 +218,9 @@ class EpisodesJob:
     def __call__(self, rows: Sequence[Row]) -> Results:
         results, rewrites = Results(), None
         if any(one.language for one in self.formats):
-            language = self.config.plan.axes.language
+            language = self.run.config.plan.axes.language
             rewrites = {row["episode_id"]: wordings(language, row["suite"], row["task"], row["axis"]) for row in rows}
-        load = EpisodeLoader(self.data, self.config.render, self.extras, rewrites)
+        load = self.run.episodes(extras=self.extras, rewrites=rewrites)
         for row in rows:
             self._check(row, load, results)
         return results
@@ -240,7 +241,7 @@ class EpisodesJob:
                 results.note("readable", [unreadable], 0)
         try:
             made = load(episode_id)
-            trajectory = TrajectoryStore(self.data / "trajectories").load(row["trajectory_id"])
+            trajectory = self.run.trajectories.load(row["trajectory_id"])
         except PipelineError as error:
             results.note("stored", [Fault("frames", episode_id, str(error), "what the run made")])
             return
@@ -248,10 +249,10 @@ class EpisodesJob:
         if "outcome" in self.extras:  # The manifest has figures of kept episodes alone.
             quality = measure(trajectory, find_task(row["suite"], row["task"]))
             row = {**row, **asdict(quality), "success": row["kept"]}
-        language = self.config.plan.axes.language
+        language = self.run.config.plan.axes.language
         witness = episode_id in sorted(self.witnesses)[:WHOLE]
         case = Case(row, made, trajectory, copies, language.bank if language else None, witness)
         for name, check in CHECKS.items():
             results.note(name, check(case))
         if episode_id in self.witnesses:
-            results.note("rendered", rendered(case, self.config.render, scene_of_process()))
+            results.note("rendered", rendered(case, self.run.config.render, scene_of_process()))

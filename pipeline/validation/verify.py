@@ -5,20 +5,17 @@ from functools import partial
 from typing import Any
 
 from pipeline.compute.pool import Workers
-from pipeline.config import Config
 from pipeline.errors import MAKE_AGAIN, PipelineError
 from pipeline.files import read_json
 from pipeline.formats.read_back import Written
-from pipeline.formats.registry import recorded
 from pipeline.planning import plan
-from pipeline.run import manifest, outcome
-from pipeline.stores.frame_store import FrameStore
+from pipeline.run import manifest
+from pipeline.run.run import COUNTS, LEAKAGE, STATISTICS, Run
 from pipeline.stores.store import TABLE, Store
-from pipeline.stores.trajectory_store import TrajectoryStore
 from pipeline.tables import read_table
 
 
-def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
+def verify(run: Run, workers: Workers) -> dict[str, dict[str, Any]]:
     """Read every stored file of a run: trajectories, frames, the datasets and the tables.
 
     Returns:
@@ -26,13 +23,13 @@ def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
         each with what to do about it.
     """
     results: dict[str, dict[str, Any]] = {}
-    stores = (TrajectoryStore(config.data / "trajectories"), FrameStore(config.data / "frames", config.render))
-    for name, store in zip(("trajectories", "frames"), stores, strict=True):
+    stores: dict[str, Store] = {"trajectories": run.trajectories, "frames": run.frames}
+    for name, store in stores.items():
         there = store.names()
         found = [*workers(partial(_damaged, store), there, name), *_gone(store, there)]
         results[name] = _result(found)
-    for one in recorded(config.data, config.export, config.render.extras):
-        name = one.folder.relative_to(config.data).as_posix()
+    for one in run.recorded_formats:
+        name = one.folder.relative_to(run.folder).as_posix()
         try:
             files = one.written()
         except PipelineError as error:
@@ -40,10 +37,10 @@ def verify(config: Config, workers: Workers) -> dict[str, dict[str, Any]]:
             continue
         faults = workers(Written.faults, files, one.title)
         results[name] = _result([f"{fault.what}: {fault.expected}" for fault in found] for found in faults)
-    results["tables"] = _result(_unreadable(read) for read in _readers(config))
+    results["tables"] = _result(_unreadable(read) for read in _readers(run))
     if not any(result["damaged"] for result in results.values()):
         # A file may be gone with the table that lists it; the plan still needs it.
-        results["episodes"] = _result([_unreadable(partial(outcome.read, config))])
+        results["episodes"] = _result([_unreadable(lambda: run.outcome)])
     return results
 
 
@@ -60,14 +57,14 @@ def _gone(store: Store, there: Sequence[str]) -> list[list[str]]:
     return [[f"{store.path(name)}: {what}"] for name in sorted(listed - {*there})]
 
 
-def _readers(config: Config) -> list[Callable[[], object]]:
+def _readers(run: Run) -> list[Callable[[], object]]:
     """Functions that read each table of a run, which has no checksum."""
     readers: list[Callable[[], object]] = [
-        partial(plan.read, config.data / "plan.parquet"),
-        partial(manifest.read, config.data / "manifest.parquet"),
+        partial(plan.read, run.plan_file),
+        partial(manifest.read, run.manifest_file),
     ]
-    names = ["counts.json", "leakage.json", *(["dataset_statistics.json"] if config.export.rlds else [])]
-    return [*readers, *(partial(read_json, config.data / name) for name in names)]
+    names = [COUNTS, LEAKAGE, *([STATISTICS] if run.config.export.rlds else [])]
+    return [*readers, *(partial(read_json, run.path(name)) for name in names)]
 
 
 def _unreadable(read: Callable[[], object]) -> list[str]:

@@ -1,0 +1,157 @@
+"""A run: one configuration, and everything that is stored in its folder ``data/<run>``."""
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+from pipeline.compute.pool import Workers, runner
+from pipeline.config import Config
+from pipeline.files import Edition, edition
+from pipeline.formats.base import Format
+from pipeline.formats.registry import failures_of, formats_of, recorded
+from pipeline.planning import plan
+from pipeline.run import manifest, outcome
+from pipeline.run.episode_loader import EpisodeLoader
+from pipeline.run.outcome import Outcome
+from pipeline.stores.frame_store import FrameStore
+from pipeline.stores.trajectory_store import TrajectoryStore
+
+PLAN = "plan.parquet"
+MANIFEST = "manifest.parquet"
+INPUTS = "inputs.json"
+SETTINGS = "settings.json"
+MACHINE = "machine.json"
+LEAKAGE = "leakage.json"
+REPLAY = "replay.json"
+STATISTICS = "dataset_statistics.json"
+COUNTS = "counts.json"
+VALIDATION = "validation.json"
+TRAJECTORIES = "trajectories"
+FRAMES = "frames"
+FINETUNE = "finetune"
+SHEETS = "sheets"
+PREVIEWS = "previews"
+CARD = "card"
+REPORT = "report.html"
+WORK = ".work"
+FINISHED = ".finished"
+"""Names of the files and folders of a run."""
+
+AnyFormat = Format[Any]
+
+
+class Run:
+    """One run: its configuration, the paths in its folder, and what is stored there.
+
+    Stores, outcome and datasets are opened when they are first asked for, and kept. Plan and manifest are read again
+    when their file has changed. A stage or a command gets a ``Run`` of its own.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.folder = config.data
+
+    def __reduce__(self) -> tuple[type["Run"], tuple[Config]]:
+        """Send a worker the configuration alone; it opens what it needs."""
+        return Run, (self.config,)
+
+    def resolved(self) -> "Run":
+        """Return the same run with an absolute path, without links, for libraries that change or compare paths."""
+        return Run(self.config.model_copy(update={"folder": self.folder.resolve().parent}))
+
+    def path(self, name: str) -> Path:
+        """Return the path of a file or folder of the run, by one of the names of this module."""
+        return self.folder / name
+
+    @property
+    def name(self) -> str:
+        return self.config.name
+
+    @property
+    def plan_file(self) -> Path:
+        return self.path(PLAN)
+
+    @property
+    def manifest_file(self) -> Path:
+        return self.path(MANIFEST)
+
+    @property
+    def report_file(self) -> Path:
+        return self.path(REPORT)
+
+    @property
+    def validation_file(self) -> Path:
+        return self.path(VALIDATION)
+
+    @cached_property
+    def trajectories(self) -> TrajectoryStore:
+        """Replayed trajectories."""
+        return TrajectoryStore(self.path(TRAJECTORIES))
+
+    @cached_property
+    def frames(self) -> FrameStore:
+        """Rendered frames."""
+        return FrameStore(self.path(FRAMES), self.config.render)
+
+    @property
+    def plan(self) -> Sequence[plan.Row]:
+        """Rows of the plan.
+
+        Raises:
+            PipelineError: when there is no plan, or it cannot be read.
+        """
+        return _plan(edition(self.plan_file)) if self.plan_file.exists() else plan.read(self.plan_file)
+
+    @property
+    def manifest(self) -> Sequence[dict[str, Any]]:
+        """Rows of the manifest, not to be changed.
+
+        Raises:
+            PipelineError: when there is no manifest, or it cannot be read.
+        """
+        file = self.manifest_file
+        return _manifest(edition(file)) if file.exists() else manifest.read(file)
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """Plan and verdicts after the stage ``render``, and what ``export.where`` leaves out.
+
+        Raises:
+            PipelineError: when a trajectory or a frame that the plan needs is missing or cannot be read.
+        """
+        return outcome.judge(self.plan, self.trajectories, self.frames, self.config)
+
+    @property
+    def formats(self) -> list[AnyFormat]:
+        """Datasets that the configuration asks for."""
+        return formats_of(self.folder, self.config.export, self.config.render.extras)
+
+    @property
+    def failure_formats(self) -> list[AnyFormat]:
+        """Datasets of failures that the configuration asks for."""
+        return failures_of(self.folder, self.config.export, self.config.render.extras)
+
+    @property
+    def recorded_formats(self) -> list[AnyFormat]:
+        """Datasets that the configuration asks for; of failures only those that exist."""
+        return recorded(self.folder, self.config.export, self.config.render.extras)
+
+    def episodes(self, **options: Any) -> EpisodeLoader:
+        """Return the loader of rendered episodes; ``options`` are further fields of ``EpisodeLoader``."""
+        return EpisodeLoader(self.folder, self.config.render, **options)
+
+    def workers(self, *, renders: bool = False) -> AbstractContextManager[Workers]:
+        """Start the workers of the section ``compute``, which stop when the context ends."""
+        return runner(self.config.compute, self.folder, renders=renders)
+
+
+@lru_cache(maxsize=1)
+def _plan(file: Edition) -> list[plan.Row]:
+    return plan.read(file.path)
+
+
+@lru_cache(maxsize=1)
+def _manifest(file: Edition) -> list[dict[str, Any]]:
+    return manifest.read(file.path)
