@@ -6,8 +6,9 @@ from pipeline.run.stage import main
 
 
 def run(run: Run) -> None:
-    recipe = build(run)
-    write(recipe, run)
+    export = run.config.export
+    recipe = build(run.manifest_file, run.manifest, export)
+    write(recipe, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
     print(f"{run.path(FINETUNE) / RECIPE} has the recipe and a command line for each of {', '.join(recipe['clients'])}")
 
 

@@ -24,7 +24,6 @@ from pipeline.files import read_json
 from pipeline.formats import exact_statistics
 from pipeline.formats.rlds_layout import datasets
 from pipeline.formats.tfrecord import METADATA, columns, records
-from pipeline.run.run import STATISTICS, Run
 
 CHUNK = 8
 """Actions that OFT predicts at once on LIBERO: the current one and seven to come."""
@@ -176,15 +175,15 @@ def check(folder: Path, statistics: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def check_run(run: Run) -> dict[str, dict[str, Any]]:
-    """Check every RLDS dataset of a run against its ``dataset_statistics.json``; keys are dataset names.
+def check_all(rlds: Path, statistics_file: Path) -> dict[str, dict[str, Any]]:
+    """Check every dataset below a folder against ``dataset_statistics.json``; keys are dataset names.
 
     Raises:
         PipelineError: when there is no dataset, or a file that cannot be read.
     """
-    (rlds,) = (dataset for dataset in run.formats if dataset.name == "rlds")
-    statistics = read_json(run.path(STATISTICS))
-    return {folder.parent.name: check(folder, statistics) for folder in datasets(rlds.folder)}
+    folders = datasets(rlds)
+    statistics = read_json(statistics_file)
+    return {folder.parent.name: check(folder, statistics) for folder in folders}
 
 
 def _faults(episode: Recorded) -> Iterator[str]:

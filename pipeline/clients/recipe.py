@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,6 @@ from pipeline.files import checksum, read_json
 from pipeline.formats import exact_statistics
 from pipeline.formats.rlds_layout import dataset_of, split_of
 from pipeline.generated import generated
-from pipeline.run.run import FINETUNE, Run
 
 RECIPE = "finetune.yaml"
 """File of the folder ``finetune``."""
@@ -44,19 +43,20 @@ def sourced(value: Any, source: str) -> dict[str, Any]:
     return {"value": value, "source": source}
 
 
-def build(run: Run) -> dict[str, Any]:
-    """Return the fine-tuning recipe of a run.
+def build(manifest_file: Path, rows: Sequence[Mapping[str, Any]], export: ExportConfig) -> dict[str, Any]:
+    """The fine-tuning recipe of a run.
 
-    The hash of the manifest identifies the datasets: the manifest has the content hash of every episode, its place in
-    each format, and the versions and the device that made it.
+    Args:
+        manifest_file: the run's manifest, whose hash identifies the datasets: it has the content hash of every
+            episode, its place in each format, and the versions and the device that made it.
+        export: the datasets that the run asks for; OpenVLA-OFT calls all of RLDS by the name there.
     """
-    rows, export = run.manifest, run.config.export
     kept = [row for row in rows if row["kept"]]
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for row in kept:
         counts[row["suite"]][row["axis"]] += 1
     dataset = {
-        "sha256": sourced(checksum(run.manifest_file), "hash of " + MANIFEST),
+        "sha256": sourced(checksum(manifest_file), "hash of " + MANIFEST),
         "episodes": sourced(len(kept), MANIFEST),
         "steps": sourced(sum(row["steps"] for row in kept), MANIFEST),
         "episodes_by_suite_and_axis": sourced({suite: dict(axes) for suite, axes in counts.items()}, MANIFEST),
@@ -98,35 +98,35 @@ def _filled(template: str, **values: object) -> str:
     return environment.get_template(template).render(**values)
 
 
-def write(recipe: Mapping[str, Any], run: Run) -> None:
+def write(recipe: Mapping[str, Any], folder: Path, export: ExportConfig, datasets: Mapping[str, Path]) -> None:
     """Generate the folder ``finetune``: ``finetune.yaml``, the clients' scripts and the files that these read.
 
-    The scripts look for the folder ``rlds`` next to ``finetune``.
+    Args:
+        folder: the folder to generate; the scripts look for ``rlds`` next to it.
+        datasets: name of each format of the run to the folder of its dataset.
 
     Raises:
         PipelineError: if edits in ``finetune`` would be lost.
     """
-    export = run.config.export
     wanted = export.lerobot_v21
-    folders = {dataset.name: dataset.folder for dataset in run.formats}
-    with generated(run.path(FINETUNE)) as unfinished:
+    with generated(folder) as unfinished:
         # One line for each field: a folded command could not be copied.
         text = yaml.dump(dict(recipe), Dumper=_Dumper, sort_keys=False, width=10_000)
         (unfinished / RECIPE).write_text(text)
         if export.rlds is not None:
             shutil.copyfile(TEMPLATES / OFT_SCRIPT, unfinished / OFT_SCRIPT)
         if export.lerobot is not None and export.lerobot.validation:
-            info = read_json(folders["lerobot"] / export.lerobot.name / "meta" / "info.json")
+            info = read_json(datasets["lerobot"] / export.lerobot.name / "meta" / "info.json")
             listed = [*range(int(info["splits"]["train"].partition(":")[2]))]
             (unfinished / LEROBOT_TRAIN).write_text(json.dumps({"dataset": {"episodes": listed}}) + "\n")
         if wanted is not None and wanted.convention == "openpi":
-            table = pq.read_table(folders["lerobot_v21"] / wanted.name / "data", columns=["actions", "state"])
+            table = pq.read_table(datasets["lerobot_v21"] / wanted.name / "data", columns=["actions", "state"])
             actions, states = (np.stack(table[column].to_numpy()) for column in table.column_names)
             (unfinished / OPENPI_ASSETS).parent.mkdir(parents=True)
             content = json.dumps(exact_statistics.openpi(actions, states), indent=1) + "\n"
             (unfinished / OPENPI_ASSETS).write_text(content)
         if wanted is not None and wanted.convention == "ipec":
-            roots = sorted(path.name for path in folders["lerobot_v21"].iterdir() if not path.name.endswith("_val"))
+            roots = sorted(path.name for path in datasets["lerobot_v21"].iterdir() if not path.name.endswith("_val"))
             mixture = _filled("starvla_data_config.py.j2", name=wanted.name, roots=roots)
             (unfinished / "starvla_data_config.py").write_text(mixture)
 

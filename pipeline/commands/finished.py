@@ -47,6 +47,7 @@ def check(arguments: argparse.Namespace) -> int:
     validate, which is a part of every run, compares the content of the datasets with each other and with the plan.)
     """
     from pipeline.clients import oft
+    from pipeline.run.run import STATISTICS
     from pipeline.validation.verify import verify
 
     run = owned(arguments)
@@ -56,7 +57,7 @@ def check(arguments: argparse.Namespace) -> int:
     trained: dict[str, Any] = {}
     # OpenVLA-OFT's reader stops at what is damaged.
     if run.config.export.rlds and not stored["rlds"]["damaged"]:
-        trained = oft.check_run(run)
+        trained = oft.check_all(run.dataset("rlds").folder, run.path(STATISTICS))
     misleading = [f"{name}: {what}" for name, found in trained.items() for what in found["violations"]]
     for what in (*damaged, *misleading):
         print(what)
@@ -135,8 +136,7 @@ def push(arguments: argparse.Namespace) -> None:
         )
     from pipeline.publish import push
 
-    (dataset,) = (dataset for dataset in run.formats if dataset.name == arguments.format)
-    upload = push.prepare(dataset, run)
+    upload = push.prepare(run.dataset(arguments.format), run)
     print(upload.summary())
     options = {"private": arguments.private, "replace": arguments.replace}
     if arguments.really:

@@ -128,6 +128,11 @@ class Run:
         """Datasets that the configuration asks for."""
         return formats_of(self.folder, self.config.export, self.config.render.extras)
 
+    def dataset(self, name: str) -> AnyFormat:
+        """Return the dataset of a format that the configuration asks for, such as ``rlds``."""
+        (dataset,) = (dataset for dataset in self.formats if dataset.name == name)
+        return dataset
+
     @property
     def failure_formats(self) -> list[AnyFormat]:
         """Datasets of failures that the configuration asks for."""

@@ -123,8 +123,7 @@ def _datasets(job: EpisodesJob, episodes: Mapping[str, Row], workers: Workers) -
     ]
     if "outcome" not in job.extras and any(one.name == "rlds" for one in job.formats):
         statistics = read_json(job.run.path(STATISTICS))
-        (rlds,) = (dataset for dataset in job.formats if dataset.name == "rlds")
-        work += [partial(_openvla_oft, statistics, folder) for folder in datasets(rlds.folder)]
+        work += [partial(_openvla_oft, statistics, folder) for folder in datasets(job.run.dataset("rlds").folder)]
     work += [partial(job, rows) for rows in _slices(episodes, job.witnesses, job.formats)]
     for results in workers(call, work, "validate"):
         total.add(results)
