@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Installs what the pipeline needs on Debian 12, 13 or Ubuntu 24.04, and is quick when it is there:
 #   bash setup.sh [run|quick|test]
-#   run    then makes the datasets of the configuration that params.yaml names
+#   run    then makes the datasets of the configuration configs/starter.yaml
 #   quick  then checks style and types and runs the tests that take little time
 #   test   then checks style and types and runs all tests, one of them in a browser
 set -euo pipefail
@@ -138,7 +138,7 @@ fi
 export PATH=$PWD/.venv/bin:$PATH
 case $VERB in
 run)
-    python -m pipeline run
+    python -m pipeline run configs/starter.yaml
     ;;
 quick | test)
     ruff check

@@ -1,14 +1,6 @@
-"""Stage card: the dataset card of each format, from the manifest and the reports."""
+"""Stage card, as DVC calls it; ``pipeline/stages.py`` has its function."""
 
-from pipeline.publish import card
-from pipeline.run.run import CARD, Run
-from pipeline.run.stage import main
-
-
-def run(run: Run) -> None:
-    card.write(run)
-    print(f"{run.path(CARD)} has a README.md for each format; `python -m pipeline push` uploads it with the data")
-
+from pipeline.stages import script
 
 if __name__ == "__main__":
-    main(run, __doc__)
+    script("card")

@@ -10,6 +10,7 @@ from conftest import REPOSITORY
 FLOORS = (
     "__main__",
     "commands",
+    "stages",
     "publish",
     "report",
     "validation",

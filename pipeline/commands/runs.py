@@ -1,30 +1,61 @@
 """Making datasets: ``run``, ``status`` and ``clean``."""
 
+from __future__ import annotations
+
 import argparse
 import sys
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from pipeline.commands.base import add, add_config, config_file, owned
+from pipeline.commands.base import add, add_config, owned, value
 from pipeline.errors import PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.run.run import Run
 
 TITLE = "make datasets"
 
 
 def add_commands(commands: Any) -> None:
-    add(commands, run, add_config)
+    add(commands, run, value("config", "CONFIG", "file of the run's configuration, such as configs/starter.yaml"))
     add(commands, status, add_config)
     add(commands, clean, _clean_arguments)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """make the datasets of a configuration, or what of them is not made yet, and say where they are
 
-    Writes into params.yaml that this configuration is the one to run, and calls `dvc repro`. Stopped at any time, it
-    goes on where it was when it is called again.
+    Performs the stages in order, each only if something is to do. Stopped at any time, it resumes when it is called
+    again. The configuration may be any file; the run's folder is <folder>/<name>, by default data/<name>, below the
+    folder that the command is called in.
     """
-    from pipeline.run import repro
+    from pipeline import stages
+    from pipeline.run import counts
 
-    return repro.run(config_file(arguments))
+    run = stages.run_all(arguments.config)
+    print()
+    places = {name: path for name, path in results(run).items() if path.exists()}
+    width = max(map(len, places))
+    for name, path in places.items():
+        print(f"{name:>{width}}  {path}")
+    rows = run.manifest
+    for sentence in counts.shortfalls(counts.targets(rows, run.config.plan.episodes)):
+        print(sentence)
+
+
+def results(run: Run) -> dict[str, Path]:
+    """Return what a person opens of a finished run, by name."""
+    from pipeline.run.run import CARD, FINETUNE, PREVIEWS, SHEETS
+
+    return {
+        **{dataset.title: dataset.root for dataset in run.formats},
+        "manifest": run.manifest_file,
+        "report": run.report_file,
+        "fine-tuning": run.path(FINETUNE),
+        "dataset cards": run.path(CARD),
+        "sheets": run.path(SHEETS),
+        "previews": run.path(PREVIEWS),
+    }
 
 
 def status(arguments: argparse.Namespace) -> None:

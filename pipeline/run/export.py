@@ -211,12 +211,8 @@ def untouched(target: AnyFormat) -> bool:
 
 
 def notice_changes(target: AnyFormat) -> None:
-    """Where files of a finished dataset are gone or have changed, have it count as not there."""
-    if not target.record_file.exists():
-        if target.folder.exists():
-            _call_stage(target)
-        return
-    if untouched(target):
+    """Delete the record of a finished dataset whose files are gone or have changed, so that it counts as not there."""
+    if not target.record_file.exists() or untouched(target):
         return
     try:
         same = all(checksum(target.folder / name) == sha256 for name, sha256 in target.record().files.items())
@@ -226,14 +222,6 @@ def notice_changes(target: AnyFormat) -> None:
         target.record_file.touch()
     else:
         target.record_file.unlink()
-        _call_stage(target)
-
-
-def _call_stage(target: AnyFormat) -> None:
-    """Have DVC see that a dataset is gone, where it knows the stage by the record of another one, which stays."""
-    if target.stage_record != target.record_file and target.stage_record.exists():
-        with target.stage_record.open("a") as file:
-            file.write("\n")
 
 
 def export(target: AnyFormat, episodes: Episodes, workers: Workers) -> None:

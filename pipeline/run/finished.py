@@ -7,6 +7,8 @@ import json
 import platform
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -14,9 +16,10 @@ from pydantic import BaseModel
 
 from pipeline.axes.language import BANK_FILE
 from pipeline.config import Config
+from pipeline.episode_schema import SCHEMA
 from pipeline.errors import PipelineError
 from pipeline.files import checksum, read_json, write_json
-from pipeline.identity import fingerprint
+from pipeline.identity import RECIPES, fingerprint
 from pipeline.run.export import untouched
 from pipeline.run.run import (
     COUNTS,
@@ -29,15 +32,19 @@ from pipeline.run.run import (
     PLAN,
     PREVIEWS,
     REPORT,
+    SETTINGS,
     SHEETS,
     STATISTICS,
+    TRAJECTORIES,
     VALIDATION,
     Run,
 )
+from pipeline.seeding import digest
 from pipeline.stores.store import TABLE
 
-FRAMES_TABLE = f"{FRAMES}/{TABLE}"
-SEEN = Path(__file__).parents[1] / "testset" / "seen.json"
+TRAJECTORIES_TABLE, FRAMES_TABLE = f"{TRAJECTORIES}/{TABLE}", f"{FRAMES}/{TABLE}"
+LIBRARY = Path(__file__).parents[1]
+SEEN = LIBRARY / "testset" / "seen.json"
 """What a policy sees in test tasks, which the report shows beside what it sees in the run."""
 
 
@@ -76,6 +83,33 @@ class Memory:
         return {"made_by": self.made_by, "outputs": _contents([self.data / name for name in self.outputs], self.data)}
 
 
+def of_stage(run: Run, name: str, sections: Sequence[str], inputs: Sequence[str], outputs: Sequence[str]) -> Memory:
+    """Return the memory of a stage whose outputs depend on this library, its settings and its input files.
+
+    Args:
+        sections: fields of ``settings.json``.
+        inputs: files and folders of the run.
+        outputs: files and folders of the run.
+    """
+    try:
+        settings = read_json(run.path(SETTINGS))
+        packages = [fingerprint(step) for step in RECIPES]
+    except (PipelineError, PackageNotFoundError):
+        # The stage doctor names the fault.
+        return Memory(run.folder, name, None, outputs)
+    contents = _contents([run.path(file) for file in inputs], run.folder)
+    made_by = digest(library(), packages, {section: settings.get(section) for section in sections}, contents)
+    return Memory(run.folder, name, made_by, outputs)
+
+
+@cache
+def library() -> str:
+    """Return a digest of every file of this package, and of the schema of an episode."""
+    files = [file for file in sorted(LIBRARY.rglob("*")) if file.is_file() and "__pycache__" not in file.parts]
+    content = {file.relative_to(LIBRARY).as_posix(): checksum(file) for file in files}
+    return digest(content, SCHEMA.model_dump(mode="json"))
+
+
 def of_validate(run: Run) -> Memory:
     """Of what ``validate`` found: it passed on these contents, of which nothing has changed."""
     stores, formats = (run.trajectories, run.frames), run.recorded_formats
@@ -92,7 +126,7 @@ def of_validate(run: Run) -> Memory:
 
 def of_doctor(run: Run, device: str) -> Memory:
     """Of a trial of this machine."""
-    return Memory(run.folder, "doctor", fingerprint("pixels", device, *host()), [MACHINE])
+    return Memory(run.folder, "trial", fingerprint("pixels", device, *host()), [MACHINE])
 
 
 def host() -> list[list[str]]:

@@ -21,6 +21,10 @@ HASHED_BYTES = 16_000_000
 """Files up to this size are listed by their content; larger ones by size and time of change, as hashing takes long."""
 
 
+SECTIONS = ("demos", "plan", "replay", "filter", "render", "export", "compute", "publish")
+"""Sections of a configuration, in the order of ``settings.json``."""
+
+
 def listing(config: Config) -> dict[str, list[str | int]]:
     """Each file that the configuration's paths lead to, and what shows whether it has changed.
 
@@ -40,10 +44,7 @@ def settings(config: Config) -> dict[str, Any]:
 
     Of a path the last name, as for ``listing``.
     """
-    sections = {
-        name: settings_of(getattr(config, name))
-        for name in ("demos", "plan", "replay", "filter", "render", "export", "publish")
-    }
+    sections = {name: settings_of(getattr(config, name)) for name in SECTIONS}
     export = {"where": None, "lerobot_v21": None, "failures": False, **sections["export"]}
     return {**sections, "export": export, "host": host()}
 

@@ -2,20 +2,16 @@
 
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from pipeline.config import Config
-from pipeline.files import checksum
 from pipeline.identity import made_with
 from pipeline.planning import plan
 from pipeline.run import inputs
-from pipeline.run.finished import Memory
+from pipeline.run.finished import Memory, library
 from pipeline.run.run import PLAN, Run
 from pipeline.seeding import digest
 from pipeline.stores.store import TABLE
 from pipeline.testset import benchmark
-
-LIBRARY = Path(__file__).parents[1]
 
 
 def make(config: Config) -> list[plan.Row]:
@@ -66,6 +62,5 @@ def _memory(run: Run) -> Memory:
     sections = {
         name: section for name, section in inputs.settings(config).items() if name in ("demos", "plan", "replay")
     }
-    library = {file.relative_to(LIBRARY).as_posix(): checksum(file) for file in sorted(LIBRARY.rglob("*.py"))}
-    made_by = digest(sections, inputs.listing(config), library, made_with("physics"))
+    made_by = digest(sections, inputs.listing(config), library(), made_with("physics"))
     return Memory(run.folder, "plan", made_by, [PLAN])

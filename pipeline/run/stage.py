@@ -1,10 +1,8 @@
-"""Run a stage on the configuration that the command line names, in a folder that belongs to this configuration."""
+"""The folder of a run: which configuration it belongs to, and the lock that keeps other processes out."""
 
-import argparse
 import fcntl
 import os
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +11,7 @@ import yaml
 
 from pipeline.config import Config, load
 from pipeline.errors import MAKE_AGAIN, PipelineError
-from pipeline.exit_status import exit_status
 from pipeline.files import is_temporary, read_json, remove_leftovers, write_json
-from pipeline.identity import REMAKE
-from pipeline.run.foreign import refuse_foreign_files
 from pipeline.run.run import Run
 from pipeline.seeding import digest
 from pipeline.strict_yaml import StrictLoader
@@ -32,26 +27,6 @@ PARAMS = Path("params.yaml")
 
 LOCK = ".lock"
 """Empty file of a run's folder that a stage holds while it runs."""
-
-
-def main(stage: Callable[[Run], None], description: str) -> None:
-    """Run ``stage`` on the configuration named on the command line."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
-    parser.add_argument("--remake", action="store_true", help=f"make finished work anew, as does {REMAKE}=1 before it")
-    arguments = parser.parse_args()
-    if arguments.remake:
-        os.environ[REMAKE] = "1"
-
-    def run() -> int:
-        config = claimed(arguments.config)
-        with locked(config.data):
-            refuse_foreign_files(config.data)
-            stage(Run(config))
-        return 0
-
-    if status := exit_status(run):
-        sys.exit(status)
 
 
 class Mark(NamedTuple):
@@ -83,7 +58,6 @@ def claimed(file: Path) -> Config:
             mark.
     """
     config = load(file)
-    _refuse_other_folder(config, file)
     _refuse_other_owner(config, file)
     config.data.mkdir(parents=True, exist_ok=True)
     _refuse_links(config.data)
@@ -164,15 +138,20 @@ def refuse_unmarked(folder: Path) -> None:
         )
 
 
-def _refuse_other_folder(config: Config, file: Path) -> None:
-    """DVC knows the folder from params.yaml alone, and would look for a stage's files there."""
+def refuse_other_folder(file: Path) -> None:
+    """Reject a configuration whose folder is not that of params.yaml, where DVC would look for a stage's files.
+
+    Raises:
+        PipelineError: naming both folders.
+    """
+    config = load(file)
     chosen = yaml.safe_load(PARAMS.read_text()) if PARAMS.is_file() else None
     if isinstance(chosen, dict) and chosen.get("run") == file.stem and chosen.get("data") != config.folder.as_posix():
         raise PipelineError(
             f"says `data: {chosen.get('data')}`, and {file} says `folder: {config.folder}`",
             where=PARAMS,
             expected="the same folder in both",
-            remedy=f"python -m pipeline run {file}, which writes it into {PARAMS}",
+            remedy=f"write `data: {config.folder}` into {PARAMS}",
         )
 
 

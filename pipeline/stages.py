@@ -1,0 +1,387 @@
+"""The stages of a run in order: from demonstrations to datasets, checks and reports.
+
+Each stage is a function of a ``Run``. ``perform`` calls one, unless its inputs and outputs are as they were after the
+last call. The command ``run`` performs all stages in one process; the scripts in ``stages/`` perform one, for DVC.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+from rich.console import Console
+
+from pipeline import gl
+from pipeline.errors import MAKE_AGAIN, PipelineError
+from pipeline.exit_status import exit_status
+from pipeline.files import read_json, write, write_json
+from pipeline.formats import exact_statistics, registry
+from pipeline.formats.episodes import by_suite
+from pipeline.formats.lerobot import LeRobot
+from pipeline.formats.lerobot_v21 import LeRobotV21
+from pipeline.formats.rlds import Rlds
+from pipeline.identity import REMAKE, refuse_unasked
+from pipeline.planning import leakage, plan
+from pipeline.run import counts, dropped, export, finished, inputs, machine, manifest, plan_stage
+from pipeline.run.cleaning import say_stale
+from pipeline.run.finished import FRAMES_TABLE, TRAJECTORIES_TABLE, Memory
+from pipeline.run.foreign import refuse_foreign_files
+from pipeline.run.outcome import outdated, rejections
+from pipeline.run.render_stage import render_plan
+from pipeline.run.replay_stage import Replays
+from pipeline.run.run import (
+    CARD,
+    COUNTS,
+    FINETUNE,
+    INPUTS,
+    LEAKAGE,
+    MACHINE,
+    MANIFEST,
+    PLAN,
+    PREVIEWS,
+    REPLAY,
+    SETTINGS,
+    SHEETS,
+    STATISTICS,
+    VALIDATION,
+    Run,
+)
+from pipeline.run.stage import claimed, locked, refuse_other_folder
+from pipeline.stores.frame_store import shown_of
+from pipeline.testset import benchmark
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A step of a run.
+
+    Attributes:
+        work: does it. A stage without inputs runs every time, and finds out by itself whether something is to do.
+        settings: sections of ``settings.json`` that its outputs depend on.
+        inputs: files and folders of the run that it reads.
+        outputs: files and folders of the run that it writes.
+    """
+
+    work: Callable[[Run], None]
+    settings: Sequence[str] = ()
+    inputs: Sequence[str] = ()
+    outputs: Sequence[str] = ()
+
+
+def write_inputs(run: Run) -> None:
+    """Write out the configuration, list the user's own files, and notice stored files that were changed or deleted."""
+    write_json(run.path(INPUTS), inputs.listing(run.config))
+    run.trajectories.notice_changes()
+    run.frames.notice_changes()
+    for dataset in (*run.formats, *run.failure_formats):
+        export.notice_changes(dataset)
+    # DVC knows no other file of these datasets, as not every run has them.
+    lost = [dataset.record_file for dataset in run.failure_formats if not dataset.record_file.exists()]
+    names = [file.relative_to(run.folder).as_posix() for file in lost]
+    write_json(run.path(SETTINGS), {**inputs.settings(run.config), "lost": names})
+
+
+def doctor(run: Run) -> None:
+    """Check the machine and the installation against what the run needs, and record what it begins with."""
+    from pipeline.validation import doctor
+
+    try:
+        tried = finished.of_doctor(run, gl.choose().device).holds()
+    except (PipelineError, PackageNotFoundError):
+        # The table names what is missing.
+        tried = False
+    if doctor.run(run, tried=tried):
+        raise PipelineError(
+            "this machine cannot make the run",
+            where=run.folder,
+            expected="no line above that begins with `fail`",
+            remedy="do what such lines say at their end, and run again",
+        )
+    if not tried:
+        machine.record(run, machine.trial().digests)
+        finished.of_doctor(run, gl.choose().device).keep()
+    if not tried or machine.known_speed(run) is None:
+        machine.keep_speed(run, machine.trial().speed)
+
+
+def make_plan(run: Run) -> None:
+    """Sample every perturbation of the run and write the plan, one row for each wanted episode."""
+    if plan_stage.is_up_to_date(run):
+        print("plan: up to date")
+        return
+    rows = plan_stage.make(run.config)
+    dropped.refuse_unasked(rows, run)
+    for axis, number in plan.shortage(rows, run.config.plan).items():
+        print(
+            f"{axis}: {number} of {run.config.plan.episodes[axis]} wanted episodes cannot be planned, as no more "
+            "different draws are left; use more demonstrations or ask for fewer",
+            file=sys.stderr,
+        )
+    plan_stage.write(rows, run)
+    trajectories = len({row.trajectory_id for row in rows})
+    print(f"planned {sum(row.wanted for row in rows)} episodes from {trajectories} trajectories")
+
+
+def check_leakage(run: Run) -> None:
+    """Compare every planned perturbation with the benchmark's test tasks, and stop where one overlaps."""
+    findings = leakage.check(run.plan, benchmark.load())
+    leakage.write(findings, run.path(LEAKAGE))
+    Console().print(leakage.report(findings))
+    leakage.refuse_overlap(findings)
+
+
+def replay(run: Run) -> None:
+    """Run the physics of every planned trajectory and judge it; needs no GL. Resumes where it was stopped."""
+    rows, config = run.plan, run.config
+    plan.refuse_other_settings(rows, config.replay)
+    refuse_unasked(outdated(rows, run.trajectories, run.frames), run.folder)
+    dropped.refuse_unasked(rows, run)
+    with run.workers() as workers:
+        replays = Replays(config.demos, config.replay, run.trajectories.root, workers, config.filter)
+        verdicts = replays.of(rows)
+    # Also the reserves that the stage render replayed because frames were rejected.
+    run.trajectories.keep(row.trajectory_id for row in rows)
+    kept = sum(verdict.kept for verdict in verdicts.values())
+    write_json(run.path(REPLAY), {"replayed": len(verdicts), "kept": kept})
+    print(f"replayed {len(verdicts)} trajectories, {kept} are kept")
+
+
+def render(run: Run) -> None:
+    """Render the frames of every kept episode from the stored states. Resumes where it was stopped.
+
+    Where frames are rejected, the reserves that take their place are replayed, as in the stage replay.
+    """
+    print(gl.choose())
+    rows, config = run.plan, run.config
+    plan.refuse_other_settings(rows, config.replay)
+    refuse_unasked(outdated(rows, run.trajectories, run.frames, gl.choose().device), run.folder)
+    dropped.refuse_unasked(rows, run)
+    # The configuration may have changed since the plan was made.
+    config.export.refuse_too_few(plan.demonstrations(rows))
+    replayed = int(read_json(run.path(REPLAY))["replayed"])
+    with run.workers(renders=True) as workers:
+        replays = Replays(config.demos, config.replay, run.trajectories.root, workers, config.filter)
+        rejected: dict[str, str] | None = None
+        while True:
+            rejected_now = rejections(rows, shown_of(run.frames.rows()))
+            if rejected_now == rejected:
+                break
+            rejected = rejected_now
+            verdicts = replays.of(rows, rejected)
+            rendered = render_plan(rows, config, run.trajectories.root, run.frames.root, workers)
+            run.frames.keep(rendered)
+    run.trajectories.keep(verdicts)
+    further = len(verdicts) - replayed
+    if further:
+        print(f"replayed {further} reserves, as frames before them were rejected")
+    print(f"{len(rendered)} files of frames are in {run.frames.root}")
+
+
+def export_rlds(run: Run) -> None:
+    """Write the kept episodes as RLDS, a set for each suite, without TensorFlow."""
+    export.export_run(Rlds, run)
+    say_stale("rlds", run)
+
+
+def export_lerobot(run: Run) -> None:
+    """Write the kept episodes as a LeRobot v3.0 dataset, and as v2.1 where that is asked for."""
+    export.export_run(LeRobot, run)
+    if run.config.export.lerobot_v21 is not None:
+        export.export_run(LeRobotV21, run)
+    say_stale("lerobot", run)
+
+
+def write_manifest(run: Run) -> None:
+    """Write one row for every planned episode, the statistics for OpenVLA-OFT, and the counts."""
+    config, outcome = run.config, run.outcome
+    table = manifest.build(outcome, registry.places(run.formats), registry.columns(), config.export.where)
+    manifest.write(table, run.manifest_file, manifest.Settings.of(config))
+
+    row_of = outcome.row_of
+    trajectory_of = {episode_id: row_of[episode_id].trajectory_id for episode_id in outcome.kept}
+    motions = {name: run.frames.motion(name) for name in {*trajectory_of.values()}}
+    suites = {episode_id: row_of[episode_id].suite for episode_id in outcome.kept}
+    figures = {}
+    for name, members in by_suite(suites, (config.export.rlds or config.export).name).items():
+        figures[name] = exact_statistics.openvla([motions[trajectory_of[episode_id]] for episode_id in members])
+    write_json(run.path(STATISTICS), figures)
+    write_json(run.path(COUNTS), counts.by_axis_and_suite(table.to_pylist()))
+
+
+def validate(run: Run) -> None:
+    """Reopen the datasets and the manifest, and stop where they differ from what was made."""
+    file = run.validation_file
+    if finished.of_validate(run).holds():
+        # `push` asks for checks that are no older than what they are about.
+        file.touch()
+        print(f"nothing has changed since the checks of {file} found nothing off")
+        return
+    from pipeline.validation.validate import validate
+
+    with run.workers(renders=True) as workers:
+        report = validate(run, workers)
+    write_json(file, report)
+    off = {check: result["findings"] for check, result in report.items() if result["findings"]}
+    if off:
+        first = next(iter(off.values()))[0]
+        numbers = ", ".join(f"{check} {len(findings)}" for check, findings in off.items())
+        raise PipelineError(
+            f"{first['what']}; findings in all: {numbers}",
+            where=f"{first['dataset']} {first['episode'] or ''}".strip(),
+            expected=first["expected"],
+            remedy=f"read {file}, correct the cause, and run `{MAKE_AGAIN}` again",
+        )
+    finished.of_validate(run).keep()
+    print(f"{len(report)} checks found nothing off, see {file}")
+
+
+def write_recipe(run: Run) -> None:
+    """Write the fine-tuning recipe, and what each policy's code needs to train on the datasets as they are."""
+    from pipeline.clients import recipe
+
+    export = run.config.export
+    built = recipe.build(run.manifest_file, run.manifest, export)
+    recipe.write(built, run.path(FINETUNE), export, {dataset.name: dataset.folder for dataset in run.formats})
+    file = run.path(FINETUNE) / recipe.RECIPE
+    print(f"{file} has the recipe and a command line for each of {', '.join(built['clients'])}")
+
+
+def summarize(run: Run) -> None:
+    """Render contact sheets, of the run and of one task per suite, and print what the run made."""
+    rows, episodes = run.manifest, run.config.plan.episodes
+    memory = finished.of_summary(run)
+    if not memory.holds():
+        _render_sheets(run)
+        memory.keep()
+    Console().print(counts.shown(rows, episodes))
+    for sentence in (*counts.shortfalls(counts.targets(rows, episodes)), *counts.beyond_step_limit(rows)):
+        print(sentence)
+
+
+def _render_sheets(run: Run) -> None:
+    from pipeline.report import preview, sheets
+
+    sheets.write(run.manifest, run.episodes(), run.path(SHEETS))
+    previews = finished.of_previews(run)
+    if not previews.holds():
+        with run.workers(renders=True) as workers:
+            preview.for_run(run.config, run.path(PREVIEWS), workers)
+        previews.keep()
+
+
+def write_card(run: Run) -> None:
+    """Write the dataset card of each format, from the manifest and the reports."""
+    from pipeline.publish import card
+
+    card.write(run)
+    print(f"{run.path(CARD)} has a README.md for each format; `python -m pipeline push` uploads it with the data")
+
+
+def write_report(run: Run) -> None:
+    """Write one HTML page about the run, with its counts, plots, pictures and videos in it."""
+    file = run.report_file
+    memory = finished.of_report(run)
+    if not memory.holds():
+        from pipeline.report import report
+
+        write(file, report.page(run, benchmark.load()))
+        memory.keep()
+    print(f"{file} ({file.stat().st_size / 1e6:.1f} MB) opens in any browser")
+
+
+_OUTCOME = (PLAN, TRAJECTORIES_TABLE, FRAMES_TABLE)
+_RECORDS = ("rlds.json", "lerobot.json", "lerobot_v21.json")
+_REPORTS = (LEAKAGE, VALIDATION, STATISTICS)
+_EXPORT = ("filter", "export")
+
+STAGES = {
+    "inputs": Stage(write_inputs),
+    "doctor": Stage(doctor, (*inputs.SECTIONS, "host"), (INPUTS,), (MACHINE,)),
+    "plan": Stage(make_plan),
+    "leakage": Stage(check_leakage, (), (PLAN,), (LEAKAGE,)),
+    "replay": Stage(replay, ("demos", "replay", "filter"), (INPUTS, MACHINE, PLAN, LEAKAGE), (REPLAY,)),
+    "render": Stage(
+        render,
+        ("demos", "replay", "filter", "render", "export"),
+        (INPUTS, MACHINE, PLAN, REPLAY),
+        (TRAJECTORIES_TABLE, FRAMES_TABLE),
+    ),
+    "export_rlds": Stage(export_rlds, _EXPORT, _OUTCOME, ("rlds.json", "failures/rlds.json")),
+    "export_lerobot": Stage(
+        export_lerobot,
+        (*_EXPORT, "plan"),
+        (INPUTS, *_OUTCOME),
+        ("lerobot.json", "lerobot_v21.json", "failures/lerobot.json", "failures/lerobot_v21.json"),
+    ),
+    "manifest": Stage(write_manifest, _EXPORT, (*_OUTCOME, *_RECORDS), (MANIFEST, STATISTICS, COUNTS)),
+    "validate": Stage(validate),
+    "recipe": Stage(write_recipe, ("export",), (MANIFEST, *_RECORDS), (FINETUNE,)),
+    "summary": Stage(summarize),
+    "card": Stage(write_card, ("export", "publish"), (MANIFEST, *_REPORTS, *_RECORDS, FINETUNE, SHEETS), (CARD,)),
+    "report": Stage(write_report),
+}
+"""Name to stage, in the order in which they run."""
+
+
+def run_all(file: Path) -> Run:
+    """Perform every stage of a configuration in this process, under a lock in the run's folder.
+
+    Returns:
+        The finished run.
+
+    Raises:
+        PipelineError: when a stage stops, or another process works in the folder.
+    """
+    config = claimed(file)
+    with locked(config.data):
+        for number, name in enumerate(STAGES, start=1):
+            print(f"[{number}/{len(STAGES)}] {name}", flush=True)
+            perform(name, Run(config))
+    return Run(config)
+
+
+def perform(name: str, run: Run) -> None:
+    """Perform a stage, unless its inputs and outputs are as they were after the last call.
+
+    Raises:
+        PipelineError: when the stage stops.
+    """
+    stage = STAGES[name]
+    memory = _memory(name, run)
+    if memory is not None and memory.holds():
+        print(f"{name}: up to date")
+        return
+    refuse_foreign_files(run.folder)
+    stage.work(run)
+    after = _memory(name, Run(run.config))
+    if after is not None:
+        after.keep()
+
+
+def _memory(name: str, run: Run) -> Memory | None:
+    stage = STAGES[name]
+    return finished.of_stage(run, name, stage.settings, stage.inputs, stage.outputs) if stage.outputs else None
+
+
+def script(name: str) -> None:
+    """Perform one stage on the configuration that the command line names; DVC calls this."""
+    parser = argparse.ArgumentParser(description=f"Stage {name}: {STAGES[name].work.__doc__}")
+    parser.add_argument("config", type=Path, help="a file of configs/, such as configs/starter.yaml")
+    parser.add_argument("--remake", action="store_true", help=f"make finished work again, as does {REMAKE}=1 before it")
+    arguments = parser.parse_args()
+    if arguments.remake:
+        os.environ[REMAKE] = "1"
+
+    def work() -> int:
+        refuse_other_folder(arguments.config)
+        config = claimed(arguments.config)
+        with locked(config.data):
+            perform(name, Run(config))
+        return 0
+
+    status = exit_status(work)
+    if status:
+        sys.exit(status)
