@@ -3,7 +3,7 @@
 from functools import partial
 
 MAKE_AGAIN = "python -m pipeline run CONFIG"
-"""The remedy where something that a run makes is missing or damaged. `dvc repro` would run what params.yaml names."""
+"""The remedy where something that a run makes is missing or damaged. `dvc repro` would perform the run that params.yaml names."""
 
 
 class PipelineError(Exception):

@@ -7,6 +7,7 @@ import pytest
 import yaml
 from conftest import REPOSITORY
 
+from pipeline import stages
 from pipeline.config import load
 from pipeline.run import inputs
 
@@ -63,12 +64,22 @@ def test_a_run_that_goes_on_elsewhere_is_compared_first() -> None:
 @pytest.mark.parametrize("file", sorted((REPOSITORY / "configs").glob("*.yaml")), ids=lambda file: file.stem)
 def test_sections_of_the_configuration_are_written_out_whatever_it_leaves_out(file: Path) -> None:
     """DVC stops where a parameter is missing."""
-    settings = inputs.settings(load(file))
+    settings = {**inputs.settings(load(file)), "lost": []}
     for stage in STAGES:
         for section in sections(stage):
             found = settings
             for field in section.split("."):
                 found = found[field]
+
+
+@pytest.mark.parametrize("name", [name for name, stage in stages.STAGES.items() if stage.outputs])
+def test_dvc_knows_the_inputs_and_outputs_of_a_stage(name: str) -> None:
+    """Without datasets that not every run has."""
+    optional = {"lerobot_v21.json", *(output for output in stages.STAGES[name].outputs if "/lerobot" in output)}
+    optional |= {output for output in stages.STAGES[name].outputs if output.startswith("failures/")}
+    assert {output.removeprefix(DATA) for output in outputs(name)} == {*stages.STAGES[name].outputs} - optional
+    needed = {file.removeprefix(DATA) for file in STAGES[name]["deps"] if file.startswith(DATA)}
+    assert {*stages.STAGES[name].inputs} - optional <= needed | {"inputs.json"}
 
 
 def test_params_name_the_shipped_default() -> None:

@@ -9,8 +9,6 @@ import resource
 import shutil
 import subprocess
 import sys
-import time
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +21,6 @@ from pipeline.config import Config
 from pipeline.errors import PipelineError
 from pipeline.libero import hdf5
 from pipeline.planning import plan
-from pipeline.run import repro
 from pipeline.run.stage import LOCK, OWNER, claimed, locked, owned
 
 
@@ -383,25 +380,3 @@ def test_clean_needs_a_mark_and_names_foreign_files(
     assert command_line.main() == 1
     assert "would be deleted: frames/holiday.jpg" in capsys.readouterr().err
     assert theirs.read_bytes() == b"mine"
-
-
-def test_a_run_beside_one_whose_command_alone_was_killed_is_refused(clone: Path) -> None:
-    shutil.copytree(REPOSITORY / ".dvc", ".dvc", ignore=shutil.ignore_patterns("tmp", "cache"))
-    Path("dvc.yaml").write_text("stages: {replay: {cmd: touch begun; sleep 60, deps: [configs]}}")
-    subprocess.run(["git", "init", "--quiet"], check=True)
-    command = [sys.executable, "-m", "pipeline", "run", "configs/tiny.yaml"]
-    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(REPOSITORY)}) as begun:
-        while not Path("begun").exists():
-            assert begun.poll() is None
-            time.sleep(0.1)
-        begun.kill()
-    other = Path("configs/other.yaml")
-    other.write_text(Path("configs/tiny.yaml").read_text().replace("name: tiny", "name: other"))
-    with pytest.raises(PipelineError, match="a run goes on here as process") as caught:
-        repro.run(other)
-    assert yaml.safe_load(Path("params.yaml").read_text())["run"] == "tiny"
-    kill, dvc = str(caught.value.remedy).split(": ")[1], Path("/proc", caught.value.what.split()[-1])
-    subprocess.run(kill.split(), check=True)
-    with suppress(OSError):  # It has ended.
-        while (dvc / "cmdline").read_bytes():
-            time.sleep(0.1)
