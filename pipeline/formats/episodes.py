@@ -96,13 +96,14 @@ class Episodes:
         if not chosen:
             raise too_few(validation, "export.<format>.validation")
         splits: dict[str, list[str]] = {"train": [], "val": []}
-        for episode_id, known in self.known.items():
-            splits["val" if _origin(known) in chosen else "train"].append(episode_id)
+        for episode_id, facts in self.known.items():
+            split_name = "val" if _origin(facts) in chosen else "train"
+            splits[split_name].append(episode_id)
         return splits
 
     def _origins_for(self, validation: float) -> set[tuple[str, str]]:
         """Choose the given share of each task's origins."""
-        digests_of = grouped((_origin(known), digest("validation", known.demo)) for known in self.known.values())
+        digests_of = grouped((_origin(facts), digest("validation", facts.demo)) for facts in self.known.values())
         by_task = grouped((task, (min(digests), (task, origin))) for (task, origin), digests in digests_of.items())
         chosen: set[tuple[str, str]] = set()
         for origins in by_task.values():
@@ -111,9 +112,9 @@ class Episodes:
         return chosen
 
 
-def _origin(known: Known) -> tuple[str, str]:
+def _origin(facts: Known) -> tuple[str, str]:
     """Return the task of an episode, and the origin of its demonstration."""
-    return known.demo.rpartition("/")[0], known.origin or known.demo
+    return facts.demo.rpartition("/")[0], facts.origin or facts.demo
 
 
 def in_a_row(slices: Mapping[str, tuple[str, Sequence[str]]], known: Mapping[str, Known]) -> list[Piece]:

@@ -180,8 +180,8 @@ def columns(episode: Episode, found: Numbers, frames: Frames) -> dict[str, pa.Ar
     """Return the columns of an episode's steps, with its images if ``frames`` is ``images``."""
     texts = {EPISODE_ID: [episode.episode_id] * len(episode)}
     for view, geometry in episode.geometry.items():
-        for name, files in geometry.maps.items():
-            texts[camera_column(view, name)] = [base64.b64encode(file).decode() for file in files]
+        for extra, files in geometry.maps.items():
+            texts[camera_column(view, extra)] = [base64.b64encode(file).decode() for file in files]
     images = {}
     if frames == "images":
         image_type = datasets.Image().pa_type

@@ -185,13 +185,13 @@ def episode(table: pa.Table, row: Mapping[str, Any], instruction: str, extras: t
 
     The episode has frames only where they are stored as image files.
     """
+    frames = {}
+    for view, spec in SCHEMA.views.items():
+        if spec.lerobot_key in table.column_names:
+            frames[view] = [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
     return Episode(
         episode_id=row[EPISODE_ID],
-        frames={
-            view: [cell["bytes"] for cell in table[spec.lerobot_key].to_pylist()]
-            for view, spec in SCHEMA.views.items()
-            if spec.lerobot_key in table.column_names
-        },
+        frames=frames,
         state=matrix(table, SCHEMA.state.lerobot_key),
         joint_state=matrix(table, SCHEMA.joint_state.lerobot_key),
         action=matrix(table, SCHEMA.action.lerobot_key),
@@ -226,10 +226,10 @@ def _object_poses(table: pa.Table) -> NDArray[np.float32]:
 
 
 def _geometry(table: pa.Table, row: Mapping[str, Any], view: str, extras: tuple[Extra, ...]) -> Geometry:
-    matrices = {
-        name: np.array(row[camera_column(view, name)], np.float32).reshape(getattr(SCHEMA, name).shape)
-        for name in MATRICES
-    }
+    matrices = {}
+    for name in MATRICES:
+        numbers = np.array(row[camera_column(view, name)], np.float32)
+        matrices[name] = numbers.reshape(getattr(SCHEMA, name).shape)
     texts = {name: table[camera_column(view, name)].to_pylist() for name in MAPS if name in extras}
     maps = {name: list(map(base64.b64decode, files)) for name, files in texts.items()}
     return Geometry(**matrices, maps=maps)

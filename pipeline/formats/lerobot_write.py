@@ -38,11 +38,11 @@ INDEX = (
     '"task", "pandas_type": "object", "numpy_type": "str", "metadata": null}], "attributes": {}, "creator": '
     '{"library": "pyarrow", "version": "26.0.1"}, "pandas_version": "3.1.1"}'
 )
-"""Metadata by which pandas uses the texts of the tasks as index, as pandas 3.1.1 writes it; other versions differ."""
+"""Metadata by which pandas uses the texts of the tasks as index, fixed here as pandas 3.1.1 writes it."""
 
 
 def file_path(kind: str, number: int, suffix: str) -> str:
-    """Return the path of a dataset's file below its root; ``kind`` is ``data``, ``meta/episodes`` or ``videos/<key>``."""
+    """Return a file's path below the dataset's root; ``kind`` is ``data``, ``meta/episodes`` or ``videos/<key>``."""
     chunk, file = divmod(number, FILES_OF_A_CHUNK)
     return f"{kind}/{PLACE.format(chunk_index=chunk, file_index=file)}{suffix}"
 
