@@ -178,7 +178,7 @@ class Verdict:
 class Quality:
     """Quality measures of a trajectory's motion (``physics/quality.py``): columns of the manifest, with their meanings.
 
-    In these meanings, another object is an object that the goal does not name and that does not stand on or in anything
+    In these meanings, the goal does not name "another object". Such an object also does not stand on or in anything
     that the goal moves.
     """
 

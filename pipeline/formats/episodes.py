@@ -74,8 +74,8 @@ class Episodes:
     def by_split(self, validation: float) -> dict[str, list[str]]:
         """Divide the episodes into ``train`` and, with a validation share above 0, ``val``, in the order of ``ids``.
 
-        All episodes of a demonstration are in one split, so that no perturbed episode has its clean twin, or equal
-        actions, in the other split. All demonstrations generated from one are in one split too, because their actions
+        All episodes of a demonstration are in one split: no perturbed episode has its clean twin, or equal actions, in
+        the other split. All demonstrations generated from one are in one split too, because their actions
         may be equal. At least one origin of each task stays in ``train``.
 
         Args:

@@ -55,7 +55,7 @@ def check(
     Raises:
         PipelineError: when the dataset cannot be opened.
     """
-    # lerobot decodes through this function of torchvision, and each worker would print the deprecation warning.
+    # lerobot decodes by torchvision, which prints in each worker that its video decoding is deprecated.
     warnings.filterwarnings("ignore", message="The video decoding", category=UserWarning)
     with readable(root):
         episodes = rows(root)

@@ -99,8 +99,8 @@ def finish(
     levels_of_pieces = [json.loads((work / piece.path / LEVELS).read_text()) for piece in pieces]
     figures = {}
     for view, spec in SCHEMA.views.items():
-        levels = np.sum([levels[view] for levels in levels_of_pieces], axis=0)
-        figures[convention.name(spec.lerobot_key)] = of_levels(levels)
+        total = np.sum([levels[view] for levels in levels_of_pieces], axis=0)
+        figures[convention.name(spec.lerobot_key)] = of_levels(total)
     for name, description in columns.items():
         if description["dtype"] in ("float32", "int64"):
             figures[name] = _exact(root, name, description["shape"][0])

@@ -26,7 +26,7 @@ class LeRobotV21(Format[LeRobotV21Config]):
 
     name: ClassVar[Step] = "lerobot_v21"
     title: ClassVar = "LeRobot v2.1"
-    # An episode is found by its id, in ``meta/episodes.jsonl``: the manifest is the same without this format.
+    # ``meta/episodes.jsonl`` contains the ids of the episodes, so the manifest needs no columns for this format.
     columns: ClassVar[tuple[pa.Field, ...]] = ()
 
     def __init__(self, data: Path, options: LeRobotV21Config, extras: Sequence[Extra] = ()) -> None:

@@ -101,7 +101,8 @@ class Written:
 
     def faults(self) -> list[Fault]:
         """Read the whole file and report if it is unreadable or differs from the written content."""
-        expected = f"what its checksum in {self.dataset}.json is of; move it away, and `{MAKE_AGAIN}` makes it again"
+        remedy = f"move the file away, and `{MAKE_AGAIN}` writes it again"
+        expected = f"the content with its checksum in {self.dataset}.json; {remedy}"
         try:
             same = checksum(self.file) == self.sha256
         except OSError as error:

@@ -189,7 +189,7 @@ def _info(folder: Path) -> Any:
 @lru_cache(maxsize=8)
 def _opened(info_file: Edition) -> Any:
     info = tfds.builder_from_directory(info_file.path.parent).info
-    _lengths(info)  # Raises where the names of the shards do not follow from what is stated.
+    _lengths(info)  # Raises if the names of the shards do not follow from the stated ones.
     return info
 
 
