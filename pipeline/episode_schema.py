@@ -242,7 +242,8 @@ def _check_geometry(episode: Episode, steps: int, extras: Collection[Extra]) -> 
         if lengths != wanted:
             raise _fault(episode, f"{view} maps", f"have the lengths {lengths}", f"{steps} for each that is asked for")
     if ("object_poses" in extras) != (episode.object_poses is not None):
-        raise _fault(episode, "object_poses", "are missing or not requested", "poses exactly if render.extras lists them")
+        expected = "poses if, and only if, render.extras lists them"
+        raise _fault(episode, "object_poses", "are missing or not requested", expected)
     if episode.object_poses is not None:
         _check_array(episode, "object_poses", episode.object_poses, SCHEMA.object_poses, steps)
     if named(extras) != bool(episode.instances):
